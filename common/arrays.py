@@ -1,4 +1,7 @@
-"""Names for the array types that cross function borders. Shapes stand in the docstrings."""
+"""Type aliases for the arrays that cross function boundaries.
+
+The shapes are stated in the docstrings.
+"""
 
 import numpy as np
 import numpy.typing as npt

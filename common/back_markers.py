@@ -1,4 +1,6 @@
-"""Three markers on the back of a hand instead of one, which turn with the palm and tell its orientation.
+"""Three back-of-hand markers instead of one, which constrain palm orientation.
+
+The three markers rotate with the palm.
 
 They lie above metacarpals, where skin moves least: one near the wrist, one each behind the knuckles of index and little
 finger. So they span a triangle as large as the back of a hand allows: noise of 1 mm turns one with sides of 4 to 5 cm
@@ -22,7 +24,9 @@ _THICKNESS_M = 0.0015  # from skin to the middle of what is painted
 
 
 def with_three_back_markers(profile: HandProfile, name: str) -> HandProfile:
-    """The same hand under another name, with the markers `back`, `back2` and `back3`; one called `back` is moved.
+    """Return the hand under another name with three markers on its back.
+
+    The markers are `back`, `back2` and `back3`; an existing `back` is moved.
 
     Raises:
         CalibrationError: The profile is broken.

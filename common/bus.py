@@ -1,4 +1,6 @@
-"""The bus: messages and commands over reliable links, as one seam with two implementations.
+"""Message bus: messages and commands over reliable links.
+
+One interface with two implementations.
 
 `LoopbackBus` joins the parts of one process, `common.zenoh_bus.ZenohBus` joins processes; the
 same tests run against both. Streams with the path DATAGRAM never come here.
@@ -50,7 +52,9 @@ class Bus(Protocol):
     """Publish and subscribe, ask and serve, and who is alive."""
 
     def publish(self, stream: str, name: str, message: Message) -> None:
-        """Send `message` of `stream` under the sender's `name`; never waits for a receiver.
+        """Publish `message` of `stream` under the sender's `name`.
+
+        Never waits for a receiver.
 
         Raises:
             ValueError: Unknown stream, a datagram stream, a message of another type.
@@ -83,7 +87,10 @@ class Bus(Protocol):
         ...
 
     def announce(self, name: str) -> None:
-        """Be listed in everybody's `alive` as `name` until this bus closes or the process dies."""
+        """List this process as `name` in everybody's `alive`.
+
+        The entry lasts until this bus closes or the process dies.
+        """
         ...
 
     def alive(self) -> frozenset[str]:
@@ -96,7 +103,9 @@ class Bus(Protocol):
 
 
 class Inbox:
-    """The queue behind every subscription: bounded, drops the oldest, decodes on reading.
+    """Bounded queue behind every subscription.
+
+    It drops the oldest message when full, and decodes on reading.
 
     Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
     under which name is the bus' to say, so what is in a message cannot be another's. Besides, how many of each name
@@ -209,7 +218,10 @@ def payload_of(stream: str, message: Message) -> bytes:
 
 
 class _Hub:
-    """What the ends of one loopback bus share: subscriptions by key, handlers and names."""
+    """Shared state of the ends of one loopback bus.
+
+    Subscriptions by key, handlers and names.
+    """
 
     def __init__(self) -> None:
         self.lock = threading.Lock()

@@ -1,4 +1,6 @@
-"""Who may say what on an encrypted bus: zenoh's access control, by the common names of certificates.
+"""Access rules of an encrypted bus: which process may send what.
+
+Uses zenoh's access control, by the common names of certificates.
 
 Nothing is allowed that is not named here. What a device says goes to whoever listens; what it is told is only what the
 master passes on:
@@ -60,7 +62,11 @@ def rules_of_master(devices: Iterable[str]) -> dict[str, object]:
 
 
 def rules_of_device(name: str) -> dict[str, object]:
-    """zenoh's `access_control` for a device: from its link it takes commands to itself, and who asks for what."""
+    """Return zenoh's `access_control` for a device.
+
+    From its link the device accepts commands addressed to itself, and the subscriptions of those who ask for its
+    data.
+    """
     rules = [
         _rule("is told", "ingress", ("query",), [key_of("command", name)]),
         _rule("is asked for", "ingress", ("declare_subscriber", "liveliness_query"), _EVERYTHING),
@@ -70,14 +76,20 @@ def rules_of_device(name: str) -> dict[str, object]:
 
 
 def rules_of_router() -> dict[str, object]:
-    """zenoh's `access_control` for a router: who may run or read a rig passes; no device does."""
+    """Return zenoh's `access_control` for a router.
+
+    Processes that may run or read a rig pass; devices do not.
+    """
     rules = [_rule("in", "ingress", _ALL, ["**"]), _rule("out", "egress", _ALL, ["**"])]
     policies = [_policy(["in", "out"], name) for name in (MASTER, OPERATOR)]
     return _access(rules, [MASTER, OPERATOR], policies)
 
 
 def _of_device(name: str) -> list[str]:
-    """All keys under which a device speaks. The name inside a message is compared with its key by who reads it."""
+    """Return all keys under which a device publishes.
+
+    The reader of a message compares the name inside it with its key.
+    """
     return [*(key_of(stream, name) for stream in _PUBLISHED_BY_DEVICES), ALIVE_KEY.format(name=name)]
 
 

@@ -1,4 +1,7 @@
-"""Say why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
+"""Diagnosis of why an encrypted bus cannot be established.
+
+zenoh does not report that a certificate was refused.
+"""
 
 import logging
 import socket
@@ -20,7 +23,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def why_refused(endpoint: str, identity: Identity) -> str:
-    """Try a handshake by hand and tell what went wrong, for a person; empty: nothing did.
+    """Try a handshake by hand and return what went wrong, as text for the user.
+
+    Empty: nothing went wrong.
 
     Takes up to a second. An answer that comes after the handshake is read, too: with TLS 1.3 the side that listens
     refuses a certificate only then.
@@ -69,7 +74,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
 
 
 def _why_invalid(endpoint: str, identity: Identity) -> str:
-    """Say which certificate is not valid by the clock of this machine.
+    """Return which certificate is not valid by the clock of this machine.
 
     It is that of the rig, or that of who listens.
     """
@@ -86,7 +91,7 @@ def _why_invalid(endpoint: str, identity: Identity) -> str:
 
 
 def _why_expired_there(identity: Identity) -> str:
-    """Say why who listens refused our certificate as not valid now.
+    """Return why the listener refused our certificate as not valid now.
 
     By our clock it is not valid either, or the clock there is wrong.
     """
@@ -116,7 +121,9 @@ def _shown_there(endpoint: str) -> Shown | None:
 def log_why_alone(
     peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
 ) -> threading.Thread:
-    """Log, on a thread, why nobody is connected when it is so for two seconds, and again when the reason is another.
+    """Log, on a thread, why no peer is connected.
+
+    It logs once this has lasted two seconds, and again when the reason changes.
 
     Args:
         peers: How many are connected.

@@ -1,4 +1,7 @@
-"""zenoh's configuration for one process: everything that is not safe or quick by default is set here. Pure."""
+"""zenoh's configuration for one process.
+
+Everything that is not safe or fast by default is set here. Pure.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -66,7 +69,10 @@ def settings(
 
 
 def _tls(identity: Identity) -> dict[str, object]:
-    """Both sides show a certificate. Who listens needs one for that use, so its address need not be the name in it."""
+    """Return the TLS settings; both sides present a certificate.
+
+    The listener needs a certificate issued for that use, so its address need not be the name in it.
+    """
     pair = str(identity.certificate), str(identity.key)
     return {
         "root_ca_certificate": str(identity.authority),

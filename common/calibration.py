@@ -1,4 +1,6 @@
-"""Typed files of calib_json: load, validate, save atomically. An unknown key is refused with file and key.
+"""Typed files of calib_json: load, validate, save atomically.
+
+An unknown key is refused with file and key.
 
 A rig is a JSON file, not a class: cameras, markers, depth model and hand are data. Units stand in the key
 names where they are not SI. The JSON schema of each file is exported to docs/ from these types.
@@ -106,7 +108,9 @@ def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
 
 
 def check(value: Struct, where: str) -> None:
-    """Refuse what the types alone cannot: parts of one file that contradict each other.
+    """Refuse parts of one file that contradict each other.
+
+    The types alone cannot detect this.
 
     Raises:
         CalibrationError: With `where` and the key.
@@ -126,7 +130,9 @@ def check(value: Struct, where: str) -> None:
 
 
 def save(path: Path, value: Struct) -> None:
-    """Write a calibration file atomically: a reader sees the old file or the new one, never half.
+    """Write a calibration file atomically.
+
+    A reader sees the old file or the new one, never half of one.
 
     Raises:
         CalibrationError: The folder is missing, read-only or full, or the value would not come back
@@ -148,7 +154,10 @@ _STRING_OR_NUMBERS = re.compile(r'"(?:[^"\\]|\\.)*"|\[[\s\d.,eE+-]+\]')
 
 
 def compact_numbers(text: str) -> str:
-    """Put arrays of plain numbers on one line, so that a calibration file stays readable; strings stay."""
+    """Put arrays of plain numbers on one line; strings are unchanged.
+
+    This keeps a calibration file readable.
+    """
 
     def compact(found: re.Match[str]) -> str:
         part = found[0]
@@ -158,7 +167,10 @@ def compact_numbers(text: str) -> str:
 
 
 def schema(kind: type[Struct]) -> bytes:
-    """JSON schema of one file type, formatted; the same bytes on every Python version."""
+    """Return the formatted JSON schema of one file type.
+
+    The bytes are the same on every Python version.
+    """
     content = msgspec.json.schema(kind)
     for part in content["$defs"].values():
         # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.

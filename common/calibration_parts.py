@@ -1,4 +1,7 @@
-"""What the types of calibration files are made of: their base, and numbers with their bounds."""
+"""Building blocks of the calibration file types.
+
+Their base class, and numbers with their bounds.
+"""
 
 from datetime import UTC, datetime
 from typing import Annotated
@@ -35,7 +38,9 @@ class Part(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_d
 
 
 class Provenance(Part, frozen=True):
-    """Where a measured part of a file comes from: when, by what, from which data, and how well the fit agrees.
+    """Provenance of a measured part of a file.
+
+    When and by what it was measured, from which data, and how well the fit agrees.
 
     `residual`: quantity with its unit -> value, such as rms_px.
     """

@@ -43,7 +43,9 @@ class Intrinsics(Part, frozen=True):
 
 
 class HsvRange(Part, frozen=True):
-    """Colour of one marker in OpenCV's HSV (H 0-179); hsv_low[0] > hsv_high[0] wraps through 0.
+    """Colour range of one marker in OpenCV's HSV (H 0-179).
+
+    hsv_low[0] > hsv_high[0] wraps through 0.
 
     `reference_bgr_linear` is the mean colour of the paint in linear light, blue first, 1 = white, at calibration; with
     it a slave follows changes of the light.

@@ -1,4 +1,7 @@
-"""A camera as geometry: point -> pixel and pixel -> ray, with OpenCV's distortion k1, k2, p1, p2, k3."""
+"""Geometric camera model: point -> pixel and pixel -> ray.
+
+With OpenCV's distortion k1, k2, p1, p2, k3.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -110,7 +113,10 @@ class CameraModel:
         return np.where(np.isnan(uv), np.nan, points.reshape(uv.shape))
 
     def ray(self, uv: Float) -> Float:
-        """Unit ray directions (..., 3) in the rig frame through pixels (..., 2); NaN stays NaN."""
+        """Return unit ray directions (..., 3) through pixels (..., 2).
+
+        In the rig frame; NaN stays NaN.
+        """
         xy = self.undistort(uv)
         direction = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -118,7 +124,10 @@ class CameraModel:
 
 
 def _undistort(uv: Float, matrix: Float, distortion: Float) -> Float:
-    """`cv2.undistortPoints` to convergence; OpenCV 5 merged what 4 calls `undistortPointsIter` into it."""
+    """Run `cv2.undistortPoints` to convergence.
+
+    OpenCV 5 merged into it what OpenCV 4 calls `undistortPointsIter`.
+    """
     of_opencv_4 = cast(Callable[..., Float] | None, getattr(cv2, "undistortPointsIter", None))
     if of_opencv_4 is not None:
         return of_opencv_4(uv, matrix, distortion, None, None, _CRITERIA)

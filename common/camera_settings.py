@@ -1,4 +1,6 @@
-"""Settings that a camera can change while it runs: what the commands "set" and "pick" say, and what a slave answers.
+"""Camera settings that can change while the camera runs.
+
+Defines the bodies of the commands "set" and "pick", and what a slave answers.
 
 A slave answers every command about its camera with a `Health` whose gauges say what the camera has now, read back, by
 the names of `figures`, and, with the prefix `WANTED`, what the camera file in use says; beside them the colour ranges
@@ -21,7 +23,9 @@ _OF_CAMERA = ("exposure_us", "analogue_gain", "colour_gains", "frame_rate_hz", "
 
 
 class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The body of the command "set": keys and units of the camera file; what is absent stays as it is.
+    """Body of the command "set".
+
+    Keys and units are those of the camera file; absent settings stay unchanged.
 
     Of `markers` those that are named are replaced; null forgets a colour. A range without `reference_bgr_linear` keeps
     the one that the marker has.
@@ -61,7 +65,7 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class ColourPick(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The body of the command "pick": the marker, and a pixel on its paint.
+    """Body of the command "pick": the marker, and a pixel of its colour.
 
     Attributes:
         marker: A marker of the rig.
@@ -81,7 +85,10 @@ def same_exposed(a: CameraCalibration, b: CameraCalibration) -> bool:
 
 
 def figures(camera: CameraCalibration) -> dict[str, float]:
-    """Settings of a camera file by the names of gauges; the gains of red and blue are relative to green."""
+    """Return the settings of a camera file by the names of metrics.
+
+    The gains of red and blue are relative to green.
+    """
     red, blue = camera.colour_gains
     return {
         "exposure_us": camera.exposure_us,
@@ -93,7 +100,10 @@ def figures(camera: CameraCalibration) -> dict[str, float]:
 
 
 def range_figures(camera: CameraCalibration, markers: Iterable[str]) -> dict[str, float]:
-    """`roi_margin`, and `marker.NAME.h_low` ... `.v_high` of those of the markers that have a colour."""
+    """Return `roi_margin` and the HSV bounds of the markers that have a colour.
+
+    The bounds are named `marker.NAME.h_low` ... `.v_high`.
+    """
     found = {"roi_margin": camera.roi_margin}
     for name in markers:
         if (colour := (camera.markers or {}).get(name)) is not None:

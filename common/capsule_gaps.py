@@ -1,4 +1,6 @@
-"""How near two fingers' skins are: the distance between round cones, which flesh on a bone nearly is.
+"""Distance between the skins of two fingers, modelled as round cones.
+
+The flesh on a bone is nearly a round cone.
 
 A round cone is the union of balls whose middles go along a line and whose radii go evenly from one end to the other. So
 the gap of two is the least, over s and t in 0..1, of
@@ -38,7 +40,10 @@ class TaperedCapsules:
 
     @classmethod
     def of_segments(cls, joints_m: Float, radius_m: Float) -> "TaperedCapsules":
-        """Segments (..., 5, 3), thumb ... little, from the root on, of joints (..., 26, 3) and radii (26,) [m]."""
+        """Return the segments (..., 5, 3), thumb ... little, from the root on.
+
+        From joints (..., 26, 3) and radii (26,) [m].
+        """
         chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
         return cls(chain[..., :-1, :], np.diff(chain, axis=-2), radius[..., :-1], np.diff(radius, axis=-1))
 
@@ -116,7 +121,10 @@ def foot_of(
 
 
 def nearest(on: Foot, share: Float) -> Float:
-    """Return where along a cone, 0..1, its skin is nearest to the point at a share of the other's bone."""
+    """Return the position along a cone, 0..1, where its skin is nearest to a point.
+
+    The point is given by its share of the other cone's bone.
+    """
     foot, foot_by, off_2, off_by, off_by_2, lean = on
     beyond = lean * np.sqrt(np.maximum(off_2 + share * (off_by + share * off_by_2), 0.0))
     return np.minimum(np.maximum(foot + share * foot_by + beyond, 0.0), 1.0)

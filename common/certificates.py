@@ -1,4 +1,6 @@
-"""Certificates of a rig: who may join its bus, as an authority of its own that signs nobody else.
+"""Certificates of a rig: which processes may join its bus.
+
+The rig is its own certificate authority, which signs nothing outside the rig.
 
 Each process proves who it is by a certificate whose common name is its role (`master`, `operator`) or, of a device, its
 name on the bus. Only the master's may be shown by the side that listens (extended key usage serverAuth): whoever steals
@@ -42,7 +44,10 @@ class KeyPair:
 
 
 def new_authority(now: datetime) -> KeyPair:
-    """Return a fresh authority (ECDSA P-256), which may sign certificates of processes, but no other authority."""
+    """Return a new certificate authority (ECDSA P-256).
+
+    It may sign certificates of processes, but no other authority.
+    """
     private = ec.generate_private_key(ec.SECP256R1())
     name = _named("Phalanx rig")
     draft = _draft(name, name, private.public_key(), now).add_extension(
@@ -53,7 +58,9 @@ def new_authority(now: datetime) -> KeyPair:
 
 
 def issue(authority: KeyPair, name: str, now: datetime) -> KeyPair:
-    """Return a fresh certificate for the process or device `name`; that of `MASTER` alone may listen.
+    """Return a new certificate for the process or device `name`.
+
+    Only the certificate of `MASTER` may listen.
 
     Raises:
         PhalanxError: The authority's PEM is broken.
@@ -84,7 +91,7 @@ def issue(authority: KeyPair, name: str, now: datetime) -> KeyPair:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What a certificate says.
+    """Contents of a certificate.
 
     Attributes:
         name: Role or device.
@@ -101,7 +108,7 @@ class Shown:
     fingerprint: str
 
     def invalid_at(self, now: datetime, whose: str) -> str:
-        """Say why the certificate is not valid at `now`, with its validity.
+        """Return why the certificate is not valid at `now`, with its validity period.
 
         Empty: it is valid.
 

@@ -1,4 +1,4 @@
-"""Time: the monotonic clock, a clock that is another machine's, and a loop tick that never drifts.
+"""Time: monotonic clock, simulated foreign clock, and a drift-free loop tick.
 
 Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never
 asked, and setting it moves nothing. How the clock of another machine runs is `common.clock_offset`.
@@ -14,7 +14,7 @@ def now_ns() -> int:
 
 
 class Clock(Protocol):
-    """Something that tells the time, so that a test can tell another."""
+    """Source of time, which tests can replace."""
 
     def now_ns(self) -> int:
         """Return the time [ns]; never runs backwards."""
@@ -30,13 +30,15 @@ class SystemClock:
 
 
 class SkewedClock:
-    """The clock of a simulated foreign machine: another zero and another rate, and steps where a test wants them.
+    """Clock of a simulated foreign machine: another zero and another rate.
+
+    It also makes steps where a test wants them.
 
     Holds the moment of its construction, at which it is `offset_ns` ahead of the true clock.
     """
 
     def __init__(self, offset_ns: int, rate_ppm: float, clock: Clock | None = None) -> None:
-        """Begin `offset_ns` ahead of `clock` and gain `rate_ppm` microseconds per second on it.
+        """Start `offset_ns` ahead of `clock`, gaining `rate_ppm` microseconds per second.
 
         Raises:
             ValueError: The rate is not above -1 000 000 ppm: such a clock would not run.
@@ -49,7 +51,10 @@ class SkewedClock:
             raise ValueError(f"rate_ppm={rate_ppm}: must be above -1e6")
 
     def step(self, by_ns: int) -> None:
-        """Jump by so much [ns], as no monotonic clock should: a machine that was asleep, or restored."""
+        """Step the clock by `by_ns` [ns], as no monotonic clock should.
+
+        Simulates a machine that was asleep or restored.
+        """
         self._offset_ns += by_ns
 
     def now_ns(self) -> int:
@@ -61,7 +66,10 @@ class SkewedClock:
         return t_ns + self._offset_ns + (t_ns - self._epoch_ns) * self._rate_ppb // 10**9
 
     def to_true(self, t_ns: int) -> int:
-        """Return what the true clock shows [ns] when this clock shows `t_ns`; exact to 1 ns."""
+        """Return the true clock's time [ns] when this clock shows `t_ns`.
+
+        Exact to 1 ns.
+        """
         elapsed = t_ns - self._offset_ns - self._epoch_ns
         rate = 10**9 + self._rate_ppb
         return self._epoch_ns + (2 * elapsed * 10**9 + rate) // (2 * rate)

@@ -1,4 +1,4 @@
-"""The offset of a foreign clock: how another machine's monotonic clock runs against ours.
+"""Offset of a foreign clock: another machine's monotonic clock relative to ours.
 
 Each machine has its own, so the master measures every slave's by the four time stamps of NTP (RFC 5905, section 8):
 
@@ -73,7 +73,9 @@ class ClockEstimate:
         return t_local_ns + self.offset_ns + round((t_local_ns - self.t_ns) * (self.drift_ppm * 1e-6))
 
     def scatter_at(self, t_local_ns: int) -> float:
-        """Standard deviation [ns] of the offset at a local time, if both ways cost the same.
+        """Return the standard deviation [ns] of the offset at a local time.
+
+        Assumes that both directions have the same delay.
 
         It grows with the time since the newest echo, as the drift is known and as a crystal wanders.
         """
@@ -95,7 +97,9 @@ class _Echo(NamedTuple):
 
 
 class OffsetEstimator:
-    """Widest corridor between the echoes of a sliding window: offset, drift and their uncertainty.
+    """Estimator of clock offset and drift, with their uncertainty.
+
+    Finds the widest search band between the echoes of a sliding window.
 
     Holds the echoes of the window and the estimate from them; after an echo that contradicts it, also those since.
     Three such echoes among twenty are a stepped clock and start the estimate afresh from these. `steps` counts such
@@ -103,7 +107,10 @@ class OffsetEstimator:
     """
 
     def __init__(self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 200_000) -> None:
-        """Keep at most `capacity` echoes of `window_ns`; a jump above `step_ns` can be a step."""
+        """Keep at most `capacity` echoes within `window_ns`.
+
+        A jump above `step_ns` can be a clock step.
+        """
         self._window_ns = window_ns
         self._step_ns = step_ns
         self._echoes: deque[_Echo] = deque(maxlen=capacity)
@@ -121,7 +128,10 @@ class OffsetEstimator:
 
     @property
     def settled(self) -> bool:
-        """Whether there are enough echoes, and none that contradict: no need to hurry."""
+        """Return whether there are enough echoes, and none that contradict.
+
+        If so, there is no need to hurry.
+        """
         return len(self._echoes) >= 2 * AT_LEAST and not self._suspects
 
     def push(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
@@ -150,7 +160,10 @@ class OffsetEstimator:
         return self._estimate
 
     def _uncertain(self, echo: _Echo) -> bool:
-        """Whether this echo is not to be used yet; starts afresh where too many contradict."""
+        """Return whether this echo must not be used yet.
+
+        Reinitialises the estimate where too many echoes contradict it.
+        """
         wrong = self._contradicts(echo)
         if wrong or self._suspects:
             self._since.append(echo)
@@ -177,7 +190,10 @@ class OffsetEstimator:
 
 @dataclass(frozen=True, slots=True)
 class _OffsetBounds:
-    """What the echoes say of a range of drifts; all in ns and ns/s, at the newest echo."""
+    """Constraints that the echoes put on a range of drifts.
+
+    All in ns and ns/s, at the newest echo.
+    """
 
     offset: float
     sigma: float
@@ -218,7 +234,10 @@ class _OffsetBounds:
 
 
 def _fit(echoes: deque[_Echo]) -> ClockEstimate:
-    """The corridor at the newest echo; the grid of drifts closes in on it until it is fine enough."""
+    """Estimate the clock from the search band at the newest echo.
+
+    The grid of drifts is refined until it is fine enough.
+    """
     table = np.array(echoes, dtype=np.int64)
     newest = int(table[-1, 0])
     base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
@@ -240,7 +259,10 @@ def _fit(echoes: deque[_Echo]) -> ClockEstimate:
 
 
 def _spacing(delay_ns: Float) -> float:
-    """How far apart the shortest delays lie (n,) [ns]: as far as the shortest is from the shortest possible one."""
+    """Return the typical spacing [ns] of the shortest of the delays (n,) [ns].
+
+    It estimates how far the shortest delay is from the shortest possible one.
+    """
     n = len(delay_ns)
     if n < AT_LEAST:
         return max(_FLOOR_NS, float(delay_ns.max() - delay_ns.min()))

@@ -1,4 +1,6 @@
-"""A program of several commands: a table of names, and modules that are imported when a command is asked for.
+"""Command-line program of several commands.
+
+A table of names, and modules that are imported only when a command is requested.
 
 Each command has two functions, named as `module:function`. One adds its options to a parser; its docstring is the help,
 with the examples behind a line `Examples:`. It is imported for the help and to read the options, so its module imports
@@ -30,7 +32,10 @@ _LOG = "%(levelname)s %(name)s: %(message)s"
 
 
 class Parser(ArgumentParser):
-    """A parser for which all that begins as a negative number is a value: `--angles -20:20:10`."""
+    """Argument parser that takes whatever begins like a negative number as a value.
+
+    Example: `--angles -20:20:10`.
+    """
 
     def __init__(self, program: str, about: str, examples: str) -> None:
         super().__init__(
@@ -44,7 +49,10 @@ class Parser(ArgumentParser):
 
 
 class UsageError(Exception):
-    """The options do not fit to each other; the program ends as it does for an unknown option."""
+    """Error raised when options are incompatible with each other.
+
+    The program ends as it does for an unknown option.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +124,9 @@ class Program:
         return tuple(entry for entry in self.table if isinstance(entry, Command))
 
     def main(self, words: Sequence[str] | None = None) -> int:
-        """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage, 130 interrupted.
+        """Run one command and return its exit code.
+
+        0 done, 1 something the user can fix, 2 wrong usage, 130 interrupted.
 
         Raises:
             SystemExit: With code 0 after a help, 2 for wrong usage, 70 if a thread or the command itself failed.
@@ -221,14 +231,20 @@ class Program:
 
 
 def defaults_of(declare: Callable[[ArgumentParser], None]) -> Namespace:
-    """The options that `declare` adds, as they are if nothing is said. None of them may be required."""
+    """Return the default values of the options that `declare` adds.
+
+    None of them may be required.
+    """
     parser = ArgumentParser()
     declare(parser)
     return parser.parse_args([])
 
 
 def help_of(declare: Callable[..., object]) -> tuple[str, str]:
-    """Description and examples of a command, from the docstring of the function that declares its options."""
+    """Return the description and examples of a command.
+
+    From the docstring of the function that declares its options.
+    """
     first, _, rest = (declare.__doc__ or "").strip().partition("\n")
     about, _, examples = f"{first}\n{dedent(rest)}".partition(f"\n{_EXAMPLES}\n")
     return about.strip(), examples.rstrip()

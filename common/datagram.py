@@ -87,7 +87,10 @@ class Refusal(StrEnum):
 
 
 class Header(NamedTuple):
-    """The first 28 bytes, not yet proven: only `Opener.open` tells whether they are true."""
+    """First 28 bytes of a datagram, not yet authenticated.
+
+    Only `Opener.open` verifies them.
+    """
 
     kind: Kind
     key_id: int
@@ -95,7 +98,10 @@ class Header(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A datagram that is what it says. `reordered`: a later one came before it."""
+    """Authenticated datagram.
+
+    `reordered`: a later one arrived before it.
+    """
 
     body: bytes
     reordered: bool
@@ -126,10 +132,16 @@ def parse(datagram: bytes, rig_tag: int) -> Header | Refusal:
 
 
 class Sealer:
-    """Seals what one sender says under one key. Holds the counter; not for use by two threads."""
+    """Sealer of the datagrams of one sender under one key.
+
+    Holds the counter; not for use by two threads.
+    """
 
     def __init__(self, key: bytes, rig_tag: int, key_id: int) -> None:
-        """Begin counting at 1: a `Sealer` is made once for a key, and never again for the same."""
+        """Start counting at 1.
+
+        A `Sealer` is made once for a key, and never again for the same key.
+        """
         self._cipher = ChaCha20Poly1305(key)
         self._rig_tag = rig_tag
         self._key_id = key_id
@@ -150,7 +162,10 @@ class Sealer:
 
 
 class ReplayWindow:
-    """Which counters were taken. Holds the highest and one bit for each of the 1024 before it."""
+    """Replay window: record of the counters already accepted.
+
+    Holds the highest and one bit for each of the 1024 before it.
+    """
 
     def __init__(self) -> None:
         """Begin with nothing taken."""
@@ -160,11 +175,17 @@ class ReplayWindow:
 
     @property
     def missing(self) -> int:
-        """How many counters up to the highest never came: datagrams that were sent and lost."""
+        """Return how many counters up to the highest never arrived.
+
+        These are datagrams that were sent and lost.
+        """
         return self._highest - self._count
 
     def missing_between(self, after: int, before: int) -> int:
-        """How many counters between these two, both taken, never came; of what is too old to be known, all."""
+        """Return how many counters between two received ones never arrived.
+
+        Counters too old for the window all count as missing.
+        """
         newer, span = self._highest - before + 1, before - after - 1  # where it begins in bits; its length
         known = min(span, max(WINDOW - newer, 0))
         return span - ((self._received >> newer) & ((1 << known) - 1)).bit_count()
@@ -188,7 +209,10 @@ class ReplayWindow:
 
 
 class Opener:
-    """Opens what one sender sealed under one key, each datagram once. Holds the replay window."""
+    """Opener of the datagrams that one sender sealed under one key.
+
+    Opens each datagram once. Holds the replay window.
+    """
 
     def __init__(self, key: bytes) -> None:
         """Open datagrams sealed with `key`."""
@@ -197,15 +221,21 @@ class Opener:
 
     @property
     def missing(self) -> int:
-        """How many datagrams the sender sealed and this side never saw, up to the newest one."""
+        """Return how many sealed datagrams never arrived here, up to the newest one."""
         return self._window.missing
 
     def missing_between(self, after: int, before: int) -> int:
-        """How many datagrams between two that came (their counters) the sender sealed and this side never saw."""
+        """Return how many sealed datagrams between two received ones never arrived here.
+
+        The two are given by their counters.
+        """
         return self._window.missing_between(after, before)
 
     def open(self, header: Header, datagram: bytes) -> Opened | Refusal:
-        """Return the body of a datagram whose header `parse` returned, or why it is refused."""
+        """Return the body of a datagram, or why it is refused.
+
+        The header is the one `parse` returned.
+        """
         body = unseal(self._cipher, header, datagram)
         if body is None:
             return Refusal.FORGED
@@ -214,7 +244,10 @@ class Opener:
 
 
 def unseal(cipher: ChaCha20Poly1305, header: Header, datagram: bytes) -> bytes | None:
-    """Return the body if the seal fits, else None. Whether it is a replay is not asked."""
+    """Return the body if the seal is valid, else None.
+
+    Replay is not checked.
+    """
     try:
         return cipher.decrypt(_nonce(header.counter), datagram[HEADER.size :], datagram[: HEADER.size])
     except InvalidTag:

@@ -1,4 +1,6 @@
-"""Endpoints of the bus: which may leave the machine, which one a program takes, and where a listener is reached.
+"""Bus endpoints: which may leave the machine, and which one a program uses.
+
+Also where a listener can be reached.
 
 `tls/HOST:PORT` (or `quic/`) is encrypted, and both sides prove who they are. `tcp/` is neither: it stays on a loopback
 address, which other machines cannot reach, unless somebody says `--open`.
@@ -21,7 +23,7 @@ def encrypted(endpoint: str) -> bool:
 
 
 def check(endpoint: str, open_bus: bool) -> None:
-    """Refuse an endpoint that is none, or whose traffic would leave the machine as plain text.
+    """Refuse an invalid endpoint, or one that sends plain text off this machine.
 
     Args:
         endpoint: As `tls/192.168.1.2:47802`.
@@ -44,7 +46,7 @@ def check(endpoint: str, open_bus: bool) -> None:
 
 
 def loopback(endpoint: str) -> bool:
-    """Whether the endpoint is on an address of this machine that no other machine reaches."""
+    """Return whether the endpoint's address is reachable from this machine only."""
     host = host_of(endpoint)
     if host == "localhost":
         return True
@@ -66,12 +68,18 @@ def port_of(endpoint: str) -> int:
 
 
 def default_bus(environment: Mapping[str, str]) -> str:
-    """The bus of a program that was told none: encrypted where there are keys, on this machine in any case."""
+    """Return the bus of a program that was given none.
+
+    Encrypted where there are keys, on this machine in any case.
+    """
     return f"{'tcp' if keys_folder(environment) is None else 'tls'}/127.0.0.1:{_PORT}"
 
 
 def reached_at(endpoint: str, address: str) -> str:
-    """Where a listener is that says it listens on all addresses of a machine whose `address` was heard."""
+    """Return the address of a listener that listens on all addresses of a machine.
+
+    `address` is the machine's address from which it was received.
+    """
     if host_of(endpoint) != ANYWHERE:
         return endpoint
     try:

@@ -20,11 +20,17 @@ what it is everywhere: the caller passed something of the wrong shape or range.
 
 
 class PhalanxError(Exception):
-    """Base of every error a user can cause or mend; its text names the thing and the fix."""
+    """Base of every error that a user can cause or fix.
+
+    Its text names the thing and the fix.
+    """
 
 
 class CalibrationError(PhalanxError):
-    """A calibration file is missing, broken or impossible. The text names file and key."""
+    """Error of a missing, broken or impossible calibration file.
+
+    The text names file and key.
+    """
 
 
 class RecordingError(PhalanxError):
@@ -40,15 +46,24 @@ class ImuError(PhalanxError):
 
 
 class TrackerError(PhalanxError):
-    """A device that tracks itself is gone, or its system is not installed. Never answered with a fake one."""
+    """Error of a tracking device that is gone, or whose system is not installed.
+
+    It concerns a device that tracks itself. A fake one is never substituted.
+    """
 
 
 class TrackerChoiceError(TrackerError):
-    """Several devices are there, and nobody said which one is meant. Waiting mends nothing."""
+    """Error raised when several devices are present and none was selected.
+
+    Waiting does not help.
+    """
 
 
 class LightsError(PhalanxError):
-    """Laser or LEDs cannot be switched, or would be on for longer than is safe. Never answered with fake ones."""
+    """Error of laser or LEDs that cannot be switched, or would be on unsafely long.
+
+    Fake ones are never substituted.
+    """
 
 
 class PictureError(PhalanxError):

@@ -1,4 +1,6 @@
-"""How much light an eye may get: laser class 1 (IEC 60825-1) and infrared lamps of the exempt group (IEC 62471).
+"""Eye safety limits of light: laser class 1 and infrared lamps.
+
+Laser class 1 by IEC 60825-1, infrared lamps of the exempt group by IEC 62471.
 
 Only what a wrist device needs: one wavelength between 700 and 1050 nm, and sources taken as points where that is the
 stricter case. IEC 60825-1 is edition 3 (2014) unless said otherwise, IEC 62471 is edition 1 (2006). All in SI units.
@@ -16,12 +18,17 @@ _ALPHA_LONG, _ALPHA_SHORT, _ALPHA_LARGE = 0.011, 0.0017, 0.1  # rad; IEC 62471, 
 
 
 def laser_c4(wavelength_nm: float) -> float:
-    """Correction C4 of the retina's limits, 700 to 1050 nm: 10^(0.002 (wavelength - 700)) (IEC 60825-1, table 9)."""
+    """Return correction C4 of the retinal limits, 700 to 1050 nm.
+
+    10^(0.002 (wavelength - 700)) (IEC 60825-1, table 9).
+    """
     return 10.0 ** (0.002 * (wavelength_nm - 700.0))
 
 
 def class_1_energy_j(wavelength_nm: float, duration_s: float) -> float:
-    """Class 1 limit of one pulse of a point source through the pupil [J]: 7e-4 t^0.75 C4 (IEC 60825-1, table 3).
+    """Return the class 1 energy limit [J] of one pulse of a point source.
+
+    Through the pupil: 7e-4 t^0.75 C4 (IEC 60825-1, table 3).
 
     From 5 us to 10 s; a shorter pulse may have as much as one of 5 us.
     """
@@ -29,7 +36,9 @@ def class_1_energy_j(wavelength_nm: float, duration_s: float) -> float:
 
 
 def class_1_power_w(wavelength_nm: float) -> float:
-    """Class 1 limit of the power of a point source through the pupil, longer than 10 s [W]: 3.9e-4 C4 C7.
+    """Return the class 1 power limit [W] of a point source, longer than 10 s.
+
+    Through the pupil: 3.9e-4 C4 C7.
 
     IEC 60825-1, table 3; C7 is 1 up to 1150 nm (table 9).
     """
@@ -37,7 +46,9 @@ def class_1_power_w(wavelength_nm: float) -> float:
 
 
 def train_c5(pulses: float) -> float:
-    """What is left of the limit of one pulse in a train of so many within 10 s: N^-0.25 (IEC 60825-1:2007, 8.3 f).
+    """Return the factor on the single-pulse limit for a train of pulses.
+
+    For N pulses within 10 s: N^-0.25 (IEC 60825-1:2007, 8.3 f).
 
     Edition 3 lets pulses longer than 5 us of a small source have 1 (4.3 f); the stricter rule is kept here.
     """
@@ -45,7 +56,9 @@ def train_c5(pulses: float) -> float:
 
 
 def share_of_fan(fan_rad: float, peak_over_mean: float) -> float:
-    """Share of the power of a line laser that enters the pupil: 7 mm of the line, where it is brightest.
+    """Return the share of a line laser's power that enters the pupil.
+
+    The pupil covers 7 mm of the line, where it is brightest.
 
     Across the line all of it enters.
 
@@ -57,12 +70,17 @@ def share_of_fan(fan_rad: float, peak_over_mean: float) -> float:
 
 
 def lamp_irradiance_w_m2(intensity_w_sr: float) -> float:
-    """What falls on an eye 200 mm before a lamp [W/m^2], by its radiant intensity on the axis [W/sr]: I / d^2."""
+    """Return the irradiance [W/m^2] of an eye 200 mm in front of a lamp.
+
+    From its radiant intensity on the axis [W/sr]: I / d^2.
+    """
     return intensity_w_sr / LAMP_AT_M**2
 
 
 def retina_w_m2_sr(intensity_w_sr: float, emitter_m: float, wavelength_nm: float, pulsed: bool) -> float:
-    """Burn-hazard weighted radiance of one emitter [W/(m^2 sr)], 200 mm away: R L (IEC 62471, 4.3.5, 4.3.6).
+    """Return the burn-hazard weighted radiance of one emitter [W/(m^2 sr)].
+
+    At 200 mm: R L (IEC 62471, 4.3.5, 4.3.6).
 
     R(wavelength) = 10^((700 - wavelength) / 500) (table 4.2). The radiance is the mean over the smallest field that
     the eye's movements leave: 1.7 mrad for a pulse, 11 mrad for long (4.2.2).
@@ -79,15 +97,24 @@ def retina_w_m2_sr(intensity_w_sr: float, emitter_m: float, wavelength_nm: float
 
 
 def retina_pulse_limit_w_m2_sr(emitter_m: float, duration_s: float) -> float:
-    """Limit of the weighted radiance of one pulse [W/(m^2 sr)]: 50000 / (alpha t^0.25) (IEC 62471, 4.3.5)."""
+    """Return the limit of the weighted radiance of one pulse [W/(m^2 sr)].
+
+    50000 / (alpha t^0.25) (IEC 62471, 4.3.5).
+    """
     return 5e4 / (_alpha(emitter_m, _ALPHA_SHORT) * duration_s**0.25)
 
 
 def retina_weak_limit_w_m2_sr(emitter_m: float) -> float:
-    """Limit of the weighted radiance of what hardly is seen, longer than 10 s: 6000 / alpha (IEC 62471, 4.3.6)."""
+    """Return the weighted radiance limit of a weak visual stimulus, beyond 10 s.
+
+    For light that is hardly seen: 6000 / alpha (IEC 62471, 4.3.6).
+    """
     return 6e3 / _alpha(emitter_m, _ALPHA_LONG)
 
 
 def _alpha(emitter_m: float, least_rad: float) -> float:
-    """Angle under which an emitter is seen from 200 mm [rad], within what the limits know."""
+    """Return the angle subtended by an emitter at 200 mm [rad].
+
+    Clipped to the range for which the limits are defined.
+    """
     return min(max(emitter_m / LAMP_AT_M, least_rad), _ALPHA_LARGE)

@@ -1,4 +1,7 @@
-"""Notice that files changed since they were last looked at. Looking costs one `stat` per file."""
+"""File change monitor: detects changes since the last check.
+
+A check costs one `stat` per file.
+"""
 
 import hashlib
 from collections.abc import Iterable
@@ -15,14 +18,19 @@ class _Look:
 
 
 class MonitoredFiles:
-    """Holds how each file was when it was last looked at; nothing before the first look."""
+    """Set of monitored files and their state at the last check.
+
+    Empty before the first check.
+    """
 
     def __init__(self) -> None:
         """Nothing was looked at yet."""
         self._seen: dict[Path, _Look | None] = {}
 
     def changed(self, paths: Iterable[Path]) -> bool:
-        """Look: whether the content of a file is new, or it has come or gone. Each change is told once.
+        """Check whether file content is new, or a file has appeared or disappeared.
+
+        Each change is reported once.
 
         The first look at a file tells of a change: whoever read the file before may have read another content.
         """

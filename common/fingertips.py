@@ -1,4 +1,6 @@
-"""Where a fingertip is: the outermost point of the skin along the finger's last bone.
+"""Position of a fingertip.
+
+It is the outermost point of the skin along the finger's last bone.
 
 The last joint of a hand file lies inside the fingertip. OpenXR defines its radius as the distance from there to the
 skin (XR_EXT_hand_tracking), so where the file gives radii the tip is that far beyond the joint. If it gives none, the

@@ -1,4 +1,7 @@
-"""The flat field of a wrist device's LEDs as a function of the image: the polynomial that `FlatField` describes."""
+"""Flat field of a wrist device's LEDs as a function of image position.
+
+It is the polynomial that `FlatField` describes.
+"""
 
 import numpy as np
 
@@ -9,7 +12,10 @@ _LEAST = 0.02  # a polynomial beyond where it was measured must not turn the ima
 
 
 def terms_of(xy: Float, degree: int) -> Float:
-    """Terms (..., T) of the polynomial at normalised image points (..., 2), ordered as `FlatField.coefficients`."""
+    """Return the polynomial terms (..., T) at normalised image points (..., 2).
+
+    Ordered as `FlatField.coefficients`.
+    """
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([x ** (d - k) * y**k for d in range(degree + 1) for k in range(d + 1)], axis=-1)
 
@@ -20,5 +26,8 @@ def field_at(field: FlatField, xy: Float) -> Float:
 
 
 def flat_of(field: FlatField, xy: Float) -> Float:
-    """The flat field (...) at normalised image points (..., 2), never less than a fiftieth of that on the axis."""
+    """Return the flat field (...) at normalised image points (..., 2).
+
+    Never less than a fiftieth of the value on the axis.
+    """
     return np.maximum(field_at(field, xy), _LEAST)

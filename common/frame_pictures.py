@@ -1,4 +1,6 @@
-"""Pictures of a recording, in the order in which they are asked for: each a file of its own, or a frame of a video.
+"""Reader of a recording's pictures in the order in which they are requested.
+
+Each is a file of its own, or a frame of a video.
 
 A row of frames.csv names the file of a picture, `left/000007.png`, or a video in the recording's folder and the number
 of a frame in it, `left.mp4/000007`.

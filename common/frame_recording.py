@@ -1,4 +1,6 @@
-"""A recording of raw frames: a folder with recording.json, frames.csv and pictures, or videos.
+"""Recording of raw frames.
+
+A folder with recording.json, frames.csv and pictures, or videos.
 
 The replay camera and the offline solver read it; `common.frame_writing` writes it. Whatever ended the recording,
 what is there can be read: the manifest comes first, and a frame's row after its file. So only the last row can be
@@ -84,7 +86,9 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return tuple(sorted(rigs, key=lambda rig: rig.kind != "markers"))
 
     def rig_named(self, name: str | None) -> RigCalibration:
-        """The rig called `name`; None: the marker rig, or the wrist rig where there is no other.
+        """Return the rig called `name`.
+
+        None: the marker rig, or the wrist rig where there is no other.
 
         Raises:
             RecordingError: There is no such rig.
@@ -139,7 +143,10 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameRecording:
-    """An opened recording: its folder, manifest and frame table, in the order of the file."""
+    """Opened recording: its folder, manifest and frame table.
+
+    The table is in the order of the file.
+    """
 
     folder: Path
     manifest: Manifest
@@ -203,7 +210,9 @@ def open_recording(folder: Path) -> FrameRecording:
 
 
 def check_manifest(manifest: Manifest, where: str) -> None:
-    """Refuse what `load` cannot see: the files inside the manifest, and whether they fit together.
+    """Check the files inside the manifest, and whether they are consistent.
+
+    `load` cannot detect these errors; they are refused here.
 
     Raises:
         CalibrationError: With `where` and the key.
@@ -225,7 +234,10 @@ def check_manifest(manifest: Manifest, where: str) -> None:
 
 
 def _rows(path: Path, text: str) -> tuple[FrameRow, ...]:
-    """All rows of frames.csv; the last one is left out, with a warning, where the end of the recording cut it."""
+    """Return all rows of frames.csv.
+
+    The last one is rejected, with a warning, where the end of the recording cut it.
+    """
     reader = csv.reader(io.StringIO(text, newline=""))
     if tuple(next(reader, ())) != COLUMNS:
         raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")

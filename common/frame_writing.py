@@ -1,4 +1,4 @@
-"""Write a recording of raw frames, so that whatever happens, what is there can be read.
+"""Writer of raw frame recordings that stay readable after any interruption.
 
 The order is the guarantee: first the manifest, then for every frame its file, whole, and only then its row. A step
 that fails takes back what it left half done. So no row ever stands without its complete file, whether the disk is
@@ -23,7 +23,9 @@ _PNG = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 
 
 def encode_png(image: Image) -> bytes:
-    """PNG file of `image` (H, W, 3) BGR or (H, W) grey, uint8; lossless. Any thread may call it.
+    """Encode `image` losslessly as a PNG file.
+
+    (H, W, 3) BGR or (H, W) grey, uint8. Any thread may call it.
 
     Raises:
         RecordingError: OpenCV cannot encode it.
@@ -90,7 +92,9 @@ class RecordingWriter:
             raise RecordingError(f"{folder / FRAMES}: cannot write: {error.strerror}") from error
 
     def add(self, camera: str, seq: int, t_ns: int, illumination: Illumination, png: bytes) -> FrameRow:
-        """Write one frame: its file, then its row. After an error the frame is as if it had never been.
+        """Write one frame: its file, then its row.
+
+        After an error the frame leaves no trace.
 
         Args:
             camera: A camera of the manifest.

@@ -1,4 +1,7 @@
-"""Rigid transforms, quaternions (wxyz) and small fits. `T_a_b` maps coordinates in b to coordinates in a."""
+"""Rigid transforms, quaternions (wxyz) and small fits.
+
+`T_a_b` maps coordinates in b to coordinates in a.
+"""
 
 import numpy as np
 
@@ -12,7 +15,10 @@ _UNSKEW: Float = 0.5 * _SKEW.T
 
 
 def _shepperd() -> Float:
-    """Linear map (9, 16) from a rotation's elements to Shepperd's four forms of its quaternion, each times 4 q[k] q."""
+    """Return the linear map (9, 16) from a rotation to Shepperd's quaternion forms.
+
+    It maps a rotation's elements to the four forms of its quaternion, each times 4 q[k] q.
+    """
     out = np.zeros((3, 3, 4, 4))
     for i, signs in enumerate(((1, 1, -1, -1), (1, -1, 1, -1), (1, -1, -1, 1))):
         out[i, i] = np.diag(signs)
@@ -40,7 +46,10 @@ def quaternion_to_matrix(q_wxyz: Float) -> Float:
 
 
 def quaternion_product(p: Wxyz, q: Wxyz) -> Wxyz:
-    """The rotation p after q; of one pair plain numbers are ten times faster than arrays."""
+    """Return the product of two quaternions: the rotation p after q.
+
+    For one pair, plain numbers are ten times faster than arrays.
+    """
     a, b, c, d = p
     w, x, y, z = q
     return (
@@ -81,7 +90,10 @@ def matrix_to_quaternion(rotation: Float) -> Float:
 
 
 def rotation_vector_to_matrix(vector: Float) -> Float:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues' formula)."""
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad].
+
+    By Rodrigues' formula.
+    """
     # A turn too small to be told from none is taken as this small, not divided by.
     angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-9)[..., None, None]
     k = skew(vector)
@@ -89,7 +101,10 @@ def rotation_vector_to_matrix(vector: Float) -> Float:
 
 
 def matrix_to_rotation_vector(rotation: Float) -> Float:
-    """Rotation vectors (..., 3) [rad], at most half a turn, of rotation matrices (..., 3, 3)."""
+    """Return rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3).
+
+    Each is at most half a turn.
+    """
     q = matrix_to_quaternion(rotation)
     sine = np.sqrt(np.vecdot(q[..., 1:], q[..., 1:]))
     half = np.arctan2(sine, q[..., 0])
@@ -102,12 +117,18 @@ def skew(vector: Float) -> Float:
 
 
 def unskew(matrix: Float) -> Float:
-    """Vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3): `unskew(skew(a)) == a`."""
+    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3).
+
+    `unskew(skew(a)) == a`.
+    """
     return matrix.reshape(*matrix.shape[:-2], 9) @ _UNSKEW
 
 
 def cross(a: Float, b: Float) -> Float:
-    """Cross products of (..., 3) arrays; several times faster than numpy's for small ones."""
+    """Return cross products of (..., 3) arrays.
+
+    Several times faster than numpy's for small ones.
+    """
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
@@ -147,7 +168,9 @@ def rigid(rotation: Float, translation: Float) -> Float:
 
 
 def fit_rigid(points_a: Float, points_b: Float, weight: Float | None = None) -> Float:
-    """Least-squares `T_a_b` (..., 4, 4) with points_a ~ T_a_b points_b, both (..., N, 3) (Kabsch, 1976).
+    """Fit `T_a_b` (..., 4, 4) in least squares: points_a ~ T_a_b points_b.
+
+    Both are (..., N, 3) (Kabsch, 1976).
 
     Args:
         points_a: Points in frame a.

@@ -1,4 +1,6 @@
-"""What counts as a pinch, a turned dial, a tap of the thumb and a pointing finger: the parts of a gestures file.
+"""Action settings of a gestures file: pinch, dial, thumb tap and pointing.
+
+They define what counts as a pinch, a turned dial, a tap of the thumb and a pointing finger.
 
 All distances are between skins, of round cones about the bones as the hand's profile has them: 0 is touch, and what is
 beyond it presses. Every threshold comes in a pair, one to begin and one to end, so that nothing flickers between.
@@ -70,7 +72,9 @@ class DialSettings(Part, frozen=True):
 
 
 class TapSettings(Part, frozen=True):
-    """The thumb's tip on a segment of a finger: twelve keys, while the fingers lie side by side as a pad.
+    """Settings of taps of the thumb's tip on a finger segment.
+
+    Twelve keys, while the fingers lie side by side as a pad.
 
     Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
     `touch_gap_m`, `leave_gap_m`: between the skins of thumb and finger at which it touches and leaves; it leaves

@@ -1,4 +1,6 @@
-"""gestures/<name>.json: what counts as which gesture. The defaults here are calib_json/gestures/default.json.
+"""gestures/<name>.json: what counts as which gesture.
+
+The defaults here are those of calib_json/gestures/default.json.
 
 A pose is a set of ranges, each of one measured quantity of the hand with a soft border. Inside its range a quantity
 fits; outside it misfits by z = distance to the range / border, and the pose fits by exp(-1/2 sum z^2). What the file
@@ -37,7 +39,10 @@ Score = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Span(Part, frozen=True):
-    """What a quantity may be: from `low` to `high` without loss, beyond with one standard deviation per `soft`."""
+    """Admissible range of a quantity, with soft bounds.
+
+    From `low` to `high` without loss, beyond with one standard deviation per `soft`.
+    """
 
     low: Measured
     high: Measured
@@ -157,7 +162,9 @@ def study_poses() -> dict[Name, PoseShape]:
 
 
 class GestureSettings(Part, frozen=True):
-    """gestures/<name>.json: the poses of a hand, by name, how they are held, and the thresholds of the actions.
+    """Contents of gestures/<name>.json.
+
+    The poses of a hand, by name, how they are held, and the thresholds of the actions.
 
     Of a taught pose the provenance says, under its name, from what.
     """

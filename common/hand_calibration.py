@@ -18,14 +18,20 @@ _UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of on
 
 
 class RestJoint(Part, frozen=True):
-    """One joint of the flat hand, palm frame; OpenXR axes: -z along the bone to the tip, +y dorsal."""
+    """One joint of the flat hand, in the palm frame.
+
+    OpenXR axes: -z along the bone to the tip, +y dorsal.
+    """
 
     position_m: HandPlace
     orientation_wxyz: Quaternion
 
 
 class MarkerMount(Part, frozen=True):
-    """Where a painted cap sits: the joint it is fixed to (or palm_frame), its centroid there, its painted length."""
+    """Mounting of a painted cap: its joint, its centroid and its painted length.
+
+    The joint is the one it is fixed to (or palm_frame); the centroid is in that frame.
+    """
 
     joint: str
     offset_m: HandPlace
@@ -40,7 +46,9 @@ Tolerance = Annotated[float, Meta(ge=0.0, le=1.0)]  # [rad]
 
 
 class FingerLimits(Part, frozen=True):
-    """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
+    """Lower and upper limits of the four angles of a finger [rad].
+
+    Zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
 
     `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
     1: the range stays. `tolerance_rad`: standard deviation by which people differ from these limits, for each angle; 0:
@@ -66,7 +74,9 @@ class Limits(Part, frozen=True):
 
 
 class Couplings(Part, frozen=True):
-    """Natural relations between the angles of index ... little; each can be switched off.
+    """Natural joint couplings between the angles of index ... little.
+
+    Each can be switched off.
 
     `dip_per_pip` None: the DIP is free. `dip_spread_rad`: standard deviation of the DIP about that ratio; 0: it is
     kept exactly. `mcp_per_pip` None: no natural flexion. `neighbours`: fingers side by side tend to bend alike.
@@ -82,7 +92,9 @@ Variance = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad^2] or covariance
 
 
 class Posture(Part, frozen=True):
-    """How a person holds the hand: a normal distribution of its 20 angles, fitted to motion.
+    """Posture prior of a person: a normal distribution of the 20 angles of the hand.
+
+    Fitted to motion.
 
     Attributes:
         mean_rad: Abduction, flexion, PIP, DIP (thumb CMC, CMC, MCP, IP) of thumb ... little, columns of `HandModel`.
@@ -102,7 +114,9 @@ PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
 
 
 class HandProfile(Part, frozen=True):
-    """hands/<name>.json: bones and markers of one hand, optionally radii, skin, limits and couplings.
+    """Contents of hands/<name>.json: bones and markers of one hand.
+
+    Optionally radii, skin, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
     `posture`: how this person holds the fingers, in place of the couplings' prior; DIPs are free then.

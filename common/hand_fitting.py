@@ -1,4 +1,6 @@
-"""A hand profile from joints that another tracker recorded (Leap, WebXR), so that its hand can be tracked by ours.
+"""Fit of a hand profile to joints recorded by another tracker (Leap, WebXR).
+
+The hand can then be tracked by this project.
 
 Two ways. A tracker that reports joint *frames* (WebXR) shows the rest pose itself in one flat hand. One that reports
 joint *places* shows it in a motion: bones are the mean distances, the palm the median places of the roots, and the
@@ -140,7 +142,10 @@ def profile_from_joints(
 
 
 def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
-    """Say which fingers the profile does not follow, and whose rest heading is not that of the motion."""
+    """Warn about fingers that the profile does not follow.
+
+    Also about those whose rest heading is not that of the motion.
+    """
     off = np.linalg.norm(model.chains(angles).position_m - fingers_m, axis=3).mean(axis=(0, 2))
     steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
     flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)
@@ -182,7 +187,10 @@ def _with_posture(profile: HandProfile, angles: Float) -> HandProfile:
 
 
 def _finger_rest(bones: Float, normals: Float) -> Float:
-    """Rest frame (3, 3) of a finger of unit bones (T, 3, 3) and bend normals (T, 3), palm frame."""
+    """Return the rest frame (3, 3) of a finger in the palm frame.
+
+    From its unit bones (T, 3, 3) and flexion normals (T, 3).
+    """
     height = normals[:, 1].sum() / np.linalg.norm(normals, axis=1).sum()
     level = np.sqrt(1.0 - height * height)  # cosine of the roll of the hinge, `height` its sine
     # The proximal bone at flexion a: -level sin a above the palm, and ahead and aside of the rest heading in it.
@@ -214,7 +222,10 @@ def _thumb_rest(bones: Float, normals: Float, right: bool) -> Float:
 
 
 def _extended(bones: Float) -> Int:
-    """The tenth of the frames in which a finger (T, 3, 3) is straightest and nearest the palm's plane."""
+    """Return the tenth of the frames in which a finger (T, 3, 3) is most extended.
+
+    That is, straightest and nearest the palm's plane.
+    """
     straight = (bones[:, 0] * bones[:, 1]).sum(axis=1)
     level = 1.0 - np.abs(bones[:, 0, 1])
     return np.argsort(-(straight + level))[: max(1, round(_EXTENDED * len(bones)))]

@@ -1,4 +1,6 @@
-"""Which angles a hand allows: a range per angle, and abduction that narrows with flexion.
+"""Joint limits of a hand: a range per angle.
+
+The range of abduction narrows with flexion.
 
 Spread fingers cannot stay spread in a fist: the collateral ligaments of the MCP tighten, because the head of the
 metacarpal is a cam. With f the flexion, F the highest and s what is left there, the range of the abduction is
@@ -25,7 +27,9 @@ FloatOrArray = TypeVar("FloatOrArray", float, Float)
 
 
 def spread_left(flexed: FloatOrArray, at_full_flexion: FloatOrArray) -> FloatOrArray:
-    """Share of the abduction range that is left, a parabola from 1 down to `at_full_flexion`.
+    """Return the share of the abduction range that remains at a flexion.
+
+    A parabola from 1 down to `at_full_flexion`.
 
     Args:
         flexed: Flexion as a share of the highest, 0 ... 1.

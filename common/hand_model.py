@@ -1,4 +1,6 @@
-"""One hand: 26 OpenXR joints, bones, limits, couplings, and forward kinematics from a profile's rest pose.
+"""Hand model: 26 OpenXR joints, bones, limits, couplings, forward kinematics.
+
+Starts from a profile's rest pose.
 
 Angles (5, 4) [rad] are zero in the rest pose; fingers thumb, index, middle, ring, little; columns abduction,
 flexion (MCP; thumb CMC), PIP (thumb MCP), DIP (thumb IP). A flexion by a is a rotation by -a about the
@@ -85,7 +87,10 @@ class HandJoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """Where a marker sits: joint index (None: the palm frame), centroid in that frame (3,) [m], painted length [m]."""
+    """Mounting of a marker: joint index, centroid (3,) [m] and painted length [m].
+
+    Index None: the palm frame. The centroid is in the frame of that joint.
+    """
 
     joint: int | None
     offset_m: Float
@@ -144,7 +149,10 @@ class HandModel:
     swing: Float
 
     def __post_init__(self) -> None:
-        """Make the radii read-only: poses adopt them, and kernels take what is read-only for another type."""
+        """Make the radii read-only.
+
+        Poses adopt them, and kernels take a read-only array for another type.
+        """
         self.radius_m.setflags(write=False)
 
     @classmethod
@@ -190,7 +198,10 @@ class HandModel:
         )
 
     def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
-        """Joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad]; any matching leading axes."""
+        """Return the joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad].
+
+        Any matching leading axes.
+        """
         chains = self.chains(np.asarray(angles_rad, dtype=np.float64))
         return self.joints(np.asarray(T_rig_palm, dtype=np.float64), chains)
 
@@ -251,7 +262,10 @@ class HandModel:
         return self.mounts[name]
 
     def abduction_limits_rad(self, flexion_rad: Float) -> tuple[Float, Float]:
-        """Low and high (..., 5) [rad] of the abduction at flexions (..., 5) [rad]; NaN where the flexion is."""
+        """Return the abduction limits (..., 5) [rad] at flexions (..., 5) [rad].
+
+        Low and high; NaN where the flexion is NaN.
+        """
         most = self.limits_rad[:, FLEXION, 1]
         flexed = np.minimum(np.maximum(flexion_rad, 0.0), most) / np.where(most > 0.0, most, 1.0)
         left = spread_left(np.maximum(flexed, 0.0), self.spread_at_full_flexion)
@@ -265,12 +279,18 @@ class HandModel:
         return low, high
 
     def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
-        """Whether each of the angles (..., 5, 4) is inside its limits; the abduction inside those of its flexion."""
+        """Return whether each of the angles (..., 5, 4) is inside its limits.
+
+        The abduction must be inside the limits at its flexion.
+        """
         low, high = self.limits_at(angles_rad[..., FLEXION])
         return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
 
     def clamp(self, angles_rad: Float) -> Float:
-        """Angles (..., 5, 4) cut at their limits, the abduction at those of the flexion that is left."""
+        """Clamp angles (..., 5, 4) to their limits.
+
+        The abduction is clamped to the limits at the clamped flexion.
+        """
         legal = np.minimum(np.maximum(angles_rad, self.limits_rad[..., 0]), self.limits_rad[..., 1])
         low, high = self.abduction_limits_rad(legal[..., FLEXION])
         legal[..., ABDUCTION] = np.minimum(np.maximum(angles_rad[..., ABDUCTION], low), high)
@@ -288,7 +308,10 @@ def _swing(root: Float, link_rotation: Float, side_sign: float) -> Float:
 
 
 def _about(axis: int, sign: float) -> Float:
-    """Rotation by sign * a about coordinate axis 0 or 1 (3, 3, 3): what is constant, times cos a, times sin a."""
+    """Return the rotation by sign * a about axis 0 or 1 as three terms (3, 3, 3).
+
+    Coordinate axis. The terms: constant, times cos a, times sin a.
+    """
     parts = np.zeros((3, 3, 3))
     i, j = (axis + 1) % 3, (axis + 2) % 3
     parts[0, axis, axis] = parts[1, i, i] = parts[1, j, j] = 1.0

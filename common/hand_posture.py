@@ -1,4 +1,6 @@
-"""The posture prior of a person: joint angles of recorded joints, and a normal distribution fitted to them.
+"""Posture prior of a person.
+
+Joint angles of recorded joints, and a normal distribution fitted to them.
 
 It is one distribution of all 20 angles, for fingers move together: four that each had their own would tell four times
 how the palm is turned. A recording is one sample of how a person moves, so it is shrunk towards a wide prior as if that
@@ -63,7 +65,10 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
 
 
 def _hinge(rest: Float, angle: Float, thumb: bool) -> Float:
-    """(T, 3) what a flexion turns about, -x of the joint, palm frame, at turns (T,) by the abduction."""
+    """Return the flexion axis (T, 3) of a joint, in the palm frame.
+
+    It is -x of the joint, at abduction angles (T,).
+    """
     about = np.zeros((len(angle), 3, 3))
     about[:, 0, 0] = about[:, 2, 2] = np.cos(angle)
     about[:, 0, 2], about[:, 2, 0], about[:, 1, 1] = np.sin(angle), -np.sin(angle), 1.0
@@ -119,7 +124,10 @@ def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
 
 
 def _independent(samples: Float) -> float:
-    """How many independent samples (T, K) of a motion are worth, by the correlation of neighbours."""
+    """Return the effective number of independent samples of a motion (T, K).
+
+    From the correlation of neighbours.
+    """
     off = samples - samples.mean(axis=0)
     correlation = np.clip(
         (off[1:] * off[:-1]).sum(axis=0) / np.maximum((off * off).sum(axis=0), 1e-12), 0.0, 0.9999

@@ -1,4 +1,6 @@
-"""What a hand profile may leave out: joint limits and couplings as the two papers give them, and radii.
+"""Defaults for what a hand profile may omit.
+
+Joint limits and couplings as given in the two papers, and radii.
 
 How far abduction narrows in a fist is in neither paper. Fingers pushed aside by a known force give way by 24
 degrees at a straight MCP and by 15 at 90 degrees of flexion, the mean of all fingers of 100 people (Lutsky, Matzon,
@@ -56,7 +58,10 @@ def without_tolerance(limits: Limits) -> Limits:
 
 
 def preset_couplings(preset: Preset) -> Couplings:
-    """DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion."""
+    """Return the couplings of a preset.
+
+    DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion.
+    """
     return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
 
 

@@ -1,4 +1,6 @@
-"""Hand profiles made from one number, the length of the hand, as a quick start before a hand is measured.
+"""Hand profiles generated from one number, the length of the hand.
+
+A quick start before a hand is measured.
 
 Bone lengths are the shares of hand length published by Buchholz, Armstrong & Goldstein (1992); the layout of
 the palm is a plain fan. Left profiles are the exact mirror image of right ones.
@@ -42,7 +44,9 @@ _MARKER_JOINT = {
 
 
 def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> HandProfile:
-    """A right or left profile scaled from the length of the hand, wrist crease to middle finger end [m].
+    """Return a right or left profile scaled from the length of the hand.
+
+    The length is from wrist crease to middle finger end [m].
 
     Raises:
         ValueError: The side is neither "left" nor "right", or the length is no hand's (0.1 to 0.25 m).
@@ -86,7 +90,10 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
 
 
 def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
-    """The same hand, larger or smaller: positions, offsets, radii and painted lengths times `factor`."""
+    """Return the hand profile scaled by `factor`.
+
+    Positions, offsets, radii and painted lengths are multiplied by `factor`.
+    """
 
     def scaled(vector: Vector3) -> Vector3:
         return _vector(factor * np.array(vector))
@@ -108,7 +115,10 @@ def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
 
 
 def mirrored_profile(profile: HandProfile) -> HandProfile:
-    """The other hand of the same person, under the same name: mirrored in the palm's x."""
+    """Return the other hand of the same person, under the same name.
+
+    Mirrored in the palm's x.
+    """
 
     def mirrored(vector: Vector3) -> Vector3:
         x, y, z = vector
@@ -135,7 +145,10 @@ def _vector(value: Float) -> Vector3:
 
 
 def joint_frame(heading: Float, dorsal: Float) -> Float:
-    """Joint frame (3, 3) in the frame of its arguments: -z along heading (3,), +y as near to dorsal (3,) as may be."""
+    """Return the joint frame (3, 3) in the frame of its arguments.
+
+    -z is along heading (3,), +y as near to dorsal (3,) as possible.
+    """
     z = -heading / np.linalg.norm(heading)
     y = dorsal - (dorsal @ z) * z
     y = y / np.linalg.norm(y)

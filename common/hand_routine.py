@@ -1,4 +1,6 @@
-"""The guided routine by which a hand is measured: which posture follows which, in 20 s, and how each step is told.
+"""Guided routine by which a hand is measured.
+
+The order of the postures, in 20 s, and the instruction for each step.
 
 Only some ways of bending tell lengths. A straight finger that bends at the knuckle alone draws a circle about the
 knuckle; one that curls while the knuckle is held draws the arc of its two farther bones. The postures (flat, tabletop,
@@ -48,7 +50,10 @@ class Move:
         return np.maximum(self.before[:, 2], self.after[:, 2]) < STRAIGHT_DEG
 
     def posture(self, share: float) -> Float:
-        """(5, 3) [deg] when `share` (0 ... 1) of its time is over; smooth, at rest at both ends."""
+        """Return the posture (5, 3) [deg] after `share` (0 ... 1) of its time.
+
+        Smooth, at rest at both ends.
+        """
         s = min(max(share, 0.0), 1.0)
         return self.before + (self.after - self.before) * (s * s * s * (s * (6.0 * s - 15.0) + 10.0))
 
@@ -108,7 +113,10 @@ ROUTINE_S = MOVES[-1].stop_s
 
 
 def move_at(t_s: float) -> Move:
-    """The move of routine time `t_s` [s]; the first before the beginning, the last after the end."""
+    """Return the move at routine time `t_s` [s].
+
+    The first before the beginning, the last after the end.
+    """
     return next((move for move in MOVES if t_s < move.stop_s), MOVES[-1])
 
 

@@ -1,4 +1,6 @@
-"""Somebody else's IMU recording: a CSV with a header, read by the names of its columns.
+"""Third-party IMU recording: a CSV with a header.
+
+Read by the names of its columns.
 
 Columns in any order between commas, semicolons or tabs, others beside them (`imu_csv_columns`); comments before the
 header are skipped, a header of two lines (group, then axis) is joined, and between semicolons a decimal comma is one. A
@@ -156,7 +158,10 @@ def _missing(columns: Mapping[tuple[str, str], object], *, timed: bool) -> list[
 def _rows(
     lines: Sequence[str], first: int, delimiter: str, columns: Columns
 ) -> tuple[list[Decimal], Float, int]:
-    """Times as they stand there, values (T, columns) by the order of `columns`, and how many rows came late."""
+    """Return the times as written, values (T, columns) and the number of late rows.
+
+    The values are in the order of `columns`.
+    """
     times: list[Decimal] = []
     values: list[list[float]] = []
     late, last = 0, len(lines)
@@ -195,7 +200,10 @@ def _number(line: int, name: str, text: str, delimiter: str) -> Decimal:
 def _scaled(
     values: Float, columns: Columns, given: Mapping[str, str]
 ) -> tuple[dict[str, Float], dict[str, str]]:
-    """Quantity -> (T, axes) in SI units (field: uT), and quantity -> unit and who said it."""
+    """Return the quantities (T, axes) in SI units (field: uT), and their units.
+
+    Both by quantity; each unit comes with its source.
+    """
     places = {key: k for k, key in enumerate(columns)}
     scaled: dict[str, Float] = {}
     units: dict[str, str] = {}
@@ -226,7 +234,7 @@ def _scaled(
 
 
 def _likely(what: str, raw: Float) -> str:
-    """The unit that nobody says."""
+    """Return the likely unit of a quantity where none is stated."""
     if what != ACCEL:
         return next(iter(UNITS[what]))
     size = _size(raw)

@@ -1,4 +1,6 @@
-"""Which column of somebody else's IMU table is what, by the names of its header, and in which unit.
+"""Meaning and unit of the columns of a third-party IMU table.
+
+By the names in its header.
 
 A name is cut into words (`Gyroscope X (deg/s)`, `gyro_x_dps`, `gyrX`, `angular_velocity.x`, `w_RS_S_x [rad s^-1]`); one
 of them says what is measured, one the axis, the last ones or what stands in brackets the unit. Others are ignored.
@@ -59,7 +61,10 @@ _CUT = re.compile(r"[^a-z0-9°²µμ]+")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column that is read: its place in a row, its name, and the unit in it; "" where it does not say."""
+    """One column that is read: its place in a row, its name, and its unit.
+
+    The unit is "" where the name does not state it.
+    """
 
     index: int
     name: str
@@ -120,7 +125,10 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
 
 
 def _unit(what: str, words: list[str], bracket: str) -> str:
-    """The unit that the brackets or the last words of a name say; "": none."""
+    """Return the unit stated by the brackets or the last words of a column name.
+
+    "": none.
+    """
     spelt = {_joined(unit): unit for unit in UNITS[what]} | _SPELT[what]
     endings = ["".join(words[k:]) for k in range(1, len(words))] + (words if what == TIME else [])
     return next((spelt[ending] for ending in (_joined(bracket), *endings) if ending in spelt), "")

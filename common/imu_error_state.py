@@ -1,4 +1,6 @@
-"""How unsure a summed-up orientation is, and how it is corrected: the covariance of an error-state Kalman filter.
+"""Covariance of an error-state Kalman filter for the IMU orientation.
+
+States how uncertain an integrated orientation is, and how it is corrected.
 
 Eleven errors, after Sola 2017 ("Quaternion kinematics for the error-state Kalman filter", ch. 5) with the global error
 of its ch. 7: attitude t (3,) [rad] in the world's axes, the gyroscope's bias b (3,) [rad/s] and scale s (3,) [1] in
@@ -72,7 +74,10 @@ class ErrorState:
         return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
 
     def propagate(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
-        """A step was summed up: at this rate (3,) of the sensor, which then lay so (3, 3), with a force or without."""
+        """Propagate the covariance over one integration step.
+
+        The sensor rotated at this rate (3,), in this orientation (3, 3), with a force measured or without.
+        """
         change, fallen = -step_s * world_sensor, step_s * G_M_S2 if felt else 0.0
         self._transition[ATTITUDE, BIAS] = change
         self._transition[ATTITUDE, SCALE] = change * rate_rad_s
@@ -83,7 +88,10 @@ class ErrorState:
         self._warmed(step_s)
 
     def silent(self, gap_s: float) -> bool:
-        """Nothing was heard for so long: it may have turned; whether its tilt may be anything now."""
+        """Inflate the covariance over a gap without samples.
+
+        The sensor may have rotated meanwhile. Returns whether the tilt is now unknown.
+        """
         attitude = self._variance[ATTITUDE] + (_UNSEEN_RAD_S * gap_s) ** 2
         for block in (ATTITUDE, VELOCITY):
             self._cov[block] = self._cov[:, block] = 0.0
@@ -94,23 +102,36 @@ class ErrorState:
         return bool(attitude[0] >= most[0])
 
     def level(self, step_s: float, velocity_m_s: Float) -> Float:
-        """Forces were summed up for a step to this level velocity (2,), which is zero; all corrections (11,)."""
+        """Correct with a zero level velocity.
+
+        Forces were integrated for a step to this level velocity (2,), which is zero in truth; returns all corrections
+        (11,).
+        """
         noise = 2.0 * _VELOCITY_S * _VELOCITY_M_S**2 / step_s
         return self._measured(VELOCITY, -velocity_m_s, noise)
 
     def rest(self, step_s: float, off_rad_s: Float) -> Float:
-        """It lay still for a step, with this rate (3,) beyond the bias; all corrections (11,)."""
+        """Correct the bias with a step at rest.
+
+        The rate (3,) is what remains beyond the bias; returns all corrections (11,).
+        """
         return self._measured(BIAS, off_rad_s, _REST**2 / step_s)
 
     def contradicted(self, heading_rad: float) -> None:
-        """Rest tells another bias than rest before; one of them was a turn, and the heading may be off by so much."""
+        """Reset the bias covariance after two rest periods gave different biases.
+
+        One of them was a rotation, so the heading may be off by `heading_rad`.
+        """
         heading = float(self._variance[_HEADING])
         self._cov[BIAS] = self._cov[:, BIAS] = 0.0
         self._variance[BIAS] = BIAS_RAD_S**2
         self._variance[_HEADING] = min(heading + heading_rad**2, _ANYWHERE_RAD**2)
 
     def _measured(self, block: slice, innovation: Float, noise: float) -> Float:
-        """Take a measurement of some errors, one after the other; corrections (11,) of all but the heading."""
+        """Apply a measurement of a block of errors, one scalar after the other.
+
+        Returns corrections (11,) of all but the heading.
+        """
         found = np.zeros(_SIZE)
         heading = float(self._variance[_HEADING])
         for k, value in enumerate(innovation.tolist(), block.start):

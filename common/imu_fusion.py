@@ -1,4 +1,6 @@
-"""Raw samples of an IMU -> its orientation: rates summed up, their tilt led back to gravity, their bias learnt at rest.
+"""Orientation from raw IMU samples.
+
+Rates are integrated, the tilt is corrected towards gravity, and the bias is estimated at rest.
 
 The filter is an error-state Kalman filter without magnetometer (`ErrorState`). Its world has z up, and nothing else is
 known of it: the heading is what it was when the filter began, and drifts from then on; `heading_sigma_rad` says how
@@ -42,7 +44,9 @@ _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 
 
 class OrientationFilter:
-    """Push machine. Holds the orientation, level velocity, bias and scale, how unsure they are, and the last sample.
+    """Push-driven orientation filter.
+
+    Holds the orientation, level velocity, bias and scale, their uncertainty, and the last sample.
 
     Attributes:
         counts: Samples that gave no orientation or little: `fusion.missing` (no rate, or one that cannot be),
@@ -50,7 +54,10 @@ class OrientationFilter:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        """Expect samples at about this rate; the steps themselves are taken from their stamps."""
+        """Expect samples at about this rate.
+
+        The steps themselves are taken from their timestamps.
+        """
         self.counts: Counter[str] = Counter()
         self._period_s = 1.0 / rate_hz
         self._bridged_s = max(_BRIDGED_S, _BRIDGED_SAMPLES / rate_hz)
@@ -67,7 +74,10 @@ class OrientationFilter:
 
     @property
     def bias_rad_s(self) -> Float:
-        """What the gyroscope says at rest (3,) [rad/s], sensor axes."""
+        """Return the gyroscope bias (3,) [rad/s] in sensor axes.
+
+        It is the reading at rest.
+        """
         return self._bias
 
     @property
@@ -77,11 +87,16 @@ class OrientationFilter:
 
     @property
     def heading_sigma_rad(self) -> float:
-        """Standard deviation of what the heading has drifted since the first sample; at most 1.8, which is anywhere."""
+        """Return the standard deviation of the heading drift since the first sample.
+
+        At most 1.8, which means unknown.
+        """
         return self._errors.heading_rad
 
     def push(self, sample: ImuSample) -> ImuSample:
-        """The same sample with `orientation_wxyz`, sensor axes -> a world whose z axis is up, and `heading_sigma_rad`.
+        """Return the sample with `orientation_wxyz` and `heading_sigma_rad` filled in.
+
+        The orientation maps sensor axes to a world whose z axis is up.
 
         Both are NaN where they are not known.
         """
@@ -90,7 +105,7 @@ class OrientationFilter:
         return replace(sample, orientation_wxyz=found, heading_sigma_rad=drifted)
 
     def _pushed(self, sample: ImuSample) -> Float:
-        """Take a sample; the orientation (4,) at its instant."""
+        """Process a sample and return the orientation (4,) at its time."""
         rate, force = sample.gyro_rad_s, sample.accel_m_s2
         if not np.abs(rate).max() < _RATE_RAD_S:
             self.counts["fusion.missing"] += 1
@@ -124,7 +139,10 @@ class OrientationFilter:
         return np.array(self._q) if self._errors.tilt_rad < _SETTLED_RAD else _NONE
 
     def _silence(self, gap_s: float, force: Float, falls: bool) -> None:
-        """Go on after a gap: it moved meanwhile; after a long one up is where the first force (3,) points."""
+        """Resume after a gap, during which the sensor moved.
+
+        After a long gap, up is where the first force (3,) points.
+        """
         self._stillness.moved()
         self._velocity = np.zeros(2)
         if self._errors.silent(gap_s) and not falls and self._q is not None:

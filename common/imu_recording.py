@@ -1,4 +1,6 @@
-"""The IMU of a recording: imu.csv beside frames.csv, one row per sample, on the same clock.
+"""IMU data of a recording: imu.csv beside frames.csv.
+
+One row per sample, on the same clock.
 
 `t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz[,heading_sigma]]` in rad/s, m/s^2, uT and rad; the quaternion takes
 the sensor's axes to its world, whose z axis is vertical, and its heading may have drifted so far. `nan` is a value that
@@ -36,7 +38,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
-    """The samples of a recording's IMU, called `source`, by time; none where it has no imu.csv.
+    """Return the samples of a recording's IMU, called `source`, by time.
+
+    Empty where the recording has no imu.csv.
 
     Raises:
         RecordingError: The file is broken; the text names file, line and column.

@@ -1,4 +1,6 @@
-"""How right an IMU's tilt is against a truth, and how honest the standard deviation that was stated for it.
+"""Accuracy of an IMU's tilt against a truth.
+
+Also how consistent the stated standard deviation is with the errors.
 
 The error is that of the vertical: the turn about a level axis that takes the found one to the true one. Headings do not
 count, since both worlds may lie anywhere to each other but for their z axes, which are up.
@@ -16,8 +18,9 @@ _REGION = 5.991  # chi square, two degrees of freedom, 95 %
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiltErrors:
-    """Of every sample whose tilt and truth are known: error about both level axes (N, 2), and its stated sigma (N,),
-    per axis [rad].
+    """Tilt errors about both level axes (N, 2), and their stated sigma (N,).
+
+    Per axis [rad], of every sample whose tilt and truth are known.
     """
 
     error_rad: Float
@@ -25,7 +28,10 @@ class TiltErrors:
 
     @classmethod
     def of(cls, found_wxyz: Float, truth_wxyz: Float, sigma_rad: Float) -> "TiltErrors":
-        """Of orientations (T, 4), sensor axes -> a world whose z axis is up, NaN where not known; sigma (T,)."""
+        """Return the tilt errors of orientations (T, 4); sigma is (T,).
+
+        Orientations map sensor axes to a world whose z axis is up, NaN where not known.
+        """
         known = (
             np.isfinite(found_wxyz).all(axis=1) & np.isfinite(truth_wxyz).all(axis=1) & np.isfinite(sigma_rad)
         )

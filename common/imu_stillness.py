@@ -1,4 +1,6 @@
-"""Whether an inertial sensor lies still: rate and force have stayed near their own mean for a while.
+"""Stillness detection of an inertial sensor.
+
+It is still when rate and force have stayed near their own mean for a while.
 
 What is constant cannot be told from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
 off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
@@ -20,7 +22,10 @@ _BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias (`D
 
 
 class Stillness:
-    """Push machine. Holds means of rate and force: a short one, and one since the sensor may have come to rest."""
+    """Push-driven stillness detector.
+
+    Holds means of rate and force: a short one, and one since the sensor may have come to rest.
+    """
 
     def __init__(self) -> None:
         """Know of no rest."""
@@ -58,7 +63,10 @@ class _Means:
         self.short = self.long = value
 
     def left(self, since_s: float, step_s: float, value: Float, sample: float, short: float) -> bool:
-        """Take the next one; whether it, or the short mean, is farther from the long mean than that."""
+        """Add a value and return whether it departed from the long mean.
+
+        True where the value is farther from it than `sample`, or the short mean farther than `short`.
+        """
         off = value - self.long
         self.short = self.short + step_s / min(since_s + step_s, _SHORT_S) * (value - self.short)
         self.long = self.long + step_s / min(since_s + step_s, _LONG_S) * off

@@ -35,7 +35,10 @@ def inner(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """As `inner`, for a small function in a hot loop: it becomes part of those that call it."""
+    """Compile like `inner`, for a small function in a hot loop.
+
+    It is inlined into its callers.
+    """
     return cast(F, cast(Any, numba).njit(**_OPTIONS, **_INNER, forceinline=True)(function))
 
 
@@ -48,7 +51,10 @@ def constant(number: int) -> int:
 
 
 def bound(function: F, *arguments: Any) -> F:
-    """A kernel for arguments of these very types alone: it looks at no type again, which takes longer than the call."""
+    """Return a kernel bound to exactly these argument types.
+
+    It skips type dispatch, which takes longer than the call.
+    """
     if not hasattr(function, "compile"):  # NUMBA_DISABLE_JIT
         return function
     alike = function, tuple(_alike(one) for one in arguments)
@@ -64,7 +70,10 @@ _BOUND: dict[tuple[object, ...], Any] = {}
 
 
 def _alike(one: Any) -> object:
-    """What two arguments have in common that are of one type to a kernel: numba takes milliseconds to say so."""
+    """Return a cheap key that is equal for arguments of the same kernel type.
+
+    numba takes milliseconds to determine the type.
+    """
     if isinstance(one, np.ndarray):
         array = cast(Any, one)
         flags = array.flags

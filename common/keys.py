@@ -1,4 +1,6 @@
-"""What a process proves itself by: the rig key of the datagrams, and a certificate on the bus. Where they come from.
+"""Credentials of a process, and where they come from.
+
+The rig key of the datagrams, and a certificate on the bus.
 
 The rig key is 32 random bytes that all processes of a rig share, written as 64 hexadecimal digits. It is in a file that
 only its owner can read, or in the environment variable PHALANX_RIG_KEY; never on a command line, where every user of
@@ -68,7 +70,9 @@ def link_key(
     keys: Path | None = None,
     device: str | None = None,
 ) -> LinkKey:
-    """Return what a process seals its datagrams by: the rig key as `rig_key` finds it, and its secrets.
+    """Return what a process seals its datagrams with.
+
+    The rig key as `rig_key` finds it, and its secrets.
 
     Args:
         environment: As of `rig_key`.
@@ -121,7 +125,9 @@ def keys_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def _others_read(path: Path, what: str, environment: Mapping[str, str]) -> str | None:
-    """Why a private file, which has `what`, is none: others than its owner can read it; None: all is well.
+    """Return why a private file, which has `what`, is not private.
+
+    Others than its owner can read it; None: all is well.
 
     In the folder of a service's credentials the mask of an access-control list stands where the group's bits are.
     """
@@ -211,7 +217,10 @@ class Access:
 def access_of(
     environment: Mapping[str, str], role: str, keys: Path | None = None, open_bus: bool = False
 ) -> Access:
-    """How a process of `role` comes to the bus, from its options `--keys` and `--open` or its environment."""
+    """Return how a process of `role` accesses the bus.
+
+    From its options `--keys` and `--open` or its environment.
+    """
     return Access(
         role, keys or keys_folder(environment), open_bus or environment.get(OPEN) == "1", environment
     )

@@ -1,4 +1,6 @@
-"""What seals the datagrams of a rig: the rig key, which all share, and a secret of each device, which no other has.
+"""Keys that seal the datagrams of a rig.
+
+The rig key, which all share, and a secret of each device, which no other has.
 
 Whoever has the rig key can make and read handshakes. What a device says in a session needs its secret as well, which
 only it and the master know: a device that was stolen reads and forges no datagram of another.
@@ -21,7 +23,10 @@ def derive(key: bytes, length: int, salt: bytes, info: bytes) -> bytes:
 
 
 def device_secret(root: bytes, name: str) -> bytes:
-    """Return the secret of the device `name` (32 bytes), as it follows from `devices.key` or the rig key."""
+    """Return the secret of the device `name` (32 bytes).
+
+    Derived from `devices.key` or the rig key.
+    """
     return derive(root, KEY_BYTES, b"", b"phalanx device " + name.encode())
 
 
@@ -55,7 +60,10 @@ class LinkKey:
 
     @property
     def has_secrets(self) -> bool:
-        """Whether secrets of devices are more than the rig key, so that one device cannot make those of others."""
+        """Return whether device secrets are independent of the rig key alone.
+
+        If so, one device cannot make the secrets of others.
+        """
         return self.root is not None or self.own is not None
 
     def secret(self, name: str) -> bytes:

@@ -1,5 +1,6 @@
-"""How the computer is that a process runs on: temperature, throttling, room on its disk. Linux; what is not there is
-not told.
+"""State of the computer: temperature, throttling, free disk space.
+
+Of the computer that a process runs on. Linux; what is not available is not reported.
 
 A Raspberry Pi says by its firmware that it throttles, its clock is capped, or its supply is too weak. Other computers
 say by the trip points of their thermal zones how warm is too warm.
@@ -32,7 +33,7 @@ _NOW = 0xF  # bits of what holds now; those above are of what has been since the
 
 
 class Program(NamedTuple):
-    """Where a program runs and which it is, as `Health` tells it."""
+    """Host and version of a program, as `Health` reports them."""
 
     host: str
     version: str
@@ -40,7 +41,10 @@ class Program(NamedTuple):
 
 @cache
 def program() -> Program:
-    """This program on this machine; its version is empty where it was never installed."""
+    """Return this program on this machine.
+
+    Its version is empty where it was never installed.
+    """
     try:
         installed = version("phalanx-hand")
     except PackageNotFoundError:
@@ -49,7 +53,10 @@ def program() -> Program:
 
 
 class Machine:
-    """Reads the gauges of the computer. Holds where they are."""
+    """Reader of the computer's metrics.
+
+    Holds where they are.
+    """
 
     def __init__(self, folder: Path, environment: Mapping[str, str] = os.environ) -> None:
         """Of this computer, and the disk that `folder` is on."""
@@ -61,7 +68,10 @@ class Machine:
         self._weak = next(sensors, None) if self._flags is None else None
 
     def metrics(self) -> dict[str, float]:
-        """temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb."""
+        """Return temperature, throttling and free disk space.
+
+        temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb.
+        """
         found: dict[str, float] = {}
         zones = [
             zone for path in sorted((self._root / _ZONES).glob("thermal_zone*")) if (zone := _zone(path))
@@ -88,7 +98,10 @@ class Machine:
 
 
 def _zone(path: Path) -> tuple[float, float] | None:
-    """Temperature of a thermal zone and the one that it should stay below [degrees C]; None where it has no limit."""
+    """Return the temperature of a thermal zone and its limit [degrees C].
+
+    The limit is what it should stay below; None where it has no limit.
+    """
     kind, milli = _text(path / "type"), _text(path / "temp")
     if kind is None or milli is None:
         return None

@@ -1,4 +1,6 @@
-"""What is inside an MCAP file, whole or cut anywhere: its chunks, channels, attachments and metadata.
+"""Contents of an MCAP file: its chunks, channels, attachments and metadata.
+
+The file may be whole or cut anywhere.
 
 A file that was ended has a summary behind its data, with a check sum: then nothing but that is read at the start. Any
 other is walked record by record up to the first that is not whole, and its chunks are opened once to see what they
@@ -53,7 +55,7 @@ _Place: TypeAlias = tuple[int, int, int]  # opcode, offset of the content, its l
 
 @dataclass(frozen=True, slots=True)
 class ChunkPlace:
-    """Where the content of a chunk stands, and the first and last log time in it [ns]."""
+    """Position of a chunk's content, and its first and last log time [ns]."""
 
     offset: int
     length: int
@@ -157,7 +159,10 @@ def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
 
 
 def _bytes(fd: int, length: int, at: int) -> bytes:
-    """So many bytes from there on; none where an index that lies points out of the file."""
+    """Read `length` bytes from position `at`.
+
+    Empty where a false index points outside the file.
+    """
     return os.pread(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
 
 
@@ -194,7 +199,7 @@ def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
 
 
 def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budget: WorkBudget) -> None:
-    """Keep what one record of the summary says.
+    """Store the contents of one record of the summary.
 
     Raises:
         RecordingError: It is beyond a bound.

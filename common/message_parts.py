@@ -85,7 +85,10 @@ UnitQuaternion = Annotated[Float, within(-_UNIT, _UNIT)]  # a quaternion
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
-    """Base of all messages: immutable, tagged with its own name, unknown fields refused."""
+    """Base of all messages: immutable, tagged with its own name.
+
+    Unknown fields are refused.
+    """
 
 
 @cache
@@ -113,7 +116,7 @@ _NOTHING = None, None
 
 
 class Layout:
-    """The array fields of one kind of message: type, shape, and bounds of each element.
+    """Array fields of one message type: type, shape, and bounds of each element.
 
     The bounds stand one after the other in two vectors, so that all numbers of a message are compared at once.
     """
@@ -161,7 +164,9 @@ class Layout:
             self._refuse(every.tolist())
 
     def adopt(self, message: Message, arrays: Mapping[str, np.ndarray]) -> None:
-        """Give a message arrays that their maker knows to be good: read-only from here on, their numbers not looked at.
+        """Give a message arrays that its creator knows to be valid.
+
+        They are read-only from here on, and their numbers are not checked.
 
         Raises:
             ValueError: Another name, shape or type: the maker is wrong.
@@ -184,7 +189,9 @@ class Layout:
 
 
 def refuse_parts(message: Message, field: str) -> None:
-    """Refuse points (..., D) of which one is seen in part: a row is NaN in all or in no element.
+    """Refuse points (..., D) that are only partly seen.
+
+    A row is NaN in all or in no element.
 
     Raises:
         ValueError: One is.
@@ -198,7 +205,9 @@ def refuse_parts(message: Message, field: str) -> None:
 
 
 def refuse_sigma(message: Message, sigma: str, uv: str) -> None:
-    """Refuse points (N, 2) seen in part, and standard deviations (N,) that are not just where points are seen.
+    """Refuse partly seen points (N, 2) and inconsistent standard deviations (N,).
+
+    Standard deviations must be given exactly where points are seen.
 
     Raises:
         ValueError: One is.

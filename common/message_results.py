@@ -1,4 +1,4 @@
-"""What a master makes of it: poses of hands and objects, contact of both, gestures."""
+"""Results of a master: hand and object poses, their contact, gestures."""
 
 from copy import copy
 from enum import IntEnum
@@ -65,7 +65,7 @@ class ObjectSource(IntEnum):
 
 
 class HandPose(Message, frozen=True, eq=False, tag=True):
-    """One hand at one instant, in the joint order of XR_EXT_hand_tracking (26 joints).
+    """One hand at one time, in the joint order of XR_EXT_hand_tracking (26 joints).
 
     Attributes:
         hand: Name of the hand profile.
@@ -136,7 +136,9 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
 
     @classmethod
     def known_good(cls, hand: str, t_ns: int, **arrays: Float | Bool | Code) -> "HandPose":
-        """A pose of arrays that its maker knows to be good: their numbers are not checked.
+        """Return a pose from arrays that their creator knows to be valid.
+
+        Their numbers are not checked.
 
         They become read-only, and are the pose's: nobody writes into them later. Those of a wrist device may be
         missing.
@@ -154,7 +156,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
 
 
 class ObjectPose(Message, frozen=True, eq=False, tag=True):
-    """One rigid object at one instant.
+    """One rigid object at one time.
 
     Attributes:
         object: Name of the object file.
@@ -222,7 +224,9 @@ class Contact(Message, frozen=True, eq=False, tag=True):
 
 
 class Gesture(Message, frozen=True, eq=False, tag=True):
-    """What a hand says. One that lasts begins, is repeated with every pose of the hand, and ends.
+    """Gesture of a hand.
+
+    One that lasts begins, is repeated with every pose of the hand, and ends.
 
     Attributes:
         hand: Name of the hand profile.

@@ -1,4 +1,6 @@
-"""The JSON schema of what is on the bus, for whoever decodes it elsewhere: docs/schema/messages.json, by `make schema`.
+"""JSON schema of the messages on the bus, for external decoders.
+
+docs/schema/messages.json, by `make schema`.
 
 On the wire a message is a msgpack map, and JSON schema has no word for two things there: bytes, and an array of
 numbers, which travels as the bytes of its elements, little-endian and row by row. Both say `"x-msgpack": "bin"`, and an
@@ -26,7 +28,10 @@ _REF = "#/$defs/{name}"
 
 
 def bus_schema() -> bytes:
-    """Streams of the bus with their keys, and the messages they carry; the same bytes on every Python version."""
+    """Return the schema of the streams, their keys, and their messages.
+
+    The same bytes on every Python version.
+    """
     kinds = sorted(
         {row.message for row in STREAMS.values()} - {Message} | {Backlog}, key=lambda kind: kind.__name__
     )
@@ -92,7 +97,9 @@ def _limits(kind: type[Message], field: str) -> dict[str, float]:
 
 
 def _array(kind: type) -> dict[str, Any]:
-    """An array type as such; of what, its field says.
+    """Return the schema of an array type as such.
+
+    The field states what the array holds.
 
     Raises:
         NotImplementedError: It is none.

@@ -1,5 +1,7 @@
-"""What senders send: markers, fingers before a wrist device and tags that a camera saw, samples of an IMU, poses of a
-tracker."""
+"""Messages of senders: markers, wrist fingers, tags, IMU samples, tracker poses.
+
+Cameras see the markers, the fingers before a wrist device and the tags.
+"""
 
 from functools import cache
 from math import nan
@@ -82,12 +84,14 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
 
     @property
     def has_alternatives(self) -> bool:
-        """Whether a marker has a rival."""
+        """Return whether any marker has an alternative."""
         return self.alt_uv is not nowhere(len(self.area)) and not bool(np.isnan(self.alt_uv).all())
 
 
 class WristDetections(Message, frozen=True, eq=False, tag=True):
-    """What the camera of a wrist device saw in one strobed triple (ambient, laser, LED), fingers thumb ... little.
+    """Detections of a wrist device's camera in one strobe cycle.
+
+    The cycle is ambient, laser, LED; fingers thumb ... little.
 
     Pixels are of the distorted image, (0, 0) = centre of the top-left pixel; NaN: not seen.
 
@@ -129,7 +133,9 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
 
 
 class TagDetections(Message, frozen=True, eq=False, tag=True):
-    """The fiducial tags (AprilTag, ArUco) that one camera found in one frame. Not every frame needs to be searched.
+    """Fiducial tags (AprilTag, ArUco) that one camera found in one frame.
+
+    Not every frame needs to be searched.
 
     Attributes:
         camera: Camera name, a member of the rig's `cameras`.
@@ -166,7 +172,9 @@ class TagDetections(Message, frozen=True, eq=False, tag=True):
 
 
 class TrackerPose(Message, frozen=True, eq=False, tag=True):
-    """Where a device that tracks itself (a Vive tracker under Lighthouse) says it is, in its system's own frame.
+    """Pose of a device that tracks itself, as the device reports it.
+
+    In its system's own frame, for example a Vive tracker under Lighthouse.
 
     Attributes:
         source: Name of the device, the `tracker` of an object file.
@@ -191,7 +199,9 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
 
 
 class ImuSample(Message, frozen=True, eq=False, tag=True):
-    """What one inertial sensor measured at one instant, in its own axes. NaN: it has no such sensor, or no value.
+    """Measurement of one inertial sensor at one time, in its own axes.
+
+    NaN: it has no such sensor, or no value.
 
     Attributes:
         source: Name of the sensor, that of the rig's `imu`.
@@ -227,7 +237,10 @@ Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera send
 
 @cache
 def nowhere(markers: int) -> Float:
-    """The rivals of so many markers of which none has one, (M, 2), read-only; at most 49 are ever made."""
+    """Return empty alternatives (M, 2) for markers of which none has one.
+
+    Read-only; at most 49 are ever made.
+    """
     nowhere = np.full((markers, 2), np.nan)
     nowhere.flags.writeable = False
     return nowhere

@@ -1,4 +1,7 @@
-"""How processes are and what they are asked: health, checklist, commands, and pictures for people."""
+"""State of processes and requests to them.
+
+Health, checklist, commands, and pictures for people.
+"""
 
 from math import isfinite
 from typing import Annotated, Literal
@@ -103,7 +106,9 @@ class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Checklist(Message, frozen=True, eq=False, tag=True):
-    """All that is not as it should be at one instant; empty: all is well.
+    """All faults at one time.
+
+    Empty: all is well.
 
     Attributes:
         source: Process name: "master".
@@ -133,7 +138,9 @@ class Command(Message, frozen=True, eq=False, tag=True):
 
 
 class Backlog(Message, frozen=True, eq=False, tag=True):
-    """How far behind a master is that records, from the message on that it shows next until it says otherwise.
+    """Backlog of a master that records.
+
+    Valid from the next message shown until the master reports otherwise.
 
     Attributes:
         source: Process name: "master".
@@ -147,7 +154,9 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):
-    """What a camera sees, small, for the eyes of whoever asked. Nothing is measured in it.
+    """Small picture of what a camera sees, for a person who requested it.
+
+    Nothing is measured in it.
 
     Attributes:
         camera: Camera name.
@@ -165,7 +174,9 @@ class Preview(Message, frozen=True, eq=False, tag=True):
 
 
 class Still(Message, frozen=True, eq=False, tag=True):
-    """One whole frame of a camera, on request: what the cameras themselves are calibrated from.
+    """One whole frame of a camera, on request.
+
+    The cameras themselves are calibrated from it.
 
     Attributes:
         camera: Camera name.

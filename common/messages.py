@@ -1,4 +1,6 @@
-"""Messages that cross a process boundary. Arrays are read-only; NaN means "not seen".
+"""Messages that cross a process boundary.
+
+Arrays are read-only; NaN means "not seen".
 
 On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
 travels as itself and a message costs no Python loop. Rivals of markers are rare, and none at
@@ -181,7 +183,9 @@ def decode(data: bytes | memoryview) -> AnyMessage:
 
 
 def restamped(message: MessageT, **numbers: float) -> MessageT:
-    """The same message with other numbers in these fields, as times are; neither they nor its arrays are checked again.
+    """Return the message with other numbers in these fields, such as times.
+
+    Neither they nor its arrays are checked again.
 
     `msgspec.structs.replace` looks at every array once more, which costs more than all else that becomes of a message
     on its way in.

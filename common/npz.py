@@ -1,4 +1,6 @@
-"""Writes an .npz with the same bytes on every run, and reads one that may be missing, cut, hostile or none at all.
+"""Reproducible writer and defensive reader of .npz files.
+
+Writes the same bytes on every run; reads a file that may be missing, cut, hostile or no .npz at all.
 
 An .npz is a zip file of arrays, so a few bytes can claim any size, twice: the zip's index says how large a member is
 unpacked, the member's header how large the array. Both are compared, with each other and with a bound, before anything
@@ -43,7 +45,9 @@ _BROKEN = (  # what the zip file, the header of an array and its data can raise
 
 
 def write_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> None:
-    """Write the arrays uncompressed; memory stays constant, also for the columns of a mapped file.
+    """Write the arrays uncompressed.
+
+    Memory stays constant, also for the columns of a mapped file.
 
     Raises:
         OSError: The folder is missing, read-only or full; no part of a file is left.
@@ -97,7 +101,7 @@ def read_npz(
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Float:
-    """The array of a member, whose size the zip file says right.
+    """Return the array of a member whose size the zip file states correctly.
 
     Raises:
         ValueError: Another size, pickled objects, or packed in another way than NumPy does.

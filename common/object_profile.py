@@ -1,4 +1,7 @@
-"""objects/<name>.json: a rigid object that is tracked, by painted markers, by fiducial tags, or by a tracker on it."""
+"""objects/<name>.json: a rigid object that is tracked.
+
+By painted markers, by fiducial tags, or by a tracker on it.
+"""
 
 from typing import Annotated, Literal, TypeAlias
 
@@ -25,7 +28,9 @@ class Bead(Part, frozen=True):
 
 
 class Tag(Part, frozen=True):
-    """A fiducial tag: its number, the edge of its black square, its frame on the object.
+    """Fiducial tag of an object.
+
+    Its number, the edge of its black square, its frame on the object.
 
     Tag frame: origin in its middle, x to the right and y up as it is printed, z out of the paper.
     """
@@ -68,7 +73,9 @@ Shape: TypeAlias = BoxShape | CylinderShape | SphereShape
 
 
 class ObjectProfile(Part, frozen=True):
-    """objects/<name>.json: what can be seen of an object, and where its surface is; lengths in its own frame.
+    """Contents of objects/<name>.json: visible features and surface of an object.
+
+    Lengths are in the object's own frame.
 
     `markers`: three or more, not in one line; the rig lists their names in `free_markers`, the camera files have their
     colours. `tracker`: name of a device that tracks itself and sits on the object at `T_object_tracker`, which
@@ -130,6 +137,9 @@ def check_pose(pose: Float, where: str) -> None:
 
 
 def tag_corners(edge_m: float) -> Float:
-    """Corners (4, 3) [m] of a tag in its own frame: as printed top left, top right, bottom right, bottom left."""
+    """Return the corners (4, 3) [m] of a tag in its own frame.
+
+    As printed: top left, top right, bottom right, bottom left.
+    """
     half = 0.5 * edge_m
     return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])

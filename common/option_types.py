@@ -1,4 +1,7 @@
-"""Types of command-line options: numbers with bounds, and ports. Their errors name the value and what is expected."""
+"""Types of command-line options: numbers with bounds, and ports.
+
+Their errors name the value and what is expected.
+"""
 
 import math
 from argparse import ArgumentTypeError

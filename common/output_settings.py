@@ -1,5 +1,6 @@
-"""outputs/<name>.json: which live outputs are on, and where each sends to. The defaults here are
-calib_json/outputs/default.json.
+"""outputs/<name>.json: which live outputs are on, and where each sends to.
+
+The defaults here are those of calib_json/outputs/default.json.
 
 Everything is off until somebody switches it on, and everything stays on this machine until somebody names another:
 hands and gestures of a person are that person's.
@@ -23,7 +24,10 @@ _UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of on
 
 
 class OscOutput(Part, frozen=True):
-    """Open Sound Control over UDP: hands, objects, contact and gestures, rig frame, to `host`:`port`."""
+    """Open Sound Control output over UDP to `host`:`port`.
+
+    Hands, objects, contact and gestures, in the rig frame.
+    """
 
     on: bool = False
     host: Host = LOOPBACK
@@ -31,7 +35,9 @@ class OscOutput(Part, frozen=True):
 
 
 class VmcOutput(Part, frozen=True):
-    """The Virtual Motion Capture protocol (OSC over UDP): bones of the hands of a VRM avatar.
+    """Output by the Virtual Motion Capture protocol (OSC over UDP).
+
+    Bones of the hands of a VRM avatar.
 
     `hand`: how the bone of the hand itself is turned: as the palm lies in the room, behind an arm that is kept in the
     T-pose (palm), as the wrist is bent against the forearm, where a device on the forearm tells it (bend), or not at
@@ -49,7 +55,10 @@ class VmcOutput(Part, frozen=True):
 
 
 class Ros2Output(Part, frozen=True):
-    """ROS 2 topics as rmw_zenoh publishes them, by the zenoh router at `router`; no ROS is needed here."""
+    """ROS 2 topics as rmw_zenoh publishes them, by the zenoh router at `router`.
+
+    No ROS is needed here.
+    """
 
     on: bool = False
     router: Host = "tcp/127.0.0.1:7447"
@@ -69,7 +78,10 @@ class LslOutput(Part, frozen=True):
 
 
 class WebOutput(Part, frozen=True):
-    """WebSocket with JSON in the joint order of WebXR, and the page that shows it, served at `host`:`port`."""
+    """WebSocket output with JSON in the joint order of WebXR.
+
+    The page that shows it is served as well, at `host`:`port`.
+    """
 
     on: bool = False
     host: Host = LOOPBACK

@@ -1,4 +1,6 @@
-"""The palmar skin of bent fingers: chains of round cones along the bones, and where rays meet them first.
+"""Palmar skin of flexed fingers: chains of round cones along the bones.
+
+Computes where rays meet them first.
 
 Where the laser meets a finger depends on its skin, and its bones lie nearer to the back than to the palm. Each finger
 is a chain of spheres joined by cones. A sphere has the radius by which the palmar side is round, and its centre is put
@@ -69,7 +71,10 @@ class PalmarSurface:
 
     @classmethod
     def of(cls, model: HandModel) -> "PalmarSurface":
-        """That of a hand file, or else of a hand of its size; as thick as the file's `palmar_scale` says."""
+        """Return the palmar surface of a hand file, or of a hand of its size.
+
+        As thick as the file's `palmar_scale` states.
+        """
         thick = np.array([[model.profile.palmar_scale.get(finger, 1.0)] for finger in get_args(Finger)])
         if model.profile.radius_m is None:
             knuckles = model.rest_position_m[CHAINS[[1, 4], 0]]
@@ -95,7 +100,9 @@ class PalmarSurface:
 
 
 def first_hits(origin: Float, rays: Float, centres: Float, radius: Float) -> Float:
-    """How far along unit rays (..., R, 3) from `origin` (3,) each cone of a chain begins, (..., R, K - 1); inf: missed.
+    """Return the distance along rays at which each cone of a chain is first hit.
+
+    Unit rays (..., R, 3) from `origin` (3,); result (..., R, K - 1); inf: missed.
 
     Args:
         origin: Outside of all cones.

@@ -1,4 +1,7 @@
-"""What the command "preview" asks for beside the picture: the body that a console writes and a slave reads."""
+"""Body of the command "preview": what it requests beside the picture.
+
+A console writes it and a slave reads it.
+"""
 
 from typing import Annotated
 
@@ -30,5 +33,5 @@ class PreviewWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
         return parse(body.encode(), cls, "preview") if body else cls()
 
     def body(self) -> str:
-        """The body that says this."""
+        """Return the command body that states this request."""
         return "" if self == PreviewWish() else msgspec.json.encode(self).decode()

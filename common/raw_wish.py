@@ -1,4 +1,7 @@
-"""What the command "raw" asks of a camera's slave: the body that a recorder writes and a slave reads."""
+"""Body of the command "raw": what it requests of a camera's slave.
+
+A recorder writes it and a slave reads it.
+"""
 
 import re
 from typing import Annotated
@@ -37,12 +40,15 @@ class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omi
         return wish
 
     def body(self) -> str:
-        """The body that says this."""
+        """Return the command body that states this request."""
         return msgspec.json.encode(self).decode()
 
 
 def raw_name(stem: str, camera: str, number: int = 1) -> str:
-    """The raw frames of a camera beside a recording of messages STEM.mcap: STEM-CAMERA, then STEM-CAMERA-2."""
+    """Return the name of a camera's raw frames beside a message recording.
+
+    Beside STEM.mcap: STEM-CAMERA, then STEM-CAMERA-2.
+    """
     return f"{stem}-{camera}" if number == 1 else f"{stem}-{camera}-{number}"
 
 

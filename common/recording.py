@@ -1,4 +1,6 @@
-"""A recording of messages: one MCAP file that any tool for MCAP opens, with the calibration it was made with.
+"""Recording of messages: one MCAP file that any MCAP tool opens.
+
+It contains the calibration it was made with.
 
     header | metadata "phalanx" | a file of calibration per attachment | chunks of messages | index
 
@@ -59,7 +61,10 @@ class Recorded:
 
 
 class MessageWriter:
-    """Writes one recording. Holds the file, its channels, and when the chunk in progress began."""
+    """Writer of one recording.
+
+    Holds the file, its channels, and when the chunk in progress began.
+    """
 
     def __init__(
         self,

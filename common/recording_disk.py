@@ -7,7 +7,10 @@ class Disk(Protocol):
     """Where the bytes go: a file, or what a test puts in its place."""
 
     def write(self, data: bytes, /) -> int | None:
-        """Write some of it and tell how much; OSError where that fails."""
+        """Write part of the data and return how much.
+
+        OSError where that fails.
+        """
         ...
 
     def close(self) -> None:

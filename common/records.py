@@ -12,7 +12,9 @@ Shape = int | tuple[int, ...]
 
 
 def record(kind: type[R], **fields: Shape | tuple[str, Shape] | tuple[object, int] | object) -> R:
-    """Allocate a struct of arrays with fixed shapes, all zero: kernels take it as one pointer.
+    """Allocate a struct of arrays with fixed shapes, all zero.
+
+    Kernels take it as one pointer.
 
     Args:
         kind: A class that declares the fields; never called.
@@ -40,12 +42,18 @@ def record(kind: type[R], **fields: Shape | tuple[str, Shape] | tuple[object, in
 
 @cache
 def _layout(types: tuple[Any, ...]) -> np.dtype[Any]:
-    """The layout of records with these fields: one object for all alike, which makes them quick to compare."""
+    """Return the layout of records with these fields.
+
+    One object for all alike, which makes them quick to compare.
+    """
     return np.dtype(list(types), align=True)
 
 
 def filled(kind: type[R], values: Mapping[str, Any]) -> R:
-    """A record of copies of arrays: whole numbers and truths as such, all else as float64."""
+    """Return a record of copies of arrays.
+
+    Integers and booleans keep their type, all else is float64.
+    """
     types = {"i": "i8", "u": "u1", "b": "u1"}
     fields = {name: (types.get(value.dtype.kind, "f8"), value.shape) for name, value in values.items()}
     out = record(kind, **fields)
@@ -55,7 +63,10 @@ def filled(kind: type[R], values: Mapping[str, Any]) -> R:
 
 
 def fields(one: R) -> R:
-    """The arrays of a record and of those in it, looked up once: numpy takes 3 us to find one by name."""
+    """Return the arrays of a record and of its nested records, looked up once.
+
+    numpy takes 3 us to find one by name.
+    """
     found = SimpleNamespace()
     record_of = cast(Any, one)
     for name in record_of.dtype.names:
@@ -65,5 +76,8 @@ def fields(one: R) -> R:
 
 
 def boxed(one: object) -> Any:
-    """The array that a record lies in: kernels are handed that in a fraction of the time."""
+    """Return the array that holds a record.
+
+    It is passed to kernels in a fraction of the time.
+    """
     return cast(Any, one).base

@@ -1,4 +1,7 @@
-"""Replaces a file whole or not at all: a reader sees the old one or the new one, also after a power cut."""
+"""Atomic file replacement: a file is replaced whole or not at all.
+
+A reader sees the old one or the new one, also after a power cut.
+"""
 
 import os
 import tempfile
@@ -10,7 +13,9 @@ from typing import IO
 
 @contextmanager
 def replacing(path: Path) -> Generator[IO[bytes], None, None]:
-    """A new file beside `path` that takes its place at the end of the block, and is gone if the block fails.
+    """Open a new file beside `path` that replaces it at the end of the block.
+
+    It is deleted if the block fails.
 
     Raises:
         OSError: The folder is missing, read-only or full; the old file is untouched.

@@ -1,4 +1,7 @@
-"""Typed files of rigs: which cameras, where, which markers, which depth model, whose hand, and what else watches it."""
+"""Typed files of rigs.
+
+Which cameras, where, which markers, which depth model, whose hand, and what else observes it.
+"""
 
 import math
 from itertools import combinations
@@ -54,7 +57,9 @@ class AffineDisparityCalibration(Part, frozen=True):
 
 
 class FilterCalibration(Part, frozen=True):
-    """The 1 € filter of the hand and its markers: cut-off at rest, its rise per speed [Hz per m/s], that of the speed.
+    """1 € filter of the hand and its markers.
+
+    Cut-off at rest, its rise per speed [Hz per m/s], and the cut-off of the speed.
 
     `jitter_m`: what may be left of the noise of each signal at rest; noisier ones are filtered more.
     """
@@ -73,7 +78,9 @@ class Volume(Part, frozen=True):
 
 
 class ImuCalibration(Part, frozen=True):
-    """An IMU fixed to the palm, as far as known; its orientation is used where mounting and world are.
+    """IMU fixed to the palm, as far as known.
+
+    Its orientation is used where mounting and world are known.
 
     `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
     frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
@@ -92,12 +99,14 @@ class ImuCalibration(Part, frozen=True):
 
     @property
     def placed(self) -> bool:
-        """Whether its orientation tells that of the palm in the rig."""
+        """Return whether its orientation determines that of the palm in the rig."""
         return self.q_palm_imu is not None and self.q_rig_world is not None
 
 
 class RigCalibration(Part, frozen=True):
-    """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
+    """Contents of rigs/<name>.json.
+
+    Which cameras, where, which markers, which depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
     `objects`: files of the objects that are tracked; their markers are free ones. `T_rig_tracking`: where the frame of
@@ -148,7 +157,9 @@ class RigCalibration(Part, frozen=True):
     strobe: StrobeCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
-        """`T_rig_camera` (4, 4) [m] of one camera; the frame of a wrist rig is that of its camera.
+        """Return `T_rig_camera` (4, 4) [m] of one camera.
+
+        The frame of a wrist rig is that of its camera.
 
         Raises:
             CalibrationError: The rig's places are not measured yet.

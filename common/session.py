@@ -1,4 +1,6 @@
-"""The handshake of master and slave: its keys and its messages. docs/wire.md draws it.
+"""Handshake of master and slave: its keys and its messages.
+
+docs/wire.md draws it.
 
 From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
 - the rig tag, by which a datagram of another rig is told at once,
@@ -39,7 +41,9 @@ HandshakeT = TypeVar("HandshakeT", bound=Handshake)
 
 
 class Beacon(Handshake, frozen=True):
-    """The master says that it is there. Broadcast for ever; its source address is where hello goes.
+    """Announcement of the master's presence, broadcast for ever.
+
+    Its source address is where hello goes.
 
     Attributes:
         master_nonce: Drawn when the master started: another one is another life of it.
@@ -77,7 +81,7 @@ class _AnyHello(Struct, frozen=True):
 
 
 class Welcome(Handshake, frozen=True):
-    """The master's share of the session's keys, for the hello with this `slave_nonce`.
+    """Master's share of the session's keys, for the hello with this `slave_nonce`.
 
     `proof`, of `SessionKeys`: that the master has the secret of that name.
     """
@@ -89,7 +93,9 @@ class Welcome(Handshake, frozen=True):
 
 
 class Unproven(Handshake, frozen=True):
-    """The hello with this `slave_nonce` was not proven: the master has another secret for its name. No session.
+    """Refusal of the hello with this `slave_nonce`, which was not proven.
+
+    The master has another secret for its name. No session.
 
     `has_secrets`: whether the secrets of the master's devices are more than the rig key. It says only why: it is not
     proven itself, and whoever has the rig key can say it.
@@ -101,7 +107,10 @@ class Unproven(Handshake, frozen=True):
 
 
 class Start(Handshake, frozen=True):
-    """Begin at `start_t_ns` [ns] on the clock of the slave that receives this; a past time: now."""
+    """Command to begin at `start_t_ns` [ns] on the clock of the receiving slave.
+
+    A past time: now.
+    """
 
     start_t_ns: TimeNs
 
@@ -156,7 +165,10 @@ def read(kind: Kind, body: bytes) -> Handshake | None:
 
 
 class SessionKeys(NamedTuple):
-    """The keys of one session: 32 bytes for each direction, the id that datagrams name, the proof of the welcome."""
+    """Keys of one session.
+
+    32 bytes for each direction, the id that datagrams name, the proof of the welcome.
+    """
 
     key_id: int
     to_master: bytes
@@ -165,7 +177,7 @@ class SessionKeys(NamedTuple):
 
 
 class RigKeys:
-    """Everything that follows from the rig key and the secrets of devices. Holds them."""
+    """All keys derived from the rig key and the secrets of devices."""
 
     def __init__(self, key: LinkKey | bytes) -> None:
         """Derive from the rig key, alone or with what there is of secrets.
@@ -194,7 +206,10 @@ class RigKeys:
         return message if isinstance(message, expected) else Refusal.UNDECODABLE
 
     def name_in(self, header: Header, datagram: bytes) -> str | None:
-        """Return who says a hello of another wire version, if its seal fits; the header is alike in all versions."""
+        """Return the sender of a hello of another wire version, if its seal is valid.
+
+        The header is alike in all versions.
+        """
         body = self.open(header, datagram)
         try:
             return None if body is None else _ANY_HELLO.decode(body).name
@@ -202,18 +217,21 @@ class RigKeys:
             return None
 
     def hello(self, name: str, process: int, slave_nonce: bytes, master_nonce: bytes) -> Hello:
-        """Return the hello of the device `name`, proven by the secret that this side has for it."""
+        """Return the hello of the device `name`.
+
+        It is proven by the secret that this side has for it.
+        """
         info = b"phalanx hello " + process.to_bytes(8, "big") + name.encode()
         proof = derive(self._of_device(name), PROOF_BYTES, master_nonce + slave_nonce, info)
         return Hello(name, process, slave_nonce, master_nonce, proof)
 
     def proves(self, hello: Hello) -> bool:
-        """Whether who said `hello` has the secret of its name."""
+        """Return whether the sender of `hello` has the secret of its name."""
         wanted = self.hello(hello.name, hello.process, hello.slave_nonce, hello.master_nonce)
         return compare_digest(hello.proof, wanted.proof)
 
     def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
-        """Return the keys of the session that `hello` and the master's `session_nonce` make."""
+        """Return the session keys from `hello` and the master's `session_nonce`."""
         nonces = hello.master_nonce + session_nonce + hello.slave_nonce
         size, info = 8 + 2 * KEY_BYTES + PROOF_BYTES, b"phalanx session " + hello.name.encode()
         block = derive(self._of_device(hello.name), size, nonces, info)

@@ -1,4 +1,7 @@
-"""The step between the bytes of an image and light: the sRGB curve. Light adds and scales linearly, bytes do not."""
+"""sRGB curve between image bytes and light.
+
+Light adds and scales linearly, bytes do not.
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +21,9 @@ def to_linear(srgb: Float) -> Float:
 
 
 def gain_tables(gains: npt.ArrayLike) -> Image:
-    """What every byte becomes when the light of its channel is multiplied, as one table per channel.
+    """Return lookup tables that apply a gain to the light of each channel.
+
+    One table per channel gives what every byte becomes when the light of its channel is multiplied.
 
     Args:
         gains: (K,) factors in linear light, in the order of the image's channels.

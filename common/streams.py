@@ -1,4 +1,7 @@
-"""The one table of streams: what travels, by which path, under which key, recorded or not."""
+"""Single table of streams: content, transport path, key and recording.
+
+What travels, by which path, under which key, recorded or not.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -97,5 +100,8 @@ _SENDER: dict[type[Message], Callable[[Any], str]] = {
 
 
 def sender_of(message: Message) -> str:
-    """The name under which a message travels: its camera, sensor, hand, object or process."""
+    """Return the name under which a message travels.
+
+    Its camera, sensor, hand, object or process.
+    """
     return _SENDER[type(message)](message)

@@ -106,7 +106,10 @@ class Limit:
 
 
 def limits_of(strobe: StrobeCalibration, fan_rad: float) -> tuple[Limit, ...]:
-    """Every limit, at the longest pulse and the highest duty that the file allows; the line spreads by `fan_rad`."""
+    """Return every limit at the longest pulse and highest duty that the file allows.
+
+    The line spreads by `fan_rad`.
+    """
     pulse_s, duty = strobe.max_pulse_us * 1e-6, strobe.max_duty
     laser = _laser(strobe.laser, fan_rad, pulse_s, duty)
     return (*laser, *_leds(strobe.led, pulse_s, duty), _electrical(strobe))

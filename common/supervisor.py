@@ -20,11 +20,14 @@ _LOG = logging.getLogger(__name__)
 
 
 class ThreadEndedError(Exception):
-    """A thread returned that was to run until it is told to stop."""
+    """Error for a thread that returned before it was told to stop."""
 
 
 class ThreadSupervisor:
-    """Hears of every thread that fails. Holds the name of the first."""
+    """Supervisor that is notified of every thread that fails.
+
+    It holds the name of the first.
+    """
 
     def __init__(self) -> None:
         """Nothing failed yet."""

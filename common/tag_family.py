@@ -1,4 +1,6 @@
-"""The codes of fiducial tags as they are printed: which cell of which tag is white, the same under every OpenCV.
+"""Codes of fiducial tags as printed: which cell of which tag is white.
+
+They are the same under every OpenCV.
 
 OpenCV 4 and the first of 5 hold the AprilTag families turned by half a turn against the pictures that their authors
 publish and everybody prints; a later 5 mends that (opencv/opencv pull request 28823). Who asks here gets the published
@@ -37,7 +39,9 @@ PUBLISHED = ("110101", "011101", "011000", "101000", "010110", "000100")
 
 
 def tag_bits(family: TagFamily, number: int) -> Image:
-    """Code of a tag (cells, cells), 1 = white, as printed: row 0 on top. About it is a black border of one cell.
+    """Return the code of a tag as printed, without its border.
+
+    Shape (cells, cells), 1 = white, row 0 on top. Around it is a black border of one cell.
 
     Raises:
         ValueError: The family has no such tag.
@@ -50,7 +54,9 @@ def tag_bits(family: TagFamily, number: int) -> Image:
 
 
 def tag_image(family: TagFamily, number: int, margin: int = 0) -> Image:
-    """The whole tag, one byte (0 or 255) a cell: code, black border, `margin` cells of white paper about it.
+    """Return the image of a whole tag, one byte (0 or 255) a cell.
+
+    Code, black border, `margin` cells of white paper around it.
 
     Raises:
         ValueError: The family has no such tag.
@@ -60,7 +66,9 @@ def tag_image(family: TagFamily, number: int, margin: int = 0) -> Image:
 
 
 def dictionary(family: TagFamily, numbers: Sequence[int]) -> cv2.aruco.Dictionary:
-    """What OpenCV finds these tags by: the first of `numbers` is its 0, and so on; corners as printed.
+    """Return the OpenCV dictionary that detects these tags.
+
+    The first of `numbers` is its 0, and so on; corners as printed.
 
     Raises:
         ValueError: The family has no such tag.

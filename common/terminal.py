@@ -1,4 +1,7 @@
-"""Lines for whoever started the program: results on standard output, remarks on standard error."""
+"""Terminal output: results on standard output, remarks on standard error.
+
+The lines are for whoever started the program.
+"""
 
 import sys
 

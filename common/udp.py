@@ -1,4 +1,7 @@
-"""UDP sockets as this project uses them: one blocking reader each, senders that never wait."""
+"""UDP sockets of this project.
+
+One blocking reader each, senders that never wait.
+"""
 
 import errno
 import socket
@@ -21,7 +24,9 @@ class UdpSocket:
     def __init__(
         self, bind: Address, shared: bool = False, broadcast: bool = False, timeout_s: float = READ_TIMEOUT_S
     ) -> None:
-        """Bind; `shared` lets several processes hear the same broadcasts.
+        """Bind the socket.
+
+        `shared` lets several processes receive the same broadcasts.
 
         Raises:
             BusError: The address is taken or not of this machine.
@@ -47,7 +52,7 @@ class UdpSocket:
         self.failed = 0
 
     def receive(self) -> tuple[bytes, Address] | None:
-        """Return the next datagram and where it came from, or None after the timeout or an error.
+        """Return the next datagram and its source, or None after the timeout or an error.
 
         One that is too long comes cut to one byte more than allowed, so that it is seen to be.
         """

@@ -1,4 +1,6 @@
-"""Video files, decoded one frame after the other: what other people's cameras and programs recorded.
+"""Video files, decoded frame by frame.
+
+They were recorded by other people's cameras and programs.
 
 A frame is known by its number in the file, from 0. One that cannot be decoded has a number, too, and is left out, so
 that the same frame has the same number however often the file is read. Frames come in the order of the file: going
@@ -23,7 +25,7 @@ _GIVE_UP = 50  # frames in a row that do not decode, where the container does no
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoTimes:
-    """What one pass over a video tells.
+    """Times that one pass over a video measures.
 
     Attributes:
         number: (T,) numbers of the frames that decode.

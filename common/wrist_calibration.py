@@ -1,4 +1,7 @@
-"""What is measured of a wrist device, in the frame of its camera (OpenCV axes): parts of its rig file."""
+"""Calibration of a wrist device, in the frame of its camera (OpenCV axes).
+
+These are parts of its rig file.
+"""
 
 import math
 from collections.abc import Mapping
@@ -39,7 +42,9 @@ class Laser(Part, frozen=True):
 
 
 class FlatField(Part, frozen=True):
-    """How bright one white surface at one distance, seen along its normal, looks across the image; 1 on the axis.
+    """Relative brightness across the image of a uniformly white surface.
+
+    The surface is at one distance, seen along its normal; 1 on the axis.
 
     A polynomial in the normalised image point (x, y) = (X / Z, Y / Z); `coefficients` of 1, x, y, x^2, x y, y^2, x^3,
     x^2 y, ..., every degree whole.
@@ -49,7 +54,9 @@ class FlatField(Part, frozen=True):
 
 
 class FingerLine(Part, frozen=True):
-    """The line along which the laser point of one finger moves while it bends (its principal axis of motion).
+    """Line along which the laser point of one finger moves during flexion.
+
+    It is the principal axis of motion.
 
     Attributes:
         origin_m: A point of the line, where the finger is straightest.

@@ -71,7 +71,9 @@ class WristDevice:
 
 
 def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
-    """Unit normal (3,) and offset [m] of the laser plane, camera frame; `where` names the rig in errors.
+    """Return the unit normal and offset of the laser plane.
+
+    Normal (3,), offset [m], camera frame; `where` names the rig in errors.
 
     Raises:
         CalibrationError: It is not measured, or crosses no finger.
@@ -92,7 +94,10 @@ def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
 
 
 def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
-    """Refuse a palm whose knuckles (4, 3) [m] lie behind the camera, or far beside its image: in another unit, say."""
+    """Reject a palm whose knuckles are behind the camera or far beside its image.
+
+    Knuckles (4, 3) [m]; the cause may be another unit, for example.
+    """
     size = np.array([optics.width_px, optics.height_px])
     uv = optics.project(knuckles_m) / size
     if not (np.abs(uv - 0.5) <= _FIELD_MARGIN).all() or knuckles_m[:, 2].max() > _FARTHEST_M:

@@ -1,4 +1,6 @@
-"""The wrist joint between forearm and palm: what stands between a device on the forearm and the hand.
+"""Wrist joint between forearm and palm.
+
+It stands between a device on the forearm and the hand.
 
 `wrist_angles_rad` (..., 2) is flexion and deviation, 0 where forearm and palm agree. A flexion is a rotation about
 the palm's x, positive where the fingers go to the side of the palm of the hand, a deviation one about its y, positive
@@ -44,7 +46,10 @@ def wrist_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
 
 
 def wrist_angles_of(R_forearm_palm: Float) -> Float:
-    """Bends (..., 2) [rad] whose rotation comes near to a rotation (..., 3, 3): of one about x and y it is exact."""
+    """Return the wrist angles whose rotation comes near to a given rotation.
+
+    Angles (..., 2) [rad], rotations (..., 3, 3): for a rotation about x and y the result is exact.
+    """
     deviation = np.arctan2(-R_forearm_palm[..., 2, 0], R_forearm_palm[..., 0, 0])
     flexion = np.arctan2(-R_forearm_palm[..., 1, 2], R_forearm_palm[..., 1, 1])
     return np.stack([flexion, deviation], axis=-1)

@@ -65,7 +65,9 @@ class ZenohBus:
         router: bool = False,
         namespace: str | None = None,
     ) -> None:
-        """Listen on an endpoint, connect to one, or both; for example `tls/127.0.0.1:47802`.
+        """Listen on an endpoint, connect to one, or both.
+
+        For example `tls/127.0.0.1:47802`.
 
         With `beyond`, this process sees and asks also those that are connected to the one it connects to:
         a viewer at the master reaches the slaves. It is a client then, listens nowhere, and that one must be there.
@@ -206,7 +208,10 @@ class ZenohBus:
             self._undeclare.append(_quietly(queryable))
 
     def ask(self, command: Command, timeout_s: float) -> Health:
-        """Ask, waiting for the target to appear until `timeout_s` is over (see `Bus.ask`)."""
+        """Ask, waiting for the target to appear until `timeout_s` is over.
+
+        See `Bus.ask`.
+        """
         self._check_open()
         deadline = time.monotonic() + timeout_s
         key = key_of("command", command.target)
@@ -288,7 +293,7 @@ class ZenohBus:
         return "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
     def _silence(self, command: Command, timeout_s: float) -> str:
-        """Say why nobody may have answered."""
+        """Return the likely reason why nobody answered."""
         text = (
             f"no answer from {command.target!r} to {command.verb!r} within {timeout_s:g} s ({self._where}): "
         )

@@ -1,1 +1,4 @@
-"""Starts and orchestrates processes by their command lines; imports none of the packages it starts."""
+"""Starts and orchestrates processes by their command lines.
+
+It imports none of the packages it starts.
+"""

@@ -1,4 +1,7 @@
-"""Options of `phalanx demo` and of the commands of `phalanx fleet status` that reach other machines."""
+"""Options of `phalanx demo` and of the remote commands of `phalanx fleet status`.
+
+These are the commands that reach other machines.
+"""
 
 import argparse
 from argparse import ArgumentParser
@@ -12,8 +15,10 @@ _READY_S = 90.0
 
 
 def add_demo(demo: ArgumentParser) -> None:
-    """Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU and tracker, one master for
-    all of them and the viewer.
+    """Start a complete synthetic system: slaves, one master and the viewer.
+
+    A slave with a synthetic camera for each camera of the rigs, one for each IMU and tracker, one master for all of
+    them and the viewer.
 
     Examples:
       phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
@@ -84,7 +89,9 @@ def _add_scene(demo: ArgumentParser) -> None:
 
 
 def add_deploy(deploy: ArgumentParser) -> None:
-    """Installs a slave for each camera as a service of its machine, and waits until it streams.
+    """Install a slave for each camera as a service of its machine.
+
+    Waits until it streams.
 
     Goes back to what was before where it does not. Needs ssh and rsync here, ssh, Python 3.11 and systemd there.
 
@@ -149,7 +156,9 @@ def add_deploy(deploy: ArgumentParser) -> None:
 
 
 def add_rollback(rollback: ArgumentParser) -> None:
-    """One step back. It waits until what was before is ready; the release that is left is removed.
+    """Roll back one step.
+
+    It waits until what was before is ready; the release that is left is removed.
 
     Examples:
       phalanx fleet rollback pi-left.local pi-right.local

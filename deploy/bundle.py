@@ -1,4 +1,6 @@
-"""What goes to a machine by the input of ssh: installer, keys of that machine, files of the rig, as one zip in memory.
+"""Bundle that goes to a machine by the input of ssh.
+
+Installer, keys of that machine, files of the rig, as one zip in memory.
 
 Nothing of it touches a disk there before the installer writes it: a dry run writes nothing, no key is left in a file.
 """

@@ -40,5 +40,5 @@ def check_reach(options: argparse.Namespace) -> None:
 
 
 def default_keys() -> Path:
-    """Where keys are, if nothing is said."""
+    """Return the default keys folder."""
     return Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")

@@ -1,4 +1,7 @@
-"""What `phalanx demo` and the commands of `phalanx fleet status` that reach other machines do."""
+"""Commands `phalanx demo` and those of `phalanx fleet status` for other machines.
+
+The latter are the commands that reach other machines.
+"""
 
 import functools
 import json
@@ -19,7 +22,7 @@ Work = Callable[[Namespace], int]
 
 
 def plainly(work: Work) -> Work:
-    """Let `work` end with a line and exit code 1 where the user can mend what is wrong."""
+    """Make `work` end with one line and exit code 1 on errors the user can fix."""
 
     @functools.wraps(work)
     def run(options: Namespace) -> int:

@@ -1,5 +1,6 @@
-"""The demo: a slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer, as
-processes of this machine.
+"""Demo of a complete synthetic system, as processes of this machine.
+
+A slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer.
 
 Real sealed UDP on 127.0.0.1, real zenoh over TLS, with keys that are made for this run and gone after it. The slaves'
 clocks have different zeros and rates, and each camera runs 5 ms after the one before.
@@ -78,7 +79,7 @@ class DemoSettings:
 
 @dataclass(slots=True)
 class _State:
-    """What the processes said so far."""
+    """State that the processes have reported so far."""
 
     tracking: threading.Event = field(default_factory=threading.Event)
     rate: float = 0.0
@@ -112,7 +113,9 @@ def run_demo(
 
 @contextmanager
 def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
-    """A keys folder for one run, in a place that only this user can enter; gone at the end of the block.
+    """Provide a keys folder for one run, gone at the end of the block.
+
+    It is in a place that only this user can enter.
 
     Raises:
         DemoError: It cannot be made.
@@ -128,7 +131,10 @@ def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
 
 
 def lead_s(processes: int, load: float) -> float:
-    """How long after their start [s] the scene of so many processes begins, while `load` others want to run."""
+    """Return how long after process start [s] the scene begins.
+
+    It depends on the number of processes and on the `load` of others that want to run.
+    """
     ready = _READY_CORE_S * (processes + load) / (os.cpu_count() or 1)
     return min(max(ready + _KNOWN_S, _LEAST_S), _MOST_S)
 
@@ -136,7 +142,9 @@ def lead_s(processes: int, load: float) -> float:
 def play(
     settings: DemoSettings, keys: Path, epoch_ns: int, stop: threading.Event, notify: Callable[[str], None]
 ) -> dict[str, int]:
-    """Run the processes for as long as wanted; the master leaves live.json and poses.npz. Who was restarted how often.
+    """Run the processes for as long as wanted and return the restart counts.
+
+    The master leaves live.json and poses.npz. The result is who was restarted how often.
 
     Args:
         settings: What the user chose.
@@ -174,7 +182,10 @@ def play(
 
 
 def _stop(processes: list[Process]) -> None:
-    """End all of them; whoever presses Ctrl-C again while they take their time leaves none behind either."""
+    """End all processes.
+
+    Whoever presses Ctrl-C again while they take their time leaves none behind either.
+    """
     try:
         # The master first: slaves that end under it would look like lost frames.
         for process in sorted(processes, key=lambda p: p.name not in ("master", "viewer")):
@@ -250,7 +261,10 @@ def _wait_until_tracking(
 
 
 def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[str], None]) -> None:
-    """Say once where the viewer is, and once that it ended: nobody needs it, the run goes on without."""
+    """Report the viewer's address once, and once that the viewer ended.
+
+    Nobody needs the viewer, the run goes on without it.
+    """
     viewer = next((p for p in processes if p.name == "viewer"), None)
     if viewer is None:
         return
@@ -274,7 +288,10 @@ def _until_end(
     stop: threading.Event,
     notify: Callable[[str], None],
 ) -> None:
-    """Let it run for the wanted time; report the rate, and any process that died and was started again."""
+    """Run for the wanted time, reporting the rate and any restarted process.
+
+    That is any process that died and was started again.
+    """
     end = max(time.monotonic(), epoch_ns * 1e-9) + settings.seconds
     next_line = 0.0
     while not stop.is_set() and (left := end - time.monotonic()) > 0:
@@ -319,7 +336,10 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that Ctrl-C, SIGTERM or a closed terminal sets; the second one is a KeyboardInterrupt."""
+    """Return an event that Ctrl-C, SIGTERM or a closed terminal sets.
+
+    The second one is a KeyboardInterrupt.
+    """
     stop = threading.Event()
 
     def on_signal(number: int, _frame: object) -> None:

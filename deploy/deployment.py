@@ -1,4 +1,7 @@
-"""All machines of a rig at once: each is deployed to by itself, then their first datagrams are waited for."""
+"""Deployment to all machines of a rig at once.
+
+Each is deployed to by itself, then their first datagrams are waited for.
+"""
 
 import sys
 import threading
@@ -30,7 +33,9 @@ class Reached:
 
 
 def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
-    """Make what a keys folder lacks for these senders, by `phalanx fleet keys --make`.
+    """Make the missing keys of a keys folder for these senders.
+
+    By `phalanx fleet keys --make`.
 
     Raises:
         DeployError: They cannot be made.
@@ -83,14 +88,20 @@ def deploy(
 def uninstall(
     targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
 ) -> dict[str, str | None]:
-    """Take everything of ours away from all of them; host -> None, or one line why it failed there."""
+    """Remove everything of this project from all machines.
+
+    Returns host -> None, or one line why it failed there.
+    """
     return _each(_hosts(targets, reached, notify), lambda host: host.uninstall(dry_run))
 
 
 def roll_back(
     targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
 ) -> dict[str, str | None]:
-    """Let all of them go back to what was before; host -> None, or one line why it failed there."""
+    """Roll all machines back to what was before.
+
+    Returns host -> None, or one line why it failed there.
+    """
 
     def one(host: Host) -> None:
         host.look()
@@ -131,7 +142,7 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
 
 
 def _wait_for_senders(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None]:
-    """Wait until each sender was heard; a machine that is silent goes back to what it was."""
+    """Wait until each sender was received, and roll back machines that are silent."""
     for host in hosts:
         host.notify("waiting for its first datagram")
     received = received_of([name for host in hosts for name in host.target.names], ears)
@@ -149,7 +160,7 @@ def _wait_received(host: Host, ears: Ears) -> None:
 
 
 def _judge(host: Host, received: Received, ears: Ears) -> None:
-    """Let a machine go back of which somebody is not heard.
+    """Roll back a machine if one of its senders is not received.
 
     Raises:
         DeployError: It is so.

@@ -14,7 +14,7 @@ _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 
 
 def rig_of(options: argparse.Namespace) -> RigFile:
-    """The rig, which has to be of the role that was said.
+    """Return the rig, which must have the requested role.
 
     Raises:
         DeployError: It is not, or lacks an option.
@@ -54,7 +54,10 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
 
 
 def ears_of(options: argparse.Namespace) -> Ears | None:
-    """How first datagrams are heard: here, or at the master of another machine."""
+    """Return how first datagrams are received.
+
+    Here, or at the master of another machine.
+    """
     if options.no_wait:
         return None
     address = _here(options.master)

@@ -1,4 +1,7 @@
-"""Keys for a dry run: as if the keys folder had what it lacks, while nothing is written into it."""
+"""Keys for a dry run.
+
+As if the keys folder had what it lacks, while nothing is written into it.
+"""
 
 import contextlib
 import tempfile

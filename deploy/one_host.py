@@ -1,4 +1,7 @@
-"""What is done on one machine: look at it, bring packages, wheels and files, install; or take back, or remove."""
+"""Deployment steps on one machine.
+
+Look at it, bring packages, wheels and files, install; or take back, or remove.
+"""
 
 import json
 import time
@@ -47,7 +50,9 @@ class Wish:
     ready_s: float
 
     def driver(self, names: Sequence[str]) -> str:
-        """Driver of the cameras among `names`, which decides what their machine has to have; empty: none is one.
+        """Return the driver of the cameras among `names`.
+
+        It decides what their machine has to have; empty: none of them is a camera.
 
         Of several, picamera2 asks for the most.
         """
@@ -179,7 +184,7 @@ class Host:
         self.notify(str(self._act(words, _plain_bundle())["text"]))
 
     def _packages(self, facts: dict[str, object], wish: Wish, picamera2: bool) -> None:
-        """Bring what the system lacks, or say what it lacks.
+        """Install the packages that the system lacks, or report what it lacks.
 
         Raises:
             DeployError: apt failed, or it cannot be done without.
@@ -220,7 +225,10 @@ class Host:
 
 
 def _result(line: str) -> dict[str, object] | None:
-    """What the installer found or did; None: the line is another, or the link broke within it."""
+    """Parse what the installer found or did.
+
+    None: the line is another, or the link broke within it.
+    """
     if not line.startswith('{"result"'):
         return None
     try:

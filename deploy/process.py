@@ -1,4 +1,7 @@
-"""Child processes that are watched: started, logged, restarted when they crash, stopped cleanly."""
+"""Supervised child processes: started, logged, restarted on a crash.
+
+They are stopped cleanly.
+"""
 
 import os
 import signal
@@ -59,7 +62,10 @@ class Process:
         return self._child.pid
 
     def check(self) -> int | None:
-        """None while it runs; after an unexpected end the exit code, and it has been started again."""
+        """Restart the process if it ended unexpectedly, and return the exit code.
+
+        None while it runs; after an unexpected end the exit code, and it has been started again.
+        """
         code = self._child.poll()
         if code is None or self._stopping:
             return None
@@ -72,7 +78,10 @@ class Process:
         return self._child.poll()
 
     def stop(self) -> int:
-        """Ask it to end (SIGINT), insist after twenty seconds (SIGKILL); return the exit code."""
+        """Stop the process and return the exit code.
+
+        Ask it to end (SIGINT), insist after twenty seconds (SIGKILL).
+        """
         self._stopping = True
         if self._child.poll() is None:
             self._child.send_signal(signal.SIGINT)
@@ -119,7 +128,10 @@ class Process:
 
 
 def _give_way(pid: int, nice: int) -> None:
-    """Let a process that was just started, and all that it starts, run after others that want to."""
+    """Lower the priority of a process that was just started and of all it starts.
+
+    They run after others that want to.
+    """
     try:
         os.setpriority(os.PRIO_PROCESS, pid, min(os.getpriority(os.PRIO_PROCESS, 0) + nice, 19))
         # Linux may share its time among sessions first, and each child has one of its own (sched(7), autogroup).

@@ -1,4 +1,7 @@
-"""Commands on another machine by ssh, folders by rsync: both come to an end, also when the network goes meanwhile."""
+"""Commands on another machine by ssh and folder transfer by rsync.
+
+Both come to an end, also when the network goes meanwhile.
+"""
 
 import contextlib
 import os
@@ -50,7 +53,10 @@ _HINTS = (  # the first that is found: a changed host key is said with two of th
 
 
 class Deadline:
-    """A moment by which all must be done. Holds that moment, and whether somebody wanted an end before."""
+    """Time by which all must be done.
+
+    It holds that time, and whether somebody wanted an end before.
+    """
 
     def __init__(self, seconds: float) -> None:
         """So many seconds from now."""
@@ -92,7 +98,9 @@ class Remote:
     def run(
         self, command: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = 1e9
     ) -> int:
-        """Run a command there, give it `send` as its input, and hand on each line it says; its exit code.
+        """Run a command on the other machine and return its exit code.
+
+        Gives it `send` as its input, and hands on each line it prints.
 
         Raises:
             DeployError: The machine is not reached, the link broke, or the time is over.
@@ -111,7 +119,9 @@ class Remote:
         return code
 
     def send(self, files: Sequence[Path], to: str, sudo: bool) -> None:
-        """Send files to the folder `to` there; what is there of them already, whole or in part, is not sent again.
+        """Send files to the folder `to` on the other machine.
+
+        What is already there of them, whole or in part, is not sent again.
 
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
@@ -146,7 +156,9 @@ def run_bounded(
     environment: Mapping[str, str] | None = None,
     ended: threading.Event | None = None,
 ) -> tuple[int | None, list[str]]:
-    """Run a command of this machine; its exit code and the lines of its errors. None: it was ended.
+    """Run a command of this machine with a time limit.
+
+    Returns its exit code and the lines of its errors. None: it was ended.
 
     Args:
         words: The command.
@@ -218,7 +230,7 @@ def printable(text: str) -> str:
 
 
 def _plain(errors: Sequence[str], host: str) -> str:
-    """The line that says why, with what to do about it."""
+    """Return the line that gives the reason, with what to do about it."""
     text = "\n".join(errors)
     for sign, hint in _HINTS:
         if sign in text:

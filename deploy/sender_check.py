@@ -1,4 +1,6 @@
-"""Whether the senders of a deployment are heard: before it, as a measure of how soon that shows, and after it.
+"""Check that the senders of a deployment are received, before and after it.
+
+Before it, this measures how soon that shows.
 
 A new version that runs and sends nothing costs the stream for as long as it is listened for. So where a master runs and
 took all of them before, it waits twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
@@ -26,7 +28,7 @@ _END_S = 60.0  # of the program that listens, besides what it listens
 
 @dataclass(frozen=True, slots=True)
 class Ears:
-    """How datagrams are heard.
+    """How datagrams are received.
 
     Attributes:
         options: Of `phalanx fleet status --wait`.
@@ -41,7 +43,7 @@ class Ears:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What was heard.
+    """Datagrams that were received.
 
     Attributes:
         rates: Name -> datagrams a second, of those that were heard.
@@ -55,7 +57,10 @@ class Received:
 
 
 def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
-    """Ask `phalanx fleet status --wait` which of the senders are heard; it ends early if `ended` is set."""
+    """Return which senders `phalanx fleet status --wait` receives.
+
+    It ends early if `ended` is set.
+    """
     words = [sys.executable, "-m", "master", "fleet", "status", "--json", "--seconds", str(ears.seconds)]
     words += [*ears.options, *(word for name in names for word in ("--wait", name))]
     lines: list[str] = []
@@ -71,7 +76,10 @@ def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None 
 
 
 class Before:
-    """What is heard before anything is changed, found out while wheels are gathered and sent. Holds the thread."""
+    """Senders received before anything is changed.
+
+    Found out while wheels are gathered and sent. It holds the thread.
+    """
 
     def __init__(self, names: Sequence[str], ears: Ears) -> None:
         """Begin to listen."""
@@ -83,7 +91,10 @@ class Before:
 
     @property
     def at_master(self) -> bool:
-        """Whether a master runs, so that each machine can be listened for by itself. Waits for the end."""
+        """Report whether a master runs, so that each machine can be checked by itself.
+
+        It waits for the end of the listening.
+        """
         self._thread.join()
         return self._received.master
 

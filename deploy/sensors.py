@@ -1,4 +1,7 @@
-"""What a demo simulates: the cameras, IMUs and trackers of its rigs, and which rigs a scene is best seen by."""
+"""Sensors that a demo simulates, and which rigs see a scene best.
+
+The sensors are the cameras, IMUs and trackers of its rigs.
+"""
 
 import json
 from dataclasses import dataclass
@@ -24,7 +27,10 @@ _BEST = {
 
 
 class DemoError(Exception):
-    """The demo cannot run; the text says why and what to do."""
+    """Error for a demo that cannot run.
+
+    The text states why and what to do.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +49,9 @@ def best_rigs(scene: str) -> tuple[str, ...]:
 
 
 def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sensor]:
-    """The cameras of all rigs, then each IMU whose mounting and world are known, then each tracker on an object.
+    """Return the simulated sensors of all rigs.
+
+    The cameras of all rigs, then each IMU whose mounting and world are known, then each tracker on an object.
 
     Raises:
         DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each see another.

@@ -1,4 +1,7 @@
-"""Which machine serves which camera: the hosts of a command line, read with the rig's file."""
+"""Assignment of machines to cameras.
+
+The hosts of a command line, read with the rig's file.
+"""
 
 import json
 import re
@@ -11,7 +14,10 @@ _HOST = re.compile(r"(?:[A-Za-z0-9._-]+@)?[A-Za-z0-9.:-]+")
 
 
 class DeployError(Exception):
-    """It cannot be deployed; the text is one line that says why, and what to do."""
+    """Error for a deployment that is not possible.
+
+    The text is one line that states why, and what to do.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +70,9 @@ def read_rig(calibration: Path, name: str) -> RigFile:
 
 
 def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
-    """Read `HOST` or `NAME[+NAME...]=HOST` of each; hosts without a name take the rig's cameras in their order.
+    """Parse `HOST` or `NAME[+NAME...]=HOST` of each host.
+
+    Hosts without a name take the rig's cameras in their order.
 
     The IMU of a rig goes to the host of its first camera, unless it is named.
 

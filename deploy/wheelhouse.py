@@ -1,4 +1,6 @@
-"""Wheels for another machine, gathered on this one: what a slave needs, for its Python and processor, and our own.
+"""Wheels for another machine, gathered on this one.
+
+What a slave needs, for its Python and processor, and our own.
 
 Downloaded once for each kind of machine, and kept below ~/.cache/phalanx.
 """
@@ -118,7 +120,10 @@ def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
 
 
 def fits(wheel: str, kind: Kind) -> bool:
-    """Whether a wheel can be installed on such a machine, by the tags of its name (PEP 427)."""
+    """Check whether a wheel can be installed on such a machine.
+
+    By the tags of its name (PEP 427).
+    """
     parts = wheel.removesuffix(".whl").split("-")
     if len(parts) < 5:
         return False
@@ -136,7 +141,9 @@ def fits(wheel: str, kind: Kind) -> bool:
 
 
 def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
-    """Put the wheels for machines of this kind into a folder, for a machine without a network.
+    """Put the wheels for machines of this kind into a folder.
+
+    For a machine without a network.
 
     Raises:
         DeployError: A wheel cannot be had, or the folder has others already.
@@ -151,7 +158,9 @@ def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
 
 
 def own_wheel() -> Path:
-    """Our own wheel as this program is, installed or in a source tree; made without a network or a build.
+    """Return the wheel of this program as it is, installed or in a source tree.
+
+    It is made without a network or a build.
 
     Raises:
         DeployError: It was never installed, so that nobody knows what it needs.

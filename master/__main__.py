@@ -1,4 +1,7 @@
-"""Entry point of `phalanx`, and of `phalanx-master`, as it is called where it runs as a service."""
+"""Entry point of `phalanx`, and of `phalanx-master`.
+
+The latter is its name where it runs as a service.
+"""
 
 import logging
 import sys

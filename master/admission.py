@@ -1,4 +1,4 @@
-"""Bounds on what a sender may say, given the files of its rig.
+"""Bounds on what a sender may report, given the files of its rig.
 
 The message alone does not know these bounds. `common.messages` refuses what no sensor can measure. Here the
 picture's size, the number of markers and the rate are those of the sender's own files, and times are compared
@@ -38,7 +38,7 @@ Sensed = Detections | TagDetections | ImuSample | TrackerPose
 
 @dataclass(frozen=True, slots=True)
 class SenderLimits:
-    """What the files say of one camera, IMU or tracker.
+    """Limits that the files state for one camera, IMU or tracker.
 
     What is None is not known and not checked.
 
@@ -76,7 +76,10 @@ def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
 
 
 def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
-    """Sender -> what its files say, of all cameras, IMUs and trackers of these rigs."""
+    """Return the limits of all senders of these rigs.
+
+    Sender -> what its files state, of all cameras, IMUs and trackers of these rigs.
+    """
     limits: dict[str, SenderLimits] = {}
     for setup in setups:
         for name, camera in setup.cameras.items():

@@ -1,4 +1,7 @@
-"""The live loop: messages in; hands, objects, contact and gestures out to every sink; and the figures of a run."""
+"""Live loop from messages to sinks, and the figures of a run.
+
+Messages in; hands, objects, contact and gestures out to every sink.
+"""
 
 import threading
 from collections import Counter
@@ -39,7 +42,10 @@ _AUXILIARY = (TagDetections, ImuSample, TrackerPose)
 
 
 class SolvedT(Protocol):
-    """A hand or an object at an instant, and when the last frame that contributed was handed to its slave [ns]."""
+    """Hand or object at one time, with the arrival time of its last frame.
+
+    That is when the last frame that contributed was handed to its slave [ns].
+    """
 
     @property
     def pose(self) -> HandPose | ObjectPose:
@@ -67,12 +73,18 @@ class Solver(Protocol[SeenT_contra]):
     """What is made of all that comes: the world of a master."""
 
     def push(self, message: SeenT_contra | AuxiliaryMessage) -> Iterable[Solved]:
-        """Take one message; give what it completes: each is out before the next is worked out."""
+        """Take one message and yield what it completes.
+
+        Each result is out before the next is computed.
+        """
         ...
 
 
 class RunFigures:
-    """What a run achieved; written by the loop, read by health reports and the summary."""
+    """Performance figures of a run.
+
+    Written by the loop, read by health reports and the summary.
+    """
 
     def __init__(self) -> None:
         self.poses = 0
@@ -104,7 +116,9 @@ class RunFigures:
         self.poses += 1
 
     def summary(self) -> dict[str, float]:
-        """poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms: of hands.
+        """Return the rate and latencies of the hand poses.
+
+        poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms: of hands.
 
         Of objects that were tracked object_latency_p50_ms, object_latency_p99_ms.
         """
@@ -165,7 +179,10 @@ def run(
 
 
 def result_at(solved: Solved, t_ns: int) -> ResultMessage:
-    """The message that is published at `t_ns`: a pose says how long it took."""
+    """Return the message that is published at `t_ns`.
+
+    A pose reports its latency.
+    """
     if isinstance(solved, Contact | Gesture):
         return solved
     return restamped(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
@@ -178,7 +195,10 @@ def health(
     counts: dict[str, int],
     times: Mapping[str, float] | None = None,
 ) -> Health:
-    """The master's report; gauges tell what a camera runs at (camera_hz.NAME) from what is solved (poses_per_s)."""
+    """Return the master's health report.
+
+    Metrics distinguish the rate at which a camera runs (camera_hz.NAME) from the rate of solved poses (poses_per_s).
+    """
     metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
     metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     metrics |= times or {}

@@ -1,4 +1,7 @@
-"""`phalanx camera`: see how a running camera is set, and set it otherwise, over the bus. No restart."""
+"""`phalanx camera`: show and change the settings of a running camera.
+
+Over the bus. No restart.
+"""
 
 import time
 from argparse import Namespace
@@ -27,7 +30,10 @@ _MOST = 1e9
 
 
 def camera(options: Namespace) -> None:
-    """Show how a running camera is set, or set it otherwise: at once, read back, compared."""
+    """Show or change the settings of a running camera.
+
+    Changes apply at once, are read back and compared.
+    """
     wanted = settings(
         options.exposure_us, options.gain, options.colour_gains, options.rate_hz, options.roi_margin
     )
@@ -70,7 +76,9 @@ def commands(
     load_file: Path | None = None,
     save: bool = False,
 ) -> list[Command]:
-    """What to tell the slave, one after the other; the last answer says how the camera is set then.
+    """Return the commands to send to the slave, one after the other.
+
+    The last answer reports how the camera is set then.
 
     Raises:
         CalibrationError: The file is broken or of another camera.
@@ -108,7 +116,10 @@ def send_all(bus: Bus, steps: list[Command]) -> Health:
 
 
 def table(health: Health) -> list[str]:
-    """Lines for a person: each setting, what is wanted, what was read back; then what else the camera says."""
+    """Format the camera settings as lines for a person.
+
+    Each setting, what is wanted, what was read back; then what else the camera reports.
+    """
     rows = [("setting", "wanted", "read back")]
     for metric, value in health.metrics.items():
         if metric.startswith(WANTED):

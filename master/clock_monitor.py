@@ -1,4 +1,6 @@
-"""What a running master tells of time: clocks of the slaves, phases of the cameras, stamps that lie.
+"""Timing report of a running master.
+
+It covers the clocks of the slaves, the phases of the cameras and wrong time stamps.
 
 Gauges for `Health`, and lines for a person. Nothing here corrects anything.
 """
@@ -37,14 +39,19 @@ class _Machines:
 
 
 class ClockMonitor:
-    """Push machine in the loop; `follow`, `look` and `metrics` belong to the thread that reports, once a second.
+    """Push machine in the loop that monitors clocks and camera timing.
+
+    `follow`, `look` and `metrics` belong to the thread that reports, once a second.
 
     Holds the machines for phases and residual offsets, what the latter found last, and for how long a camera has
     been suspect. Cameras that watch two hands are measured once.
     """
 
     def __init__(self, setups: Sequence[RigSetup]) -> None:
-        """Watch the cameras of all hands; triples of a wrist device have no others to be in step with."""
+        """Watch the cameras of all hands.
+
+        Strobe cycles of a wrist device have no other cameras to be in step with.
+        """
         self._senders = tuple(
             dict.fromkeys(name for setup in setups for name in (*setup.camera_names, *setup.imus))
         )
@@ -60,13 +67,19 @@ class ClockMonitor:
                 machines.push(message)
 
     def follow(self, setups: Sequence[RigSetup]) -> None:
-        """Go on with other files of the same cameras: what was measured with the old ones is forgotten."""
+        """Continue with new calibration files of the same cameras.
+
+        What was measured with the old files is forgotten.
+        """
         for number, k in enumerate(self._which):
             if setups[k] is not self._now[number].setup:
                 self._now[number] = _Machines(setups[k])
 
     def look(self) -> list[str]:
-        """Measure anew; return what a person should know: a stamp that lies, a lock that came or went."""
+        """Measure again and return the messages that a person should see.
+
+        They report a wrong time stamp, or a lock that came or went.
+        """
         measured = {name: now.residual.offset_of(name) for now in self._now for name in now.others}
         self._found = {name: offset for name, offset in measured.items() if offset is not None}
         lines = [line for now in self._now for line in now.phases.look()]
@@ -79,7 +92,10 @@ class ClockMonitor:
         return lines
 
     def metrics(self, clock_of: Callable[[str], ClockEstimate | None]) -> dict[str, float]:
-        """<sender>.<quantity>: clock_*, of a marker camera phase_*, residual_*; what is not known is not told."""
+        """Return the timing metrics, keyed `<sender>.<quantity>`.
+
+        The quantities are clock_*, and for a marker camera phase_* and residual_*; unknown ones are omitted.
+        """
         out: dict[str, float] = {}
         for name in self._senders:
             clock = clock_of(name)
@@ -116,7 +132,10 @@ def _that_cover(setups: Sequence[RigSetup]) -> list[int]:
 
 
 def warning(camera: str, offset: TimeOffset) -> str:
-    """What a person is told of a camera whose stamps lie."""
+    """Return the warning about a camera whose time stamps are wrong.
+
+    It is addressed to a person.
+    """
     late, sigma = 1e-6 * offset.offset_ns, 1e-6 * offset.sigma_ns
     return (
         f"camera {camera}: its frames are {abs(late):.1f} ms (sigma {sigma:.1f}) {'later' if late > 0 else 'earlier'}"
@@ -126,7 +145,10 @@ def warning(camera: str, offset: TimeOffset) -> str:
 
 
 def _named(sender: str, **quantities: float) -> dict[str, float]:
-    """Gauges of a camera or IMU by their full names, cut to the length of a name at the expense of its own."""
+    """Return the metrics of a camera or IMU under their full names.
+
+    A name too long is cut to the length limit by shortening the sender's part.
+    """
     return {
         f"{sender[: _NAME - 1 - len(quantity)]}.{quantity}": round(value, 3)
         for quantity, value in quantities.items()

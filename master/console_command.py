@@ -1,4 +1,7 @@
-"""`phalanx console`: the master in a browser; the page itself is `master.console`, loaded when it is served."""
+"""Command `phalanx console`: the master in a browser.
+
+The page itself is `master.console`, loaded when it is served.
+"""
 
 import os
 from argparse import Namespace

@@ -1,4 +1,6 @@
-"""What a master makes of all that its senders say, behind one push: hands, objects, contact and gestures.
+"""Everything a master derives from its senders' messages, behind one push.
+
+The results are hands, objects, contact and gestures.
 
 In this order, because the hand is what is waited for: first the poses that a message completes, of every hand, then
 those of objects, then what the hands do. `push` is a generator: what it gave is out before the next is worked out.
@@ -102,7 +104,7 @@ class Line(Protocol):
         ...
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the hand's IMU says of its own orientation (4,)."""
+        """Take the orientation (4,) that the hand's IMU reports."""
         ...
 
     def flush(self) -> list[SolvedPose]:
@@ -119,7 +121,9 @@ class Dispatcher:
     def __init__(
         self, setups: Sequence[RigSetup], lines: Sequence[Line], stage: Stage, *, gestures: bool = True
     ) -> None:
-        """Join each hand's setup with the line that solves it, and build what is beside the hands.
+        """Join each hand's setup with its solver line and build the other stages.
+
+        The other stages are what is beside the hands.
 
         Args:
             setups: Of each hand.
@@ -150,7 +154,9 @@ class Dispatcher:
 
     @property
     def counts(self) -> Counter[str]:
-        """Events since the start; those of a hand, where there are several, under its name.
+        """Return the event counts since the start.
+
+        Where there are several hands, the events of a hand are under its name.
 
         Of objects object.NAME.poses, .tracked, .occluded; of gestures gesture.KIND, how many began; of trackers
         tracker.NAME.lost, .leap, .late, .broken, and .unplaced where it is not registered.
@@ -168,7 +174,10 @@ class Dispatcher:
 
     @property
     def unplaced(self) -> tuple[TrackedObject, ...]:
-        """Objects with a tracker that is not registered: what it says is of no use."""
+        """Return the objects whose tracker is not registered.
+
+        What such a tracker reports is of no use.
+        """
         return tuple(one for one in self._now.objects if one.unplaced)
 
     def push(self, message: SensorMessage) -> Iterator[Solved]:
@@ -200,7 +209,9 @@ class Dispatcher:
             yield from self._done(one.pose)
 
     def prepare(self, setups: Sequence[RigSetup]) -> Callable[[], None]:
-        """Build what is beside the hands of other files; what is returned lets it take over with the next message.
+        """Build the stages beside the hands for changed files.
+
+        The function that is returned lets them take over with the next message.
 
         From any thread but the loop's. What was known of objects and gestures begins anew.
 

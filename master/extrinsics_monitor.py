@@ -1,4 +1,7 @@
-"""What a running master tells of a camera whose rays miss those of the others: knocked, or not the one of its file."""
+"""Live check of the camera extrinsics while the master runs.
+
+It reports a camera whose rays miss those of the others: the camera was knocked, or is not the one of its file.
+"""
 
 from collections.abc import Mapping
 
@@ -7,7 +10,10 @@ _NAME = 64  # characters of a name in `Health`
 
 
 class ExtrinsicsMonitor:
-    """Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was left out."""
+    """Monitor of cameras whose rays are rejected.
+
+    Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was rejected.
+    """
 
     def __init__(self, cameras: tuple[str, ...]) -> None:
         """Watch the cameras of a rig."""
@@ -16,7 +22,9 @@ class ExtrinsicsMonitor:
         self._poses = 0
 
     def look(self, counts: Mapping[str, int]) -> list[str]:
-        """Once a second: a line for each camera that has been left out of most poses for a while; once, until it ends.
+        """Return a line for each camera that has been rejected for a while.
+
+        Called once a second. The camera was rejected from most poses; it is reported once, until the condition ends.
 
         Args:
             counts: Of the pipeline since its start.

@@ -1,4 +1,7 @@
-"""`phalanx fleet status`: one row for each process of a rig, from what it and the master say of it on the bus."""
+"""`phalanx fleet status`: one row for each process of a rig.
+
+A row has what the process and the master report of it on the bus.
+"""
 
 import json
 import os
@@ -56,10 +59,13 @@ class Device:
 
 
 class Roll:
-    """Reports of all processes as they come. Holds the last two of each, and when the last one came."""
+    """Status reports of all processes as they arrive.
+
+    Holds the last two of each, and when the last one came.
+    """
 
     def __init__(self, expected: Sequence[str]) -> None:
-        """Of these, which are told as unknown until they report."""
+        """Expect these processes, which are shown as unknown until they report."""
         self._expected = tuple(expected)
         self._last: dict[str, Health] = {}
         self._before: dict[str, Health] = {}
@@ -116,7 +122,10 @@ class Roll:
         return name not in self._expected and last is not None and f"{name}.received" not in last.counts
 
     def _rate(self, name: str) -> float | None:
-        """Messages a second that the master took from it since its report before; None: the master does not know it."""
+        """Return the messages per second that the master took from a process.
+
+        They are counted since its report before; None: the master does not know it.
+        """
         last, before = self._last.get(MASTER), self._before.get(MASTER)
         event = f"{name}.received"
         if last is None or before is None or event not in last.counts:
@@ -132,7 +141,9 @@ def expected_devices(environment: Mapping[str, str]) -> list[str]:
 
 
 def status(options: Namespace) -> int:
-    """Show each process of the rig, or wait until some are heard; the exit code.
+    """Show each process of the rig and return the exit code.
+
+    Can also wait until some processes have reported.
 
     Raises:
         UsageError: `--wait` and `--watch` are both given.

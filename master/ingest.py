@@ -1,4 +1,6 @@
-"""Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
+"""Conversion of datagrams to detections and IMU samples.
+
+They are decoded, checked, counted, and put on the master's clock.
 
 A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the live loop takes
 messages from a queue (`master.message_queue`).
@@ -32,7 +34,7 @@ DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data come
 
 
 class Ingest:
-    """All slaves of one rig, heard on one UDP port.
+    """Receiver of all slaves of one rig, on one UDP port.
 
     Holds the socket, its thread, and the link's state behind a lock.
 
@@ -110,18 +112,24 @@ class Ingest:
 
     @property
     def connected(self) -> frozenset[str]:
-        """The cameras, IMUs and trackers heard within the last second."""
+        """Return the cameras, IMUs and trackers received within the last second."""
         with self._lock:
             return self._link.connected()
 
     @property
     def lost(self) -> int:
-        """Frames, or triples, of all cameras that were sent and never came."""
+        """Return the number of sent frames of all cameras that never arrived.
+
+        Strobe cycles count as frames do.
+        """
         return sum(self.counts_of(camera).lost for camera in self._cameras)
 
     @property
     def skipped(self) -> int:
-        """Frames, or triples, of all cameras that were never sent: camera or slave had no time for them."""
+        """Return the number of frames of all cameras that were never sent.
+
+        Strobe cycles count as frames do. Camera or slave had no time for them.
+        """
         return sum(self.counts_of(camera).skipped for camera in self._cameras)
 
     @property
@@ -157,7 +165,7 @@ class Ingest:
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def limit(self, limits: Mapping[str, SenderLimits]) -> None:
-        """Take of each sender what its files say now (`admission.limits_of`)."""
+        """Accept from each sender what its files state now (`admission.limits_of`)."""
         with self._lock:
             self._link.limit(limits)
 
@@ -173,8 +181,11 @@ class Ingest:
     def rejected_peers(
         self,
     ) -> tuple[dict[str, RejectedPeer], dict[str, RejectedPeer], dict[str, RejectedPeer]]:
-        """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
-        somebody says hello without its secret."""
+        """Return the recently rejected peers by sender, in three mappings.
+
+        The first has where a second process of the sender's name was rejected lately; the second where it speaks
+        another version; the third where somebody says hello without its secret.
+        """
         t_ns = self._clock.now_ns()
         with self._lock:
             rejected = self._link.rejected_peers
@@ -199,7 +210,10 @@ class Ingest:
             return self._link.clock_of(camera)
 
     def get(self, timeout_s: float) -> SensorMessage | None:
-        """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
+        """Return the oldest waiting message; None after `timeout_s`.
+
+        Its times are on the master's clock.
+        """
         return self.queue.get(timeout_s)
 
     def close(self) -> None:
@@ -231,7 +245,10 @@ class Ingest:
                 self.queue.put(messages)
 
     def _pending(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
-        """What has come, at most `AT_ONCE`: under a flood it is not for each that all that is due is seen to."""
+        """Yield the datagrams that have arrived, at most `AT_ONCE`.
+
+        So under a flood the periodic duties are not checked for each datagram.
+        """
         if first is None:
             return
         yield first
@@ -242,7 +259,10 @@ class Ingest:
 
 
 def _check_address(host: str) -> None:
-    """Refuse a host name: looking it up would stop the thread that reads, at every beacon."""
+    """Refuse a host name.
+
+    Looking it up would stop the thread that reads, at every beacon.
+    """
     try:
         IPv4Address(host)
     except AddressValueError as error:

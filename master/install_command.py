@@ -92,7 +92,7 @@ def environment_of() -> dict[str, str]:
 
 
 def _given(options: Namespace) -> set[str]:
-    """The options of `KEPT` that are not as they are if nothing is said."""
+    """Return the options of `KEPT` that differ from their defaults."""
     typical = defaults_of(declare_run)
     return {name for name in KEPT if getattr(options, name) != getattr(typical, name)}
 

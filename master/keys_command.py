@@ -1,4 +1,7 @@
-"""`phalanx fleet keys`: rig key, secrets and certificates of a rig, made and kept on the PC."""
+"""`phalanx fleet keys`: rig key, secrets and certificates of a rig.
+
+They are made and kept on the PC.
+"""
 
 from argparse import Namespace
 from collections.abc import Sequence
@@ -47,7 +50,10 @@ def _make(folder: Path, devices: Sequence[str]) -> None:
 
 
 def _show(folder: Path) -> None:
-    """Notify who has a certificate, what for, until when, and which device has no secret."""
+    """Print the certificates and the devices without a secret.
+
+    For each certificate: who has it, what for, and until when.
+    """
     certificates = certificates_of(folder)
     wide = max(len(one.name) for one in certificates)
     for one in certificates:

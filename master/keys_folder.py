@@ -1,4 +1,6 @@
-"""The keys folder of a rig on its PC: made, shown, renewed, a device taken out of it. `common.keys` says what is in it.
+"""Keys folder of a rig on its PC.
+
+It is made, shown and renewed, and a device is taken out of it. `common.keys` states what is in it.
 
 A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
 So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for
@@ -24,7 +26,9 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
-    """Make what is missing, and nothing else; return the files that were made, below `folder`.
+    """Make what is missing, and nothing else.
+
+    Returns the files that were made, below `folder`.
 
     A folder of before there were secrets gets them for all of its devices.
 
@@ -81,7 +85,9 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
 
 
 def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]:
-    """Make everything anew: rig key, secrets, authority, all certificates. What was is worth nothing afterwards.
+    """Make everything anew: rig key, secrets, authority, all certificates.
+
+    All earlier keys become invalid.
 
     All is made first, then takes the place of the old; other files in the folder stay.
 
@@ -118,8 +124,9 @@ def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]
 
 
 def renew_device(folder: Path, name: str, now: datetime) -> None:
-    """Make a new certificate for one device. Its old one stays valid, its secret stays: for one that was lost or stolen
-    use `renew`.
+    """Make a new certificate for one device.
+
+    Its old one stays valid, its secret stays: for one that was lost or stolen use `renew`.
 
     Raises:
         PhalanxError: No such folder or device; it cannot be written. The old one is still there then.
@@ -154,7 +161,9 @@ def files_of_device(name: str) -> tuple[str, ...]:
 
 
 def lacks_secrets(folder: Path) -> list[str]:
-    """Devices without a secret that follows from `devices.key`; all of them where there is none.
+    """Return the devices without a secret derived from `devices.key`.
+
+    It is all of them where there is no such key.
 
     Raises:
         PhalanxError: It is not the keys folder of a PC; a file is broken, or cannot be read.
@@ -174,7 +183,7 @@ def lacks_secrets(folder: Path) -> list[str]:
 
 
 def certificates_of(folder: Path) -> list[Shown]:
-    """What the certificates of master, operator and devices say.
+    """Return the contents of the certificates of master, operator and devices.
 
     Raises:
         PhalanxError: It is not the keys folder of a PC; a certificate is broken.

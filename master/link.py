@@ -1,4 +1,6 @@
-"""The master's side of the datagram link: sessions of all slaves, as a push machine without a socket.
+"""The master's side of the datagram link.
+
+It has the sessions of all slaves, as a push machine without a socket.
 
 `common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
@@ -76,7 +78,9 @@ START_AGAIN_NS = 50_000_000
 
 
 class MasterLink:
-    """Takes datagrams, gives what they brought on the master's clock, and says what to send.
+    """Datagram link of the master.
+
+    Takes datagrams, returns their contents on the master's clock, and the replies to send.
 
     Holds the sessions of the rig's cameras, IMUs and trackers, the moment of the start, the counters of refusals.
     """
@@ -151,7 +155,10 @@ class MasterLink:
         self.rejected_peers = RejectedPeers(self._keys, self._senders)
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> SensorMessage | None:
-        """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
+        """Take one datagram that arrived from `address` at `t_ns`.
+
+        Returns what it brought.
+        """
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             result = header
@@ -202,7 +209,7 @@ class MasterLink:
         return State.LIVE if t_ns - of.live.received_ns < WELL_NS else State.SILENT
 
     def connected(self) -> frozenset[str]:
-        """Return the senders heard in a live session within the last second."""
+        """Return the senders received in a live session within the last second."""
         t_ns = self._clock.now_ns()
         live = ((name, sender.live) for name, sender in self._senders.items())
         return frozenset(
@@ -215,7 +222,10 @@ class MasterLink:
         return None if live is None else live.clock.estimate()
 
     def clock_steps_of(self, sender: str) -> int:
-        """Return how often the clock of `sender` was seen to jump since this master began."""
+        """Return how often the clock of `sender` was seen to jump.
+
+        The count is since this master began.
+        """
         of = self._senders[sender]
         return of.steps_before + (0 if of.live is None else of.live.clock.steps)
 
@@ -224,7 +234,7 @@ class MasterLink:
         return self._senders[sender].restarts
 
     def limit(self, limits: Mapping[str, SenderLimits]) -> None:
-        """Take of each sender what its files say now."""
+        """Accept from each sender what its files state now."""
         for name, sender in self._senders.items():
             sender.limit(limits.get(name, SenderLimits()))
 
@@ -239,7 +249,10 @@ class MasterLink:
         return replace(counts, lost=lost, skipped=counts.lost - lost)
 
     def tag_counts_of(self, camera: str) -> CameraCounts | None:
-        """Return what was counted of the tags of `camera`, of which none is ever missing; None: it sends no tags."""
+        """Return the counts of the tags of `camera`.
+
+        None of the tags is ever missing. None: the camera sends no tags.
+        """
         kind = self._senders[camera].kinds.get(TagDetections)
         return None if kind is None else kind.sequence.counts
 

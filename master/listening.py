@@ -1,4 +1,6 @@
-"""Pages that other machines may open: encrypted by a certificate of this machine's own, or plain where it is said.
+"""Web pages that other machines may open.
+
+They are encrypted by a certificate of this machine's own, or plain where that is requested.
 
 The certificate signs itself. It is not of the rig's authority on purpose: a certificate of that may be shown by whoever
 listens only to be the master (docs/security.md), and nobody should have to trust a rig's authority in his browser.
@@ -48,7 +50,10 @@ class PageCertificate:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is reached from this machine alone. Of names only localhost is: the others may change."""
+    """Check whether an address is reached from this machine alone.
+
+    Of names only localhost is: the others may change.
+    """
     return loopback(f"tcp/[{host}]:0")
 
 
@@ -58,13 +63,18 @@ def is_open(environment: Mapping[str, str]) -> bool:
 
 
 def private_folder(environment: Mapping[str, str]) -> Path:
-    """Where this user's passwords and certificates of pages are kept: ~/.config/phalanx; made by who writes."""
+    """Return the folder of this user's page passwords and certificates.
+
+    It is ~/.config/phalanx; whoever writes there makes it.
+    """
     base = environment.get("XDG_CONFIG_HOME") or str(Path("~/.config").expanduser())
     return Path(base) / "phalanx"
 
 
 def page_certificate(folder: Path, host: str, now: datetime | None = None) -> PageCertificate:
-    """The certificate kept in `folder` (page.pem, with its key); made anew where there is none, or it does not fit.
+    """Return the page certificate kept in `folder` (page.pem, with its key).
+
+    It is made anew where there is none, or it does not fit.
 
     Args:
         folder: Made with mode 0700 where it is missing.
@@ -107,7 +117,9 @@ def read_private(path: Path) -> bytes:
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a file that its owner alone can read, at once; its folder is made, for him alone, where it is missing.
+    """Write a file that its owner alone can read, at once.
+
+    Its folder is made, for the owner alone, where it is missing.
 
     Raises:
         PhalanxError: It cannot be written.
@@ -130,7 +142,9 @@ def machine_names() -> frozenset[str]:
 
 
 def places_of(host: str) -> tuple[str, ...]:
-    """Under what a browser finds a page that listens on `host`: itself, or where that is everywhere, each IPv4 address.
+    """Return the addresses at which a browser finds a page on `host`.
+
+    It is the host itself, or where the page listens everywhere, each IPv4 address.
 
     Those that other machines reach come first, this machine's own last.
     """
@@ -140,7 +154,10 @@ def places_of(host: str) -> tuple[str, ...]:
 
 
 def _addresses() -> list[str]:
-    """IPv4 addresses of this machine, as Linux tells of each network; elsewhere, and without one, of its name."""
+    """Return the IPv4 addresses of this machine.
+
+    Linux reports them for each network; elsewhere, and without one, they are those of its name.
+    """
     found: list[str] = []
     if sys.platform == "linux":
         from fcntl import ioctl

@@ -1,4 +1,7 @@
-"""A live master: opens bus, ingest and sinks, runs the loop, reports once a second, writes the summary."""
+"""A live master.
+
+It opens bus, ingest and sinks, runs the loop, reports once a second, and writes the summary.
+"""
 
 import gc
 import os
@@ -192,7 +195,10 @@ def run_live(
 
 
 def _sinks(setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus) -> list[Sink]:
-    """Where what is told goes: to the bus, and to files where that is asked for."""
+    """Return the sinks of the results.
+
+    Results go to the bus, and to files where that is requested.
+    """
     sinks: list[Sink] = [BusSink(bus)]
     if settings.poses is not None:
         counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
@@ -220,7 +226,9 @@ def devices_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
 def ingest_of(
     setups: Sequence[RigSetup], key: LinkKey | bytes, clock: Clock, settings: LiveSettings
 ) -> Ingest:
-    """Where all cameras, IMUs and trackers of these hands and objects are heard.
+    """Return the receiver of all senders of these hands and objects.
+
+    The senders are cameras, IMUs and trackers.
 
     Raises:
         BusError: The address cannot be bound, or the beacon's is no IPv4 address.

@@ -1,4 +1,7 @@
-"""How a live master is: its health on the bus, answers to who asks there, and a line for each change."""
+"""Status of a live master.
+
+It has the master's health on the bus, answers to requests there, and a line for each change.
+"""
 
 import secrets
 import threading
@@ -23,7 +26,9 @@ _REPORT_S = 1.0
 
 
 class Reporter:
-    """Tells how the master is: on the bus, to whoever asks there, and a line for each change.
+    """Status reporter of the master.
+
+    It reports on the bus, to whoever asks there, and prints a line for each change.
 
     Holds the id of this run, and what it reports on.
     """
@@ -55,7 +60,10 @@ class Reporter:
         bus.serve(MASTER, self.answer)
 
     def health(self) -> Health:
-        """The report of this moment; of what never happened only `received` is told, to keep it short."""
+        """Return the current health report.
+
+        Of what never happened only `received` is reported, to keep it short.
+        """
         events = self._ingest.counts | self._bus.counts
         happened = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
@@ -66,8 +74,10 @@ class Reporter:
         return health(self.session, self._clock, self._figures, counts, times)
 
     def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "filter"
-        another 1 € filter for one rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
+        """Execute a command and return the health.
+
+        "report" returns the status, "reload" uses the files as they are now, "filter" sets another 1 € filter for one
+        rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
 
         Raises:
             CalibrationError: The files cannot be used; the old ones still are.
@@ -83,7 +93,10 @@ class Reporter:
         return self.health()
 
     def work(self) -> None:
-        """Once a second until the stop: health on the bus and the rate; and a line whenever something changes."""
+        """Publish health on the bus and the rate once a second until the stop.
+
+        Prints a line whenever something changes.
+        """
         connected: frozenset[str] | None = None
         started = False
         poses = 0
@@ -136,7 +149,7 @@ class Reporter:
 
 
 def marker_line(name: str, counts: MarkerCounts) -> str:
-    """What a person is told of a slave whose rig file is another than the master's."""
+    """Return the line about a slave whose rig file differs from the master's."""
     return (
         f"camera {name}: its slave sends {counts.sent} markers, the rig here has {counts.expected}: nothing of it is"
         " used. Deploy the rig to it again (phalanx fleet deploy), then restart this master if its own file has changed"
@@ -144,7 +157,10 @@ def marker_line(name: str, counts: MarkerCounts) -> str:
 
 
 def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
-    """What a person is told when a sender comes or goes: who is there, and which cameras are waited for."""
+    """Return the line for the user when a sender comes or goes.
+
+    It states who is there, and which cameras are waited for.
+    """
     here = ", ".join(name for name in cameras if name in connected) or "none yet"
     absent = ", ".join(name for name in cameras if name not in connected)
     line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
@@ -155,7 +171,10 @@ def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: 
 
 
 def unplaced_line(name: str, tracker: str) -> str:
-    """What a person is told of a tracker whose poses mean nothing in the rig."""
+    """Return the line about a tracker whose poses are not placed in the rig.
+
+    Its poses mean nothing there.
+    """
     return (
         f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
         f" `phalanx calibrate tracker {name}`"

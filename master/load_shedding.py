@@ -1,4 +1,6 @@
-"""What a master that falls behind leaves out: it solves the newest instant, and no message is lost for it.
+"""Load shedding of a master that falls behind.
+
+It solves the newest epoch, and no message is lost for it.
 
 An instant is left out (*shed*, counted as `instants_shed`) when what waits already completes a newer one of the same
 hand: where the hand was then interests nobody any more. All messages are taken, for a camera's past tells where its
@@ -26,7 +28,7 @@ _SILENT_PERIODS = (
 
 @dataclass(frozen=True, slots=True)
 class Cameras:
-    """The cameras whose frames make the instants of one hand, the leading one first.
+    """The cameras whose frames make the epochs of one hand, the leading one first.
 
     Attributes:
         centre_ns: Camera -> middle of its frames after their stamps [ns].
@@ -49,7 +51,7 @@ class Cameras:
         return cls(dict.fromkeys(names, 0) | centre_ns, round(_SILENT_PERIODS * 1e9 / slowest_hz))
 
     def newer_waits(self, waiting: Mapping[str, Span], newest_ns: Mapping[str, int], t_ns: int) -> bool:
-        """Whether what waits completes an instant.
+        """Check whether the waiting messages complete an epoch.
 
         Args:
             waiting: Camera -> when its frames are that wait [ns].
@@ -76,7 +78,10 @@ class LoadShedding:
     """
 
     def __init__(self, setups: Sequence[RigSetup] = ()) -> None:
-        """Of a master of these hands that is not behind; without hands it is as far behind as it is told."""
+        """Initialise for a master of these hands that is not behind.
+
+        Without hands it is as far behind as it is set.
+        """
         self.waiting: Callable[[], Mapping[str, Span]] = dict[str, Span]
         self.reject = 0
         self._newest_ns: dict[str, int] = {}
@@ -89,7 +94,10 @@ class LoadShedding:
                     self._cameras.setdefault(name, []).append(Cameras.of(setup, names))
 
     def look(self, message: Message) -> None:
-        """A message was taken: see what waits behind it. Only with a frame it changes what is left out."""
+        """Take a message and check what waits behind it.
+
+        Only with a frame it changes what is skipped.
+        """
         if not isinstance(message, Detections):
             return
         waiting, monitored = self.waiting(), self._cameras.get(message.camera)
@@ -101,14 +109,17 @@ class LoadShedding:
 
 
 class Shedding:
-    """Asked for each instant of one hand whether it is left out. Holds how many in a row were."""
+    """Decision for each epoch of one hand whether it is skipped.
+
+    Holds how many in a row were.
+    """
 
     def __init__(self, load_shedding: LoadShedding) -> None:
-        """Leave out what `load_shedding` says."""
+        """Skip epochs as `load_shedding` states."""
         self._load_shedding = load_shedding
         self._in_a_row = 0
 
     def __call__(self) -> bool:
-        """Whether the next instant is left out."""
+        """Return whether the next epoch is skipped."""
         self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._load_shedding.reject else 0
         return self._in_a_row > 0

@@ -27,7 +27,7 @@ class MonitoredLoop(Generic[SeenT]):
         manager: ServiceManager,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Say that the loop is ready: it begins now.
+        """Report that the loop is ready: it begins now.
 
         Args:
             source: Where messages come from.

@@ -1,4 +1,7 @@
-"""How programs of the PC come to the bus: a master listens, all others join it, each with its own certificate."""
+"""Access of the PC's programs to the bus.
+
+A master listens, all others join it, each with its own certificate.
+"""
 
 import os
 import threading
@@ -13,7 +16,9 @@ _TRY_AGAIN_S = 0.3
 
 
 def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
-    """The bus as the master at `endpoint` sees it; or, of a router there, what is told of `site`.
+    """Join the bus as the master at `endpoint` sees it.
+
+    Where a router is at the endpoint, it is what is published of `site`.
 
     Raises:
         BusError: Nobody listens there, or refuses this program's certificate; the endpoint is malformed.
@@ -37,7 +42,9 @@ def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
 def bus_of_master(
     endpoint: str, stop: threading.Event, waiting: Callable[[BusError], None], site: str | None = None
 ) -> ZenohBus | None:
-    """The bus, once a master, or a router for `site`, listens at `endpoint`; None when stopped before.
+    """Return the bus, once a master listens at `endpoint`; None when stopped before.
+
+    A router for `site` will do too.
 
     `waiting` is told once why not yet.
 

@@ -1,4 +1,6 @@
-"""What came and was not taken yet: the one queue between the thread that reads the socket and the live loop.
+"""Queue of messages that arrived and were not taken yet.
+
+It is the one queue between the thread that reads the socket and the live loop.
 
 It drops the oldest, so a slow loop sees what is new. Frames, tags, samples of IMUs and poses of trackers have each
 their own room in it: none drives another out, and at overload all that is taken is of the same stretch of time.
@@ -32,7 +34,10 @@ _KIND: dict[type[SensorMessage], str] = {
 
 
 class Span(NamedTuple):
-    """Capture times of the oldest and of the newest frame of a camera that waits [ns], master's clock."""
+    """Capture times of the oldest and of the newest waiting frame of a camera.
+
+    [ns], master's clock.
+    """
 
     oldest_ns: int
     newest_ns: int
@@ -59,11 +64,17 @@ class MessageQueue:
 
     @property
     def frames(self) -> int:
-        """Frames, or triples, of all cameras that wait."""
+        """Return the number of waiting frames of all cameras.
+
+        Strobe cycles count as frames do.
+        """
         return self._waiting["frame"]
 
     def frame_spans(self) -> dict[str, Span]:
-        """Camera -> of when its frames, or triples, are that wait; only cameras of which one does."""
+        """Return the time span of each camera's waiting frames.
+
+        Camera -> span; strobe cycles count as frames do. Only cameras that have a waiting frame are included.
+        """
         if not self._waiting["frame"]:
             return {}
         with self._changed:
@@ -91,7 +102,10 @@ class MessageQueue:
             self._changed.notify()
 
     def get(self, timeout_s: float) -> SensorMessage | None:
-        """Return the oldest waiting message; None after `timeout_s`, or once closed and empty."""
+        """Return the oldest waiting message.
+
+        None after `timeout_s`, or once closed and empty.
+        """
         with self._changed:
             if not self._queue:
                 self._changed.wait_for(lambda: self._queue or self._closed, timeout_s)

@@ -1,4 +1,7 @@
-"""Which changes of a rig's files a running master cannot follow: what slaves, files and viewers were started with."""
+"""Changes of a rig's files that a running master cannot follow.
+
+They concern what slaves, files and viewers were started with.
+"""
 
 from collections.abc import Sequence
 

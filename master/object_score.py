@@ -1,4 +1,7 @@
-"""Tracked objects against their truth: millimetres, degrees, how often they were tracked, and if doubt was honest."""
+"""Score of tracked objects against their truth.
+
+It has millimetres, degrees, how often they were tracked, and whether the stated uncertainty was consistent.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +31,10 @@ class ObjectTruth:
     T_rig_object: Float
 
     def at(self, t_ns: Int) -> Float:
-        """Poses (T, 4, 4) at other instants (T,), interpolated; NaN outside, and where truths are too far apart."""
+        """Interpolate poses (T, 4, 4) at other times (T,).
+
+        NaN outside, and where truths are too far apart.
+        """
         out = np.full((len(t_ns), 4, 4), np.nan)
         if len(self.t_ns) == 0:
             return out
@@ -68,7 +74,10 @@ def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
 
 
 def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:
-    """Distance [mm] of the origin and angle [deg] of each pose (T,) from the truth; NaN where either is not known."""
+    """Return distance [mm] of the origin and angle [deg] of each pose (T,).
+
+    Both are from the truth; NaN where either is not known.
+    """
     true = truth.at(poses.t_ns)
     off_mm = 1e3 * np.linalg.norm(poses.position_m - true[:, :3, 3], axis=1)
     rotation = np.swapaxes(true[:, :3, :3], 1, 2) @ quaternion_to_matrix(poses.orientation_wxyz)
@@ -102,7 +111,10 @@ def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
 
 
 def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
-    """Share of the true instants at which the nearest pose is tracked, and not farther than poses usually are apart."""
+    """Return the share of true epochs at which the nearest pose is tracked.
+
+    The nearest pose must not be farther away than the usual spacing of poses.
+    """
     if len(truth.t_ns) == 0 or len(poses) == 0:
         return 0.0
     apart = [np.median(np.diff(t_ns)) for t_ns in (truth.t_ns, poses.t_ns) if len(t_ns) > 1]
@@ -115,7 +127,9 @@ def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
 
 
 def score_objects(scores: dict[str, dict[str, float]]) -> dict[str, object]:
-    """For a summary: `objects` (each by its name), and of all together object_mm, object_deg, object_tracked.
+    """Return the object metrics for a summary.
+
+    `objects` (each by its name), and of all together object_mm, object_deg, object_tracked.
 
     These are of the object that is worst in each.
     """

@@ -1,4 +1,6 @@
-"""Options that several commands of the master share, and what the texts behind them mean.
+"""Options that several commands of the master share.
+
+Also what the texts behind them mean.
 
 `--keys` and `--open` say the same as their environment variables, and set them: programs that a command starts by
 itself, such as the recorder, or what the console's page begins, belong to the same rig.
@@ -114,7 +116,10 @@ def add_site(command: ArgumentParser) -> None:
 
 
 def add_link(command: ArgumentParser) -> None:
-    """Where slaves hear the start, where their datagrams come, and by which key they are sealed."""
+    """Add the options of the link to the slaves.
+
+    Where slaves receive the start signal, where their datagrams arrive, and by which key these are sealed.
+    """
     command.add_argument(
         "--beacon",
         default=HERE_BEACON,
@@ -165,7 +170,10 @@ def add_joints(command: ArgumentParser) -> None:
 
 
 def add_span(command: ArgumentParser, whole: str, end: str) -> None:
-    """A part of `whole`; the option `end` says up to where."""
+    """Add the options that select a part of `whole`.
+
+    The option `end` gives where the part ends.
+    """
     command.add_argument(
         "--from",
         dest="from_s",

@@ -1,4 +1,6 @@
-"""When the cameras expose against each other: whether a lock between them holds, as the master sees it.
+"""Exposure phases between the cameras.
+
+Whether a lock between them holds, as the master observes it.
 
 The phase of a camera is how much later than the leading camera's frame its own was taken, modulo the period. Cameras
 that run free drift through all phases, some period in minutes; locked ones stay where they are.
@@ -33,10 +35,17 @@ class Phase:
 
 
 class CameraPhases:
-    """Push machine. Holds the leading camera's last time, the last 64 phases of the others, and who is in step."""
+    """Monitor of the exposure phases of the cameras.
+
+    Push machine. Holds the leading camera's last time, the last 64 phases of the others, and which cameras are in
+    step.
+    """
 
     def __init__(self, frame_rate_hz: Mapping[str, float]) -> None:
-        """Take the cameras in the rig's order, with their nominal rates; the first one leads."""
+        """Take the cameras in the rig's order, with their nominal rates.
+
+        The first one leads.
+        """
         self._leader = next(iter(frame_rate_hz))
         self._period_ns = 1e9 / frame_rate_hz[self._leader]
         self._lead_ns: int | None = None
@@ -54,7 +63,10 @@ class CameraPhases:
             fractions.append((message.t_ns - self._lead_ns) / self._period_ns)
 
     def phases(self) -> dict[str, Phase]:
-        """Phase of every camera but the leading one of which enough frames came: the mean direction on a circle."""
+        """Return the phase of every non-leading camera with enough frames.
+
+        The phase is the mean direction on a circle.
+        """
         found: dict[str, Phase] = {}
         for name, fractions in self._fractions.items():
             kept = np.array(fractions.copy())

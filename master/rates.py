@@ -1,4 +1,6 @@
-"""How fast the cameras run, and how many of their frames arrive: two rates that are easily taken for one.
+"""Camera frame rates and frame arrival rates.
+
+How fast the cameras run, and how many of their frames arrive: two rates that are easily confused.
 
 A camera's rate is that of its frame counter over its capture times, whether or not somebody had time for the frames
 in between; the rate of arrival counts the frames that were searched, sent and received.
@@ -11,7 +13,10 @@ from common.messages import Detections
 
 @dataclass(slots=True)
 class _Span:
-    """One camera: its last frame, and what was added up between the frames of one process of its slave."""
+    """Frame count of one camera.
+
+    Its last frame, and the sums between the frames of one process of its slave.
+    """
 
     session: int
     seq: int
@@ -22,13 +27,19 @@ class _Span:
 
 
 class CameraRates:
-    """Push machine. Holds of each camera the last frame, and frames, arrivals and time since the first."""
+    """Estimator of the frame rates of all cameras.
+
+    Push machine. Holds for each camera the last frame, and frames, arrivals and time since the first.
+    """
 
     def __init__(self) -> None:
         self._spans: dict[str, _Span] = {}
 
     def push(self, message: Detections) -> None:
-        """Take one frame; an older one than the last is not counted, and nothing between two processes of a slave."""
+        """Count one frame.
+
+        A frame older than the last is not counted, and nothing between two processes of a slave.
+        """
         known = self._spans.get(message.camera)
         if known is None:
             self._spans[message.camera] = _Span(message.session, message.seq, message.t_ns)

@@ -1,4 +1,7 @@
-"""Reads what `phalanx-slave run -o` wrote of a recording, detections_<camera>.npz, as the messages of its rows."""
+"""Reader of detections_<camera>.npz of a recording.
+
+Written by `phalanx-slave run -o`; returned as the messages of its rows.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,7 +126,9 @@ def _where_seen(uv: Float, value: float) -> Float:
 
 
 def _sigma_of(uv: Float, quality: Float) -> Float:
-    """Standard deviations (T, M) [px] of centroids whose file states none, from their quality (T, M).
+    """Return standard deviations (T, M) [px] of centroids from their quality.
+
+    For centroids whose file states none; the quality is (T, M).
 
     A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap that
     may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.

@@ -1,4 +1,7 @@
-"""What the IMU of a recording told of one hand, and the setup that knows what that is worth."""
+"""IMU data of a recording for one hand.
+
+With the setup that has the accuracy of these data.
+"""
 
 import logging
 from dataclasses import replace as with_fields
@@ -22,7 +25,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[ImuSample, ...], RigSetup]:
-    """What the recording's IMU measured, with its orientation, and the setup that knows what that is worth.
+    """Return the recording's IMU samples with orientation, and their setup.
+
+    The setup has the accuracy of these samples.
 
     A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live slave makes
     its orientation of them. The heading of that begins anywhere, whatever the rig's file says of it.
@@ -58,7 +63,7 @@ def _imu_of(setup: RigSetup) -> ImuCalibration | None:
 
 
 def _with_imu(setup: RigSetup, imu: ImuCalibration) -> RigSetup:
-    """The setup whose IMU is worth something else."""
+    """Return the setup with the accuracy of its IMU replaced."""
     if setup.has_markers and setup.rig.imu is not None:
         return with_fields(setup, rig=replace(setup.rig, imu=imu))
     if setup.wrist is None or setup.wrist_rig is None:

@@ -1,4 +1,7 @@
-"""Reads what `phalanx-slave run -o` wrote of the tags of a recording, tags_<camera>.npz, as messages of its frames."""
+"""Reader of tags_<camera>.npz of a recording.
+
+Tag detections written by `phalanx-slave run -o`; returned as messages of its frames.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -35,7 +35,10 @@ class MarkerCounts(NamedTuple):
 
 
 class RejectedPeers:
-    """Push machine. Holds of each sender of the rig when it was last turned away, and from where."""
+    """Record of rejected senders of the rig.
+
+    Push machine. Holds for each sender when it was last rejected, and from where.
+    """
 
     def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
         """Nobody was, yet; `names` are those of the rig."""
@@ -47,11 +50,17 @@ class RejectedPeers:
         self._next_ns: int | None = None
 
     def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """A second process under `name` said hello at `t_ns` [ns] while the first one was well."""
+        """Record a duplicate sender `name`, which said hello at `t_ns` [ns].
+
+        A second process under this name, while the first one was well.
+        """
         self._duplicates[name] = t_ns, RejectedPeer(host, version)
 
     def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Somebody at `host` said hello at `t_ns` [ns] as `name`, without that device's secret."""
+        """Record a hello at `t_ns` [ns] as `name` without that device's secret.
+
+        The sender is at `host`.
+        """
         self._unproven[name] = t_ns, RejectedPeer(host, version)
 
     def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
@@ -62,7 +71,10 @@ class RejectedPeers:
         self._markers[name] = t_ns, MarkerCounts(sent, expected)
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
-        """Take a datagram of another wire version; what is no hello of this rig, rightly sealed, is left."""
+        """Take a datagram of another wire version.
+
+        What is not a rightly sealed hello of this rig is ignored.
+        """
         if len(datagram) < HEADER.size or (self._next_ns is not None and t_ns < self._next_ns):
             return
         magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
@@ -82,7 +94,10 @@ class RejectedPeers:
         return _lately(self._versions, t_ns)
 
     def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Name -> where somebody says hello without its secret, as of `t_ns` [ns]."""
+        """Return where senders say hello without their secret, as of `t_ns` [ns].
+
+        A mapping from name to where.
+        """
         return _lately(self._unproven, t_ns)
 
     def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:

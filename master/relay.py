@@ -1,4 +1,6 @@
-"""What a master tells, repeated at a router under the name of its site: read-only upward, nothing comes down.
+"""Relay of a master's messages to a router under the name of its site.
+
+Read-only upward, nothing comes down.
 
 Each stream has a thread and a bounded queue of its own, so that a slow link holds up neither the master nor another
 stream; what did not fit is counted. Of the two ends of a relay only the lower one is asked anything.
@@ -24,13 +26,15 @@ _JOIN_S = 2.0
 
 
 class Relay:
-    """Repeats until it is closed. Holds a thread for each stream, and what was counted.
+    """Relay that repeats messages until it is closed.
+
+    Holds a thread for each stream, and the counts.
 
     `below` is the bus of the master, `above` that of the router; both belong to the caller.
     """
 
     def __init__(self, below: Bus, above: Bus, clock: Clock) -> None:
-        """Begin to repeat, and to tell below and above how it is, as `relay`.
+        """Start repeating, and report health below and above as `relay`.
 
         Raises:
             BusError: A bus is closed.
@@ -51,7 +55,10 @@ class Relay:
         below.serve(NAME, self._answer)
 
     def health(self) -> Health:
-        """Counts of each stream: repeated.NAME, and dropped.NAME and refused.NAME where there are any."""
+        """Return the counts of each stream.
+
+        repeated.NAME, and dropped.NAME and refused.NAME where there are any.
+        """
         counts = {f"repeated.{stream}": number for stream, number in dict(self._repeated).items()}
         for stream, source in self._from.items():
             lost = {f"dropped.{stream}": source.dropped, f"refused.{stream}": source.refused}
@@ -59,7 +66,10 @@ class Relay:
         return Health(NAME, self.session, self._clock.now_ns(), counts, {}, *program())
 
     def report(self, notify: Callable[[str], None], stop: threading.Event) -> None:
-        """Once a second until `stop`: health below, which is repeated above as all health is; a line each minute."""
+        """Report health once a second until `stop`.
+
+        Health is published below, from where it is repeated above as all health is; a line is printed each minute.
+        """
         minute = 0
         while not stop.wait(REPORT_S):
             health = self.health()

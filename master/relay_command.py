@@ -1,4 +1,7 @@
-"""`phalanx fleet relay`: several masters, seen from one place, and nothing that reaches down to them."""
+"""`phalanx fleet relay`: several masters, seen from one place.
+
+Nothing reaches down to the masters.
+"""
 
 import os
 import threading
@@ -19,7 +22,9 @@ _POLL_S = 0.5
 
 
 def relay(options: Namespace) -> None:
-    """Be a router that relays, readers and other routers connect to, or a relay beside a master.
+    """Run a router, or a relay beside a master.
+
+    Relays, readers and other routers connect to the router.
 
     Raises:
         UsageError: An option is of the other one.

@@ -1,4 +1,6 @@
-"""Replay: the slave's detection in every camera of a recording, as processes; then all together are solved.
+"""Replay of the slaves' detection on a recording.
+
+In every camera, as processes; then all cameras are solved together.
 
 Videos and pictures of other programs become a recording before that, by `phalanx-slave record --from`.
 """

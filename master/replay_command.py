@@ -1,4 +1,7 @@
-"""`phalanx replay`: recorded frames, detections or messages to hands, the same bytes on every run."""
+"""`phalanx replay`: recorded frames, detections or messages to hands.
+
+The same bytes on every run.
+"""
 
 from argparse import Namespace
 from pathlib import Path

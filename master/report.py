@@ -1,4 +1,7 @@
-"""After a simulated run: its poses against the scene's exact truth, as figures, a picture and a Rerun file."""
+"""Report of a simulated run against the scene's exact truth.
+
+Figures, a picture and a Rerun file of its poses.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -71,7 +74,10 @@ class Played:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
-    """A run beside its truth: scores, the true hand, what the cameras saw, and how to draw a wrist device."""
+    """A run beside its truth.
+
+    Scores, the true hand, what the cameras saw, and how to draw a wrist device.
+    """
 
     scores: dict[str, float]
     truth: PosesTruth
@@ -172,7 +178,10 @@ def _of_wrist(
 
 
 def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Truth:
-    """The scene at the instants of the poses, with what each camera could see."""
+    """Return the scene at the times of the poses, with each camera's visibility.
+
+    The visibility is what each camera could see.
+    """
     times = (poses.t_ns - epoch_ns) * 1e-9
     renderers = [Renderer(scene, camera) for camera in scene.rig.cameras]
     joints = np.empty((len(times), 25, 3))

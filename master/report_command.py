@@ -1,4 +1,7 @@
-"""`python -m master.report_command`: what `phalanx demo` calls at its end, a simulated run against the exact truth."""
+"""`python -m master.report_command`: report of a simulated run.
+
+What `phalanx demo` calls at its end; compares the run with the exact truth.
+"""
 
 import logging
 import sys
@@ -17,7 +20,9 @@ from master.terminal import progress
 
 
 def report(words: Sequence[str]) -> None:
-    """Write figures, a picture and a Rerun file of a run. Of a second hand they are in a folder of its name below OUT.
+    """Write figures, a picture and a Rerun file of a run.
+
+    Those of a second hand are in a folder of its name below OUT.
 
     Raises:
         PhalanxError: A file is missing or broken, or there is no such scene.

@@ -1,4 +1,7 @@
-"""From JSON to rigs: reads them and what they name of a calibration folder; pipelines are made of what it returns."""
+"""Reader of rigs from JSON.
+
+Reads rigs and what they name of a calibration folder; pipelines are made of what it returns.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +26,9 @@ def setups_of(
     objects: Mapping[str, ObjectProfile] | None = None,
     gestures_of: Callable[[str | None], GestureSettings] = lambda _name: default_gestures(),
 ) -> tuple[RigSetup, ...]:
-    """What watches each hand of these rigs, in the order in which they name the hands.
+    """Return the setup of each hand of these rigs.
+
+    What observes each hand, in the order in which the rigs name the hands.
 
     A marker rig with `other_hands` watches several: each of its markers is that of the hand that mounts it. Free
     markers and objects stay with the rig's first hand.
@@ -59,8 +64,9 @@ def setups_of(
 def load_setups(
     calibration: Path, rig_names: Sequence[str], hand_file: Path | None = None
 ) -> tuple[RigSetup, ...]:
-    """Read rigs/<rig>.json of each rig, their cameras, hands, objects and gestures from a calib_json tree: a setup for
-    each hand.
+    """Read a setup for each hand from a calib_json tree.
+
+    Reads rigs/<rig>.json of each rig, their cameras, hands, objects and gestures.
 
     Args:
         calibration: The tree.
@@ -86,7 +92,9 @@ def setups_with_hands(
     hand_file: Path | None,
     objects: Mapping[str, ObjectProfile] | None = None,
 ) -> tuple[RigSetup, ...]:
-    """As `setups_of`, each hand, object and gesture as `load_hand`, `load_objects` and `load_gestures` find it.
+    """Build setups as `setups_of`, loading hands, objects and gestures.
+
+    Each as `load_hand`, `load_objects` and `load_gestures` find it.
 
     `hand_file` is the hand of all rigs; `objects` are those of a recording, before those of the tree.
 
@@ -102,7 +110,9 @@ def setups_with_hands(
 
 
 def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) -> RigSetup:
-    """Read rigs/<rig>.json, its cameras, hand, objects and gestures from a calib_json tree.
+    """Read one rig's setup from a calib_json tree.
+
+    Reads rigs/<rig>.json, its cameras, hand, objects and gestures.
 
     Raises:
         CalibrationError: A file is missing, broken or contradicts another.
@@ -140,7 +150,10 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
 
 @dataclass(frozen=True, slots=True)
 class RigFiles:
-    """Where setups were read: the arguments of `load_setups`, and numbers of the estimator that go with them."""
+    """Where setups were read.
+
+    The arguments of `load_setups`, and parameters of the estimator that go with them.
+    """
 
     calibration: Path
     rigs: tuple[str, ...]

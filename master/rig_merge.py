@@ -1,5 +1,7 @@
-"""Rigs by the hand that they watch: several marker rigs of one hand become one of N cameras, and a rig of several hands
-becomes one for each. Objects are those of all of them together.
+"""Rigs grouped by the hand that they observe.
+
+Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Objects are
+those of all of them together.
 
 Each pair of cameras is calibrated in a frame of its own; `T_world_rig` says where that lies in the one they share. What
 rigs of one hand say twice must be said alike: a silent choice between two filters would be nobody's.
@@ -23,7 +25,9 @@ _UNTURNED = 1e-9  # of a rotation matrix that turns nothing
 
 
 def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
-    """One marker rig with the cameras of all of them, in their order and in the frame that they share.
+    """Merge marker rigs into one with the cameras of all of them.
+
+    In their order and in the frame that they share.
 
     It triangulates by all of them, whatever law of two cameras each has (`depth_model` "stereo"). Its residual is that
     of the rig that was measured worst. It states the first volume that a rig states, where that is a box along the axes
@@ -78,7 +82,9 @@ def gestures_named(rigs: Sequence[RigCalibration]) -> str | None:
 
 
 def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
-    """Refuse rigs of which two have a camera or an IMU of the same name: a message tells whose it is by that alone.
+    """Refuse rigs that share the name of a camera or an IMU.
+
+    A message identifies its sender by that name alone.
 
     Raises:
         CalibrationError: With both rigs and the name.
@@ -97,7 +103,9 @@ def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
 def rigs_by_hand(
     rig: RigCalibration, hands: Mapping[str, HandModel]
 ) -> list[tuple[str, RigCalibration, tuple[int, ...]]]:
-    """Of each hand: its name, the rig as if it watched that hand alone, and which of the rig's markers those are.
+    """Split a rig by hand.
+
+    For each hand: its name, the rig as if it observed that hand alone, and which of the rig's markers those are.
 
     A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free markers
     and objects stay with its first hand.
@@ -136,8 +144,9 @@ def rigs_by_hand(
 
 
 def in_world(rig: RigCalibration) -> RigCalibration:
-    """The marker rig in the frame that several rigs share: cameras, world of its IMU, tracking system, and volume; one
-    without `T_world_rig` as it is.
+    """Return the marker rig in the frame that several rigs share.
+
+    Transforms cameras, world of its IMU, tracking system, and volume; a rig without `T_world_rig` stays as it is.
 
     A volume that the shared frame's axes turn away from is no box there, and is not stated any more.
     """
@@ -172,7 +181,10 @@ def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
 
 
 def _worst_places(rigs: Sequence[RigCalibration]) -> dict[str, Provenance]:
-    """How well the cameras are placed together: as well as those that are placed worst."""
+    """Return the accuracy of the cameras' poses in the merged rig.
+
+    As good as that of the rig whose cameras are placed worst.
+    """
     key = "T_rig_camera"
     known = [rig.provenance[key] for rig in rigs if key in rig.provenance]
     return {} if not known else {key: max(known, key=lambda one: one.residual.get("rms_px", 0.0))}

@@ -1,4 +1,7 @@
-"""The objects and gestures of a rig: their files, and what must fit between them and the rig."""
+"""Objects and gestures of a rig.
+
+Their files, and what must fit between them and the rig.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -54,7 +57,9 @@ def _refuse_shared_features(rig: str, objects: Sequence[ObjectProfile]) -> None:
 
 
 def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]) -> None:
-    """Refuse an object, or a tracker, that the rigs of two hands have: its poses would come twice.
+    """Refuse an object or a tracker that the rigs of two hands share.
+
+    Its poses would come twice.
 
     Args:
         watched: Of each hand the name of its rig, and its objects.
@@ -79,7 +84,9 @@ def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]
 def load_objects(
     calibration: Path | None, rigs: Sequence[RigCalibration], known: Mapping[str, ObjectProfile]
 ) -> dict[str, ObjectProfile]:
-    """The objects that these rigs name: from `known`, else <calibration>/objects/<name>.json.
+    """Load the objects that these rigs name.
+
+    From `known`, else <calibration>/objects/<name>.json.
 
     Raises:
         CalibrationError: One is in neither, or its file is broken.
@@ -99,8 +106,9 @@ def load_objects(
 
 
 def load_gestures(calibration: Path | None, name: str | None) -> GestureSettings:
-    """<calibration>/gestures/<name>.json; of a rig that names none default.json, and where that is not there either
-    what is shipped.
+    """Load <calibration>/gestures/<name>.json.
+
+    For a rig that names none, default.json, and where that does not exist either, the shipped settings.
 
     Raises:
         CalibrationError: A file that is named is missing, or one is broken.

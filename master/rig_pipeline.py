@@ -1,4 +1,7 @@
-"""From a rig to the pipeline that its files describe: joins the parts, for each kind of rig."""
+"""Pipeline construction from a rig's files.
+
+Joins the parts, for each kind of rig.
+"""
 
 from collections import Counter
 from collections.abc import Callable
@@ -39,7 +42,10 @@ _BLEND_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhe
 
 
 class Pipeline(Protocol):
-    """What makes poses of what the cameras of one rig saw, whichever kind of rig it is: a push machine."""
+    """Pipeline from the cameras of one rig to poses.
+
+    For either kind of rig: a push machine.
+    """
 
     counts: Counter[str]
 
@@ -48,7 +54,7 @@ class Pipeline(Protocol):
         ...
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU says of its own orientation (4,)."""
+        """Take the IMU's estimate of its own orientation (4,)."""
         ...
 
     def flush(self) -> list[SolvedPose]:
@@ -57,7 +63,10 @@ class Pipeline(Protocol):
 
 
 def _point_filter(setup: RigSetup) -> PointFilter:
-    """The filter this rig's file describes, along the mean sight of its cameras and across it."""
+    """Return the point filter that this rig's file describes.
+
+    Along the mean viewing direction of its cameras and across it.
+    """
     poses = np.array([model.T_rig_camera for model in setup.models.values()])
     ahead = poses[:, :3, 2].sum(axis=0)
     across = cross(poses[0, :3, 1], ahead)
@@ -95,7 +104,10 @@ def _estimator(
     settings: Settings | None = None,
     fused: bool = False,
 ) -> Estimator:
-    """The estimator of a rig's hand; arguments as of `Estimator`, `fused`: with the rows of a wrist device."""
+    """Return the estimator of a rig's hand.
+
+    Arguments as of `Estimator`; `fused`: with the rows of a wrist device.
+    """
     markers, wrist = setup.hand_markers, None
     if fused:
         assert setup.wrist is not None
@@ -169,7 +181,9 @@ def build_pipeline(
     counts: Counter[str] | None = None,
     dropped_epochs: Callable[[], bool] | None = None,
 ) -> MarkerPipeline:
-    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `side`.
+    """Build the pipeline that this marker rig's file describes.
+
+    Of a wrist device beside it nothing is used except through `side`.
 
     Args:
         setup: The rig.
@@ -219,7 +233,9 @@ def pipeline_of(
     continuous: bool = True,
     dropped_epochs: Callable[[], bool] | None = None,
 ) -> Pipeline:
-    """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
+    """Build the pipeline of a rig of either kind, or of both.
+
+    Arguments and errors as of `build_pipeline`.
 
     What is pushed is of cameras of these rigs: the link refuses one that sends
     what those of the other kind do.

@@ -1,4 +1,7 @@
-"""What watches one hand: a rig and all that its files refer to, checked, and the rigs of one hand joined."""
+"""Setup that observes one hand.
+
+A rig and all that its files refer to, checked, and the rigs of one hand joined.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +24,9 @@ from master.wrist_setup import WristSetup
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSetup:
-    """What watches one hand, with everything the files refer to, checked: a marker rig, a wrist device, or both.
+    """Setup that observes one hand, with all files it refers to, checked.
+
+    A marker rig, a wrist device, or both.
 
     Attributes:
         rig: The rig file; of several marker rigs what they are together; with markers and a wrist device the former.
@@ -64,7 +69,7 @@ class RigSetup:
 
     @property
     def wrist_cameras(self) -> tuple[str, ...]:
-        """The cameras that send strobed triples and no markers."""
+        """Return the cameras that send strobe cycles and no markers."""
         return () if self.wrist_rig is None else self.wrist_rig.cameras
 
     @property
@@ -144,8 +149,10 @@ class RigSetup:
 
     @classmethod
     def joined(cls, setups: Sequence["RigSetup"]) -> "RigSetup":
-        """All that watches one hand: its marker rigs become one of N cameras in the frame that they share
-        (`T_world_rig`), and its wrist device stands beside them.
+        """Join all setups that observe one hand.
+
+        Its marker rigs become one of N cameras in the frame that they share (`T_world_rig`), and its wrist device
+        stands beside them.
 
         Args:
             setups: One or more, of one hand.
@@ -203,7 +210,9 @@ def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:
 
 
 def _refuse_two(setups: Sequence[RigSetup], wrist_setups: Sequence[RigSetup]) -> None:
-    """Refuse rigs that are not of one hand, or of which two claim what a hand has once.
+    """Refuse rigs of different hands, or with conflicting parts.
+
+    Two rigs conflict where both claim what a hand has only once.
 
     Raises:
         CalibrationError: With both rigs.

@@ -1,4 +1,7 @@
-"""`phalanx run`: track live until Ctrl-C, or install that as a service of this user."""
+"""`phalanx run`: track live until Ctrl-C.
+
+Or install that as a service of this user.
+"""
 
 import os
 from argparse import Namespace

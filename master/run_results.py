@@ -1,4 +1,7 @@
-"""After a simulated run: what it told beside the hands, again as messages and as figures that a person understands."""
+"""Results of a simulated run beside the hands.
+
+As messages again, and as figures that a person understands.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -30,7 +33,10 @@ _TRUTH_HZ = 60.0
 
 
 class Annotation(Protocol):
-    """One thing that a simulated hand says: as of a Gesture message, and when it begins and has done it [s]."""
+    """One gesture of a simulated hand.
+
+    As in a Gesture message, with the times when it begins and is complete [s].
+    """
 
     @property
     def kind(self) -> str: ...  # noqa: D102
@@ -44,16 +50,16 @@ class Annotation(Protocol):
 
 @runtime_checkable
 class Annotated(Protocol):
-    """A simulated hand that knows what it says."""
+    """A simulated hand with known gestures."""
 
     @property
     def annotations(self) -> Sequence[Annotation]:
-        """Everything that it says in a period, in order."""
+        """Return all gestures in a period, in order."""
         ...
 
     @property
     def period_s(self) -> float:
-        """Time [s] after which it says the same again."""
+        """Return the time [s] after which the gestures repeat."""
         ...
 
     def dial_rad(self, t_s: float) -> float:
@@ -63,7 +69,7 @@ class Annotated(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResults:
-    """What a run told of one hand and of its objects.
+    """Results of a run for one hand and its objects.
 
     Attributes:
         objects: One for each object of the rig.
@@ -77,7 +83,9 @@ class RunResults:
 
     @classmethod
     def load(cls, folder: Path, setup: RigSetup, from_ns: int) -> "RunResults":
-        """Read the files beside poses.npz; what a run did not write is not there. Gestures from a time on.
+        """Read the files beside poses.npz.
+
+        What a run did not write is not there. Gestures are read from a given time on.
 
         Raises:
             RecordingError: A file is broken.
@@ -141,7 +149,9 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 def judge_gestures(
     published: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
-    """What the hand of a scene said against what was told of it; poses of the hand are not judged.
+    """Compare the published gestures with those of a scene's hand.
+
+    Poses of the hand are not judged.
 
     Args:
         told: Gestures in the order of time.
@@ -230,7 +240,10 @@ def _label(one: Gesture) -> str:
 
 
 def _cut(published: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
-    """Whether it is one that the hand had begun before the first pose, or not done at the last."""
+    """Check whether a gesture is cut off by the run.
+
+    The hand had begun it before the first pose, or had not completed it at the last.
+    """
     turns = range(int(end_s // motion.period_s) + 1)
     spans = (
         (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)

@@ -104,7 +104,9 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
 
 
 def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
-    """How good poses are where the cameras see nothing of a finger, and when what tells of it changes.
+    """Score poses where the cameras see nothing of a finger.
+
+    Also when the source of information on it changes.
 
     Returns:
         joint_mm_hidden, pip_deg_hidden: Mean errors of fingers that are valid while their marker is at least half seen
@@ -136,7 +138,10 @@ def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[s
 
 
 def _near_change(t_ns: Int, source: Code) -> Bool:
-    """(N,) whether any joint has got another source within 0.2 s of each instant (N,), of sources (N, 26)."""
+    """Return a mask (N,) of the times near a change of any joint's source.
+
+    Within 0.2 s of each of the times (N,), of sources (N, 26).
+    """
     changed = t_ns[1:][(source[1:] != source[:-1]).any(axis=1)]
     after = np.searchsorted(changed, t_ns - _HAND_OVER_NS)
     return np.searchsorted(changed, t_ns + _HAND_OVER_NS, side="right") > after

@@ -1,4 +1,6 @@
-"""Counts what becomes of one camera's frames on the way: received, lost, skipped, late, duplicate, reordered.
+"""Frame counts of one camera.
+
+Frames received, lost, skipped, late, duplicate, reordered on the way.
 
 A frame is *lost* when it was sent and never came, *skipped* when nothing was sent under its number: numbers
 alone cannot tell, so `Sequence` counts both as lost and `Losses` parts them by the counters of the datagrams. It is
@@ -41,7 +43,9 @@ class CameraCounts:
 
 
 class Sequence:
-    """Push machine over frame numbers. Holds what was counted, the last one, and the newest skipped ones (<= 1024).
+    """Counter of frame numbers.
+
+    Push machine. Holds the counts, the last number, and the newest skipped ones (<= 1024).
 
     Attributes:
         lost: Numbers that have not come so far.
@@ -49,7 +53,9 @@ class Sequence:
     """
 
     def __init__(self, step: int | None = 1) -> None:
-        """Begin with nothing received; `step` is how much the number rises from one message to the next.
+        """Start with nothing received.
+
+        `step` is how much the number rises from one message to the next.
 
         None: as it likes, and nothing is ever missing.
         """
@@ -114,7 +120,10 @@ class Sequence:
 
 @dataclass(slots=True)
 class _Gap:
-    """Between two messages that came, by the counters of their datagrams: how many numbers and datagrams did not."""
+    """Gap between two messages that came, by the counters of their datagrams.
+
+    How many numbers and datagrams did not come.
+    """
 
     after: int
     before: int
@@ -128,7 +137,9 @@ class _Gap:
 
 
 class Losses:
-    """Parts messages lost on the way from those never sent, though datagrams of other kinds are lost beside them.
+    """Count of messages lost on the way, separate from those never sent.
+
+    Although datagrams of other kinds are lost beside them.
 
     A message that was lost left a hole in the counters of its session between the messages around it. So a lost tag
     or echo is no lost frame, unless a frame was never sent in the same gap. Holds the newest gaps of the session
@@ -140,12 +151,18 @@ class Losses:
         self._gaps: deque[_Gap] = deque(maxlen=REMEMBERED)
 
     def gap(self, after: int, before: int, numbers: int, datagrams: int) -> None:
-        """Between datagrams `after` and `before` so many numbers were missed, and so many datagrams did not come."""
+        """Record a gap between datagrams `after` and `before`.
+
+        `numbers` is how many numbers were missed, `datagrams` how many datagrams did not come.
+        """
         self._gaps.append(new := _Gap(after, before, numbers, datagrams))
         self.lost += new.lost
 
     def late(self, counter: int, numbers: int) -> None:
-        """A datagram came after later ones; it was `numbers` (1 or 0) of those that were missed."""
+        """Record a datagram that came after later ones.
+
+        It was `numbers` (1 or 0) of those that were missed.
+        """
         for gap in reversed(self._gaps):
             if gap.after < counter < gap.before:
                 was = gap.lost
@@ -194,7 +211,9 @@ class Counted:
         return True
 
     def take(self, session: int, seq: int, counter: int, missing: Callable[[int, int], int]) -> bool:
-        """Count message `seq` of the process `session`, which came in datagram `counter`; whether it is to be used.
+        """Count message `seq` of the process `session`, from datagram `counter`.
+
+        Returns whether the message is to be used.
 
         Args:
             session: Of the message.

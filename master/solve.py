@@ -1,4 +1,6 @@
-"""Solve offline: detections of every camera and a recording's calibration -> what a `Dispatcher` returns, scored.
+"""Offline solver.
+
+Detections of every camera and a recording's calibration -> what a `Dispatcher` returns, scored.
 
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.
@@ -98,7 +100,9 @@ def solve_hands(
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, object]:
-    """Solve all hands and objects of a recording and write what they did, and summary.json, into `out`.
+    """Solve all hands and objects of a recording.
+
+    Writes their results, and summary.json, into `out`.
 
     That is poses.npz of the first hand, poses-HAND.npz and summary-HAND.json of the others, object_NAME.npz,
     contact_HAND_NAME.npz and gestures.jsonl.
@@ -168,7 +172,10 @@ def solve(
 
 @dataclass(slots=True)
 class _Output:
-    """What came out: of each hand its poses, of each object its own; and how fast the cameras ran."""
+    """Results of an offline solve.
+
+    For each hand its poses, for each object its own; and how fast the cameras ran.
+    """
 
     poses: dict[str, list[HandPose]]
     objects: dict[str, list[ObjectPose]] = field(default_factory=dict[str, list[ObjectPose]])
@@ -212,7 +219,10 @@ def _summarise(
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
-    """Of a hand with markers; of a recording of both kinds also where cameras lose what a wrist device sees."""
+    """Score a hand with markers.
+
+    In a recording of both kinds also where cameras lose what a wrist device sees.
+    """
     found = np.isfinite(poses.markers_raw_m).all(axis=2).sum(axis=0)
     truth = load_truth(recording.folder, found == found.max())
     if truth is None:
@@ -226,7 +236,10 @@ def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> 
 def _score_wrist(
     recording: FrameRecording, setup: RigSetup, messages: Sequence[Detections], poses: Poses
 ) -> dict[str, float]:
-    """Of what a wrist device saw; of a hand without markers also the hand made of that."""
+    """Score the observations of a wrist device.
+
+    For a hand without markers also the hand solved from them.
+    """
     if setup.wrist is None:
         return {}
     exact = load_wrist_truth(recording, setup.wrist_cameras[0])
@@ -249,7 +262,10 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
 def _messages(
     recording: FrameRecording, setups: Sequence[RigSetup], folder: Path
 ) -> list[Detections | TagDetections]:
-    """All cameras' detections in the order of their capture times; ties in the order of the cameras, tags last."""
+    """Return all cameras' detections in the order of their capture times.
+
+    Ties are in the order of the cameras, tags last.
+    """
     shown = {name: len(rig.markers) for rig in recording.manifest.all_rigs for name in rig.cameras}
     messages: list[Detections | TagDetections] = []
     order: dict[str, int] = {}
@@ -269,7 +285,10 @@ def _messages(
 
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:
-    """Frames, or triples, that a camera skipped: lost before they were recorded, or none was made of them."""
+    """Count the frames, or strobe cycles, that a camera skipped.
+
+    Lost before they were recorded, or none was made of them.
+    """
     numbers = {
         name: FrameSequence(CYCLE_FRAMES if name in setup.wrist_cameras else 1) for name in setup.cameras
     }

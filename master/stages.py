@@ -1,4 +1,7 @@
-"""Where the time goes: mean duration of each named stage, measured from outside the pure code."""
+"""Mean duration of each named stage.
+
+Shows where the time goes; measured from outside the pure code.
+"""
 
 import time
 from collections.abc import Callable
@@ -8,7 +11,10 @@ class StageTimes:
     """Sums durations by stage name."""
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Measure with `now_ns`: time that passes, or `time.thread_time_ns`, what the processor spends."""
+        """Measure with the clock `now_ns`.
+
+        Time that passes, or `time.thread_time_ns`, the processor time spent.
+        """
         self._now_ns = now_ns
         self._stages: dict[str, StageTime] = {}
 

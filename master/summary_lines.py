@@ -34,7 +34,10 @@ _LABELS = {
 
 
 def summary_lines(summary: Mapping[str, object]) -> list[str]:
-    """One line for each figure that a run has, those of poses first, then objects and gestures."""
+    """Format one line for each metric that a run has.
+
+    Those of poses come first, then objects and gestures.
+    """
     lines = [
         f"{label:34s} {summary[key]:>9} {unit}".rstrip()
         for key, (label, unit) in _LABELS.items()

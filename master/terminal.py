@@ -1,4 +1,4 @@
-"""What commands of the master say on the terminal: lines, and how far they are."""
+"""Terminal output of the master's commands: text lines and progress."""
 
 import sys
 

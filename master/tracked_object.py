@@ -1,4 +1,6 @@
-"""One object, whatever tells where it is: what cameras see of it, and a tracker on it, become one row of poses.
+"""Fusion of all sensors of one object into one stream of poses.
+
+What cameras see of it and a tracker on it become one row of poses.
 
 Cameras measure it in the rig's own frame, a tracker through its registration. So while cameras track it their poses
 are told, and the tracker's where they do not; what cameras hold is not told while the tracker knows better. Time never
@@ -18,10 +20,15 @@ _NAME = 64  # characters of a name in `Health`
 
 
 class TrackedObject:
-    """Push machine. Holds the lines of cameras and tracker, and when each told something last."""
+    """Push machine that merges camera and tracker poses of one object.
+
+    Holds the lines of cameras and tracker, and when each last reported something.
+    """
 
     def __init__(self, setup: RigSetup, name: str, counts: Counter[str]) -> None:
-        """Build the lines of one of the setup's objects; what comes of it is counted into `counts`.
+        """Build the lines of one of the setup's objects.
+
+        Their results are counted into `counts`.
 
         Raises:
             CalibrationError: A bead is none of the rig's markers.
@@ -41,7 +48,10 @@ class TrackedObject:
         return self.tracker is not None and self._device is None
 
     def push(self, message: MarkerDetections | TagDetections) -> list[SolvedObject]:
-        """Take what one camera found; return the poses that are told of it, oldest first."""
+        """Take the detections of one camera and return the resulting poses.
+
+        They come oldest first.
+        """
         if self._line is None:
             return []
         if isinstance(message, MarkerDetections):
@@ -51,7 +61,10 @@ class TrackedObject:
         return self._of_cameras(self._line.push(message))
 
     def push_tracker(self, message: TrackerPose) -> list[SolvedObject]:
-        """Take a pose of its tracker; return the poses that are told of it, oldest first."""
+        """Take a pose of the object's tracker and return the resulting poses.
+
+        They come oldest first.
+        """
         if self._device is None:
             self._counts[f"tracker.{message.source}.unplaced"[:_NAME]] += 1
             return []

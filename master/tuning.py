@@ -1,5 +1,6 @@
-"""Other geometry, depth model, filter, hand, object or gestures while the master tracks: a new pipeline takes the old
-one's place.
+"""Live changes of the setup while the master tracks.
+
+Other geometry, depth model, filter, hand, object or gestures: a new pipeline replaces the old one.
 
 Each hand has a pipeline; only those change whose files did; objects and gestures change together (`master.dispatcher`).
 
@@ -35,7 +36,10 @@ _ROUNDS = 20
 
 
 class FilterTrial(Part, frozen=True):
-    """The body of the command "filter": which rig, and its filter as the rig file would have it."""
+    """Body of the command "filter".
+
+    It names the rig, and gives its filter as the rig file would have it.
+    """
 
     rig: Name
     filter: FilterCalibration
@@ -54,7 +58,10 @@ class _WhenOpen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _OrientationSample:
-    """What an IMU said of its orientation: the arguments of `Pipeline.push_orientation`."""
+    """One orientation measurement of an IMU.
+
+    Its fields are the arguments of `Pipeline.push_orientation`.
+    """
 
     t_ns: int
     orientation_wxyz: Float
@@ -70,8 +77,10 @@ class LivePipeline:
     def __init__(
         self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
     ) -> None:
-        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `dropped_epochs` is
-        asked for each of its epochs whether it is rejected.
+        """Begin with the pipeline of `setup`.
+
+        `stage` measures the stages of whichever pipeline is in use; `dropped_epochs` is asked for each of its epochs
+        whether it is rejected.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.
@@ -104,7 +113,7 @@ class LivePipeline:
         return solved
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the hand's IMU says of its orientation (4,)."""
+        """Take an orientation (4,) measured by the hand's IMU."""
         self._number += 1
         self._recent.append((self._number, _OrientationSample(t_ns, orientation_wxyz, heading_sigma_rad)))
         self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
@@ -123,7 +132,9 @@ class LivePipeline:
         take()
 
     def change(self, setup: RigSetup) -> None:
-        """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.
+        """Replace the running pipeline by one of `setup`.
+
+        May be called from any thread but the loop's; takes as long as it takes to build a pipeline.
 
         Raises:
             CalibrationError: The depth model does not fit the rig; nothing has changed.
@@ -131,7 +142,9 @@ class LivePipeline:
         self.prepare(setup)()
 
     def prepare(self, setup: RigSetup) -> Callable[[], None]:
-        """Build a pipeline of `setup`; what is returned shows it the last messages and lets it take over.
+        """Build a pipeline of `setup` and return the function that switches to it.
+
+        The returned function shows it the last messages and lets it take over.
 
         Raises:
             CalibrationError: As `change`.
@@ -166,7 +179,10 @@ class LivePipeline:
         return shown
 
     def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
-        """Show the new pipeline what it has not seen yet, and take its poses that are later than the last one."""
+        """Switch to the new pipeline and return its new poses.
+
+        It is shown the samples that it has not seen yet; only its poses that are later than the last one are taken.
+        """
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)
@@ -178,7 +194,9 @@ class LivePipeline:
 
 
 class RigTuning:
-    """Follows the files of all rigs. Holds the setups in use, and how often a change was applied and refused.
+    """Follower of the files of all rigs.
+
+    Holds the setups in use, and how often a change was applied and refused.
 
     Its methods are called on several threads and take turns.
     """
@@ -191,7 +209,9 @@ class RigTuning:
         notify: Callable[[str], None],
         dispatcher: Dispatcher | None = None,
     ) -> None:
-        """Follow `files`, which say `setups`, and change `pipelines`; `notify` is told one line for each change.
+        """Follow the calibration files and change the pipelines with them.
+
+        `files` hold the `setups`, `pipelines` are changed; `notify` gets one line for each change.
 
         Objects and gestures are those of `dispatcher`; None: nobody asks for any.
         """
@@ -211,7 +231,10 @@ class RigTuning:
         return {"reload.applied": self._applied, "reload.refused": self._refused}
 
     def look(self) -> None:
-        """Use the files if they were changed; where that fails, say so once and go on as before."""
+        """Apply the files if they were changed.
+
+        Where that fails, this is reported once and the old setups stay in use.
+        """
         with self._lock:
             changed = self._monitored.changed(self._files.paths(self._setups))
         if not changed:
@@ -233,7 +256,9 @@ class RigTuning:
             self._notify("changed files are in use")
 
     def try_filter(self, body: str) -> None:
-        """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).
+        """Use another 1 € filter for one rig.
+
+        It stays until the rig's files change or `reload` (body: `FilterTrial`).
 
         What has changed in the files until now is used first: the next look does not take the trial back for that.
 
@@ -279,7 +304,9 @@ class RigTuning:
 def renew(
     setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
 ) -> None:
-    """Let new solvers take over from all that `sender` feeds: the state of the old ones may be broken.
+    """Replace all solvers that `sender` feeds by new ones.
+
+    The state of the old ones may be broken.
 
     Args:
         setups: Of each hand, as they are in use.
@@ -312,7 +339,10 @@ def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetu
 
 
 def _messages_per_frame(setup: RigSetup) -> int:
-    """How many messages of all cameras and of the IMU come with each frame of the slowest camera, about."""
+    """Estimate the messages per frame of the slowest camera.
+
+    The approximate number of messages of all cameras and of the IMU that come with each such frame.
+    """
     slowest_hz = min(camera.frame_rate_hz for camera in setup.cameras.values())
     imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
     samples = max((imu.rate_hz for imu in imus), default=0.0) / slowest_hz
@@ -320,7 +350,7 @@ def _messages_per_frame(setup: RigSetup) -> int:
 
 
 def _show(pipeline: Pipeline, sample: Detections | _OrientationSample) -> list[SolvedPose]:
-    """Tell it what came; the poses that completes."""
+    """Push one sample into a pipeline and return the poses that it completes."""
     if isinstance(sample, _OrientationSample):
         pipeline.push_orientation(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
         return []

@@ -16,7 +16,7 @@ _LOG = f"journalctl --user -u {UNIT} -n 20"
 
 
 def systemctl(words: Sequence[str]) -> str:
-    """Ask the service manager of this user; what it says.
+    """Run a command of this user's service manager and return its output.
 
     Raises:
         PhalanxError: There is none, it failed, or takes too long.
@@ -82,7 +82,7 @@ class UserServices:
         return f"{UNIT} runs; `systemctl --user status {UNIT}` shows how it is, `{_LOG}` what it said"
 
     def remove(self, dry_run: bool) -> str:
-        """Stop the service and remove its unit; a line that says what was done.
+        """Stop the service, remove its unit and return one line that reports it.
 
         Raises:
             PhalanxError: It does not stop.

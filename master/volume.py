@@ -1,4 +1,6 @@
-"""The volume that a rig states: the box, in the rig frame, in which its accuracy was tested.
+"""Test volume of a rig.
+
+The box, stated by the rig and in the rig frame, in which its accuracy was tested.
 
 Outside it a hand is tracked as well as the cameras see it, but how well is not known. So a joint says whether it lies
 inside; that it does not, alone makes no pose invalid.
@@ -13,7 +15,9 @@ _EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not 
 
 
 def inside(volume: Volume | None, points_m: Float) -> Bool:
-    """Which of the points (..., 3) [m], rig frame, lie in the volume, (...); its faces belong to it.
+    """Return which of the points lie in the volume.
+
+    Points (..., 3) [m] in the rig frame; the result is (...). The faces belong to the volume.
 
     All do where the rig states none. A point that is NaN lies nowhere.
     """

@@ -1,4 +1,6 @@
-"""`phalanx fleet status --wait`: are these cameras and IMUs heard here? An installer goes back if they are not.
+"""`phalanx fleet status --wait`: wait until cameras and IMUs are received.
+
+It reports whether these cameras and IMUs are received here; an installer rolls back if they are not.
 
 Where a master runs, it is asked what it takes. Where none does, this command gives the start and counts the
 datagrams that come. When it ends, slaves wait for their master again.
@@ -36,7 +38,10 @@ Received = dict[str, float]
 
 
 def wait_for_senders(options: Namespace) -> int:
-    """Wait until datagrams of all these senders come; the exit code, 1 if one of them is not heard."""
+    """Wait until datagrams of all these senders arrive.
+
+    Returns the exit code, 1 if one of them is not received.
+    """
     stop = stop_on_signals()
     names: list[str] = options.wait
     seconds = options.seconds or _MOST_S
@@ -58,7 +63,9 @@ def wait_for_senders(options: Namespace) -> int:
 
 
 def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
-    """What the master that runs takes of them: name -> datagrams a second, of those whose count rises.
+    """Return the rates at which the running master receives these senders.
+
+    A map name -> datagrams a second, of those whose count rises.
 
     Raises:
         PhalanxError: It does not know one of them.
@@ -96,7 +103,9 @@ def here(
     seconds: float,
     stop: threading.Event,
 ) -> Received:
-    """Give the start, and count what comes: name -> datagrams a second, of those that are heard.
+    """Start the senders and count their datagrams on this machine.
+
+    Returns name -> datagrams a second, of those that are received.
 
     Raises:
         PhalanxError: A name is none of the rig's.

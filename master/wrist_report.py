@@ -1,4 +1,7 @@
-"""A simulated run of a wrist device against its scene: exact truth at the poses, and what its camera saw."""
+"""Comparison of a simulated run of a wrist device with its scene.
+
+It has the exact truth at the poses, and what its camera saw.
+"""
 
 from collections.abc import Callable, Iterator
 
@@ -20,7 +23,10 @@ Progress = Callable[[str, int, int], None]
 
 
 def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, progress: Progress) -> WristTruth:
-    """The scene at the instants (N,) [ns] of poses; `epoch_ns` is scene time 0 on their clock."""
+    """Return the exact scene at the times (N,) [ns] of poses.
+
+    `epoch_ns` is scene time 0 on their clock.
+    """
     now: list[WristEpoch] = []
     for row, at_ns in enumerate(t_ns.tolist()):
         now.append(scene.truth((at_ns - epoch_ns) * 1e-9))
@@ -38,7 +44,9 @@ def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, progress: Progre
 
 
 def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress) -> dict[str, float]:
-    """Errors of the laser points, as `score_wrist` has them, of poses that also other sensors tell of.
+    """Compute errors of the laser points where other sensors also give poses.
+
+    The errors are as `score_wrist` has them.
 
     Such a pose carries the points of the last triple. Each triple counts once, at the first pose after it.
     """
@@ -52,7 +60,10 @@ def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progr
 
 
 def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, float]:
-    """How far the forearm's vertical is off, rms [deg]: `forearm_tilt_deg`; nothing where no pose tells how it lies."""
+    """Compute the rms error [deg] of the forearm's vertical: `forearm_tilt_deg`.
+
+    The result is empty where no pose reports the forearm's orientation.
+    """
     imu = scene.rig.imu
     rows = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
     if imu is None or imu.q_rig_world is None or not len(rows):
@@ -68,7 +79,10 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
 
 
 def lit_view(renderer: WristRenderer, t_s: float) -> Image:
-    """What laser and LEDs together light at scene time `t_s` [s], (H, W) grey: without the light of the room."""
+    """Render what laser and LEDs together light at scene time `t_s` [s].
+
+    The image is (H, W) grey and without the light of the room.
+    """
     ambient = renderer.render(t_s, Illumination.AMBIENT)
     laser, led = (renderer.render(t_s, lit) for lit in (Illumination.LASER, Illumination.LED))
     return np.asarray(cv2.add(cv2.subtract(laser, ambient), cv2.subtract(led, ambient)), np.uint8)

@@ -1,4 +1,6 @@
-"""Errors of a wrist device against exact truth: its laser points, its fingertips, and the hand they make.
+"""Errors of a wrist device against exact truth.
+
+They cover its laser points, its fingertips, and the hand solved from them.
 
 Every strobed triple of the truth counts once, also one of which nothing was made: what is not found is missed there.
 """
@@ -37,7 +39,9 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristTruth:
-    """Exact values at N triples, in the frame of the wrist camera. NaN: there is none.
+    """Exact values at N strobe cycles, in the frame of the wrist camera.
+
+    NaN: there is none.
 
     Attributes:
         t_ns: (N,) middle of the exposure of the laser frames.
@@ -155,14 +159,16 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
 
 
 def cycles_missed(poses: Poses, truth: WristTruth) -> int:
-    """Triples of a recording without a pose."""
+    """Count the strobe cycles of a recording without a pose."""
     return int((rows_at(truth.t_ns, poses.t_ns) < 0).sum())
 
 
 def score_cycles(
     setup: WristSetup, messages: Sequence[WristDetections], truth: WristTruth
 ) -> dict[str, float]:
-    """Errors of the laser points of triples, whatever hand is made of them.
+    """Compute errors of the laser points of strobe cycles.
+
+    They do not depend on the hand that is solved from them.
 
     Returns:
         triples: How many there are; cycles_missed: how many of the truth's are missing. Of the laser points as
@@ -198,7 +204,10 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
 
 
 def score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
-    """What became of the laser points (N, 5, 3) of all triples, as in `score_wrist`."""
+    """Score the laser points (N, 5, 3) of all strobe cycles.
+
+    The scores are as in `score_wrist`.
+    """
     to_groups = 1e3 * np.linalg.norm(found[:, :, None] - truth.laser_m[:, None], axis=3)
     own = np.stack([to_groups[:, f, 1 + f] for f in range(FINGER_COUNT)], axis=1)
     reported = np.isfinite(found).all(axis=2)
@@ -215,7 +224,10 @@ def score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
 
 
 def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
-    """What became of the fingers whose laser line and tip are both in sight; `row` (N,) of the poses."""
+    """Score the fingers whose laser line and tip are both in sight.
+
+    `row` (N,) are the rows of the poses.
+    """
     both = clear_line(truth) & truth.tip_visible
     error = np.abs(np.degrees(at_rows(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
     by_ik = at_rows((poses.solver_mode == SolverMode.IK).astype(np.float64), row) == 1.0
@@ -233,7 +245,10 @@ def clear_line(truth: WristTruth) -> Bool:
 
 
 def rows_at(truth_ns: Int, t_ns: Int) -> Int:
-    """For each triple of the truth the row of `t_ns` (T,), in rising order, that is of its time; -1: there is none."""
+    """Return for each true strobe cycle the row of the same time in `t_ns`.
+
+    `t_ns` (T,) is in rising order; -1: there is none.
+    """
     if not len(t_ns):
         return np.full(len(truth_ns), -1)
     after = np.clip(np.searchsorted(t_ns, truth_ns), 0, len(t_ns) - 1)
@@ -250,7 +265,10 @@ def at_rows(values: Float, row: Int) -> Float:
 
 
 def _any_of(joints: Bool) -> Bool:
-    """(N, 4) whether any joint of index ... little beyond the metacarpal is among these (N, 26)."""
+    """Return (N, 4) whether any finger joint is among the joints (N, 26).
+
+    The fingers are index ... little, and only joints beyond the metacarpal count.
+    """
     return np.stack([joints[:, list(finger[1:])].any(axis=1) for finger in FINGER_JOINTS[1:]], axis=1)
 
 

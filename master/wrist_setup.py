@@ -1,4 +1,7 @@
-"""What the master knows of one wrist device before the first message: device and hand, its laser, how to read it."""
+"""What the master knows of one wrist device before the first message.
+
+Device and hand, its laser, and how to read it.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -71,7 +74,10 @@ class WristSetup(WristDevice):
         )
 
     def flexed(self, wrist_angles_rad: Float) -> "WristSetup":
-        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_joint`)."""
+        """Return the setup with the palm of a flexed wrist.
+
+        The wrist is flexed by (2,) [rad] (`common.wrist_joint`); all else is the same.
+        """
         T = self.T_camera_palm.copy()
         T[:3, :3] = T[:3, :3] @ forearm_palm(wrist_angles_rad)
         return replace(self, T_camera_palm=T)

@@ -1,4 +1,7 @@
-"""Makes a marker's colour of a click on the picture of a running slave: finds frame, light and the other colours."""
+"""Marker colour from a click on the picture of a running slave.
+
+It finds the frame, the light and the other colours.
+"""
 
 from collections.abc import Callable, Mapping
 
@@ -32,7 +35,9 @@ class ColourSampler:
     def pick(
         self, wish: ColourPick, camera: CameraCalibration
     ) -> tuple[CameraCalibration, Mapping[str, float]]:
-        """The camera file with the colour that the click shows; how many pixels it has, and what its range holds.
+        """Return the camera file with the colour at the clicked position.
+
+        Also returns how many pixels it has, and what its range holds.
 
         Raises:
             CameraError: No frame was read yet.

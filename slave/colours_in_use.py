@@ -1,4 +1,7 @@
-"""What `Health` says of the camera file in use: size, a number for the colours of each marker, ranges that overlap."""
+"""What `Health` reports of the camera file in use.
+
+Size, a number for the colours of each marker, and ranges that overlap.
+"""
 
 from itertools import combinations
 from zlib import crc32
@@ -12,7 +15,9 @@ _HUES = 180
 
 
 def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, float]:
-    """Gauges: width_px, height_px; colour.<marker>, another number for another range; overlap.<one>..<other> [hues].
+    """Return metrics of the camera file in use.
+
+    width_px, height_px; colour.<marker>, another number for another range; overlap.<one>..<other> [hues].
 
     Args:
         camera: The content in use.
@@ -28,7 +33,10 @@ def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, flo
 
 
 def overlap(one: HsvRange, other: HsvRange) -> int:
-    """How many hues two ranges share; 0 where their saturations or values have none in common."""
+    """Return how many hues two colour ranges share.
+
+    0 where their saturations or values have none in common.
+    """
     for axis in (1, 2):
         if one.hsv_low[axis] > other.hsv_high[axis] or other.hsv_low[axis] > one.hsv_high[axis]:
             return 0

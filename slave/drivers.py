@@ -1,4 +1,7 @@
-"""Names of the drivers behind `--camera`, `--imu`, `--tracker` and `--lights`, as the help and the errors list them."""
+"""Names of the drivers as the help and the errors list them.
+
+They are those behind `--camera`, `--imu`, `--tracker` and `--lights`.
+"""
 
 REAL_CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 CAMERAS = f"{REAL_CAMERAS} | synthetic | replay:FOLDER"

@@ -1,4 +1,7 @@
-"""What does the inner loops: OpenCV and numpy, or machine code that does the same. Chosen by name alone."""
+"""Engines of the inner loops.
+
+OpenCV and numpy, or machine code that does the same. The engine is chosen by name alone.
+"""
 
 from collections.abc import Callable
 from typing import TypeVar

@@ -55,7 +55,7 @@ class Failures:
         return why
 
     def ask(self, query: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
-        """Ask a driver for what it tells of itself.
+        """Query a driver for its state.
 
         Nothing where it raises, so that the reports go on.
         """

@@ -1,4 +1,6 @@
-"""Join recordings of single cameras, and of the IMU, made side by side, into one recording of all of them.
+"""Joining of single recordings into one.
+
+Recordings of single cameras, and of the IMU, made side by side, become one recording of all of them.
 
 Every camera is recorded by a process of its own, into a folder of its own. Cameras of one rig become a recording of
 that rig; those of several rigs, such as marker cameras and the wrist device of one hand, one of all rigs. Their times
@@ -82,7 +84,10 @@ def join_recordings(
 
 
 def _manifest(parts: Sequence[FrameRecording]) -> tuple[Manifest, dict[str, FrameRecording]]:
-    """What the joined recording says of itself, and which part has the frames of each camera."""
+    """Build the manifest of the joined recording.
+
+    Also returns which part has the frames of each camera.
+    """
     owners = _owners(parts)
     cameras = {name: file for part in reversed(parts) for name, file in part.manifest.cameras.items()}
     names = dict.fromkeys(name for part in parts for name in part.manifest.cameras)
@@ -110,7 +115,10 @@ def _rigs(part: FrameRecording) -> dict[str, RigCalibration]:
 
 
 def _imu(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> tuple[ImuSample, ...]:
-    """The samples of the one part that has an IMU, on the clock of the first; none where no part has."""
+    """Return the samples of the one part that has an IMU.
+
+    They are on the clock of the first part; none where no part has an IMU.
+    """
     both = zip(parts, shifts_ns, strict=True)
     having = [(part.folder, shift_ns) for part, shift_ns in both if (part.folder / IMU).exists()]
     if len(having) > 1:

@@ -1,4 +1,7 @@
-"""Say what the light does to the colours: counts, gauges, and a log line before it costs a marker."""
+"""Report of how the light affects the colours.
+
+Counts, metrics, and a log line before it costs a marker.
+"""
 
 import logging
 from collections.abc import Callable
@@ -52,13 +55,18 @@ class LightReport:
                 _LOG.warning("%s: %s", self._name, warning.text)
 
     def counts(self) -> dict[str, int]:
-        """Those of the others, and: warnings.light, warnings.<marker>, refused.light, colour_tables."""
+        """Return the counts of the other reports and of the light.
+
+        The light's are warnings.light, warnings.<marker>, refused.light, colour_tables.
+        """
         warned = {f"warnings.{subject}": count for subject, count in self._warned.items()}
         own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
         return {**self._others.counts(), **warned, **own}
 
     def metrics(self) -> dict[str, float]:
-        """Those of the others, and, while the light is followed, what it is against calibration.
+        """Return the metrics of the other reports and of the light.
+
+        While the light is followed, its metrics compare it with calibration.
 
         That is red and blue relative to green, and green. Of markers that look alike
         twins.<one>..<other>, the hues between them.

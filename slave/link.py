@@ -1,4 +1,6 @@
-"""The slave's side of the datagram link: from the first beacon to data, as a push machine.
+"""The slave's side of the datagram link.
+
+It runs from the first beacon to data, as a push machine.
 
 `common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
 - While the master of the session is heard, beacons of any other life are ignored: an old one
@@ -100,7 +102,9 @@ class _Session:
 
 
 class SlaveLink:
-    """Takes beacons and datagrams, seals what is to be sent, and says what to send by itself.
+    """Push machine that takes beacons and datagrams and seals outgoing ones.
+
+    It also states what to send by itself.
 
     Holds the session, the offer under way, and the counters.
     """
@@ -126,7 +130,10 @@ class SlaveLink:
 
     @property
     def wrong(self) -> str | None:
-        """Why no master takes this slave, where that is known: a twin, another wire version, another secret."""
+        """Return why no master accepts this slave, where that is known.
+
+        A duplicate sender, another wire version, another secret.
+        """
         if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < LATELY_NS:
             return None
         return self._wrong[1]
@@ -139,7 +146,7 @@ class SlaveLink:
 
     @property
     def started(self) -> bool:
-        """Whether the master has said start and is still there."""
+        """Return whether the master has sent start and is still there."""
         session = self._session
         if session is None or session.start_t_ns is None:
             return False
@@ -147,7 +154,10 @@ class SlaveLink:
 
     @property
     def start_t_ns(self) -> int | None:
-        """When to begin [ns], on this slave's clock; None before the start of this session."""
+        """Return when to begin [ns], on this slave's clock.
+
+        None before the start of this session.
+        """
         return None if self._session is None else self._session.start_t_ns
 
     @property
@@ -256,7 +266,7 @@ class SlaveLink:
         self._send_hello(self._offer, t_ns)
 
     def _has_duplicate(self, beacon: Beacon, t_ns: int) -> Refusal | None:
-        """Whether the master says no more than that it has somebody of this name already."""
+        """Return a refusal if the master only reports a sender of the same name."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
         if (
@@ -269,7 +279,11 @@ class SlaveLink:
         return Refusal.DUPLICATE_SENDER
 
     def _answer_other_version(self, datagram: bytes, address: Address, t_ns: int) -> None:
-        """Say who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
+        """Send this slave's identity to a master of another wire version.
+
+        The master is of this rig and cannot understand this slave; its word is not proven, so the answer is sent
+        seldom.
+        """
         if len(datagram) < OVERHEAD:
             return
         _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)
@@ -328,7 +342,10 @@ class SlaveLink:
         return Event.WELCOME, keys
 
     def _on_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""
+        """Take the master's unproven reason why there is no welcome.
+
+        It changes nothing here: whoever has the rig key can send it.
+        """
         unproven = self._keys.open_as(header, datagram, Unproven)
         if isinstance(unproven, Refusal):
             return unproven

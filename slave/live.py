@@ -52,7 +52,7 @@ def send_detections(
     engine: Engine | WristEngine,
     raw_frames: RawSettings | None = None,
 ) -> None:
-    """Detect in the frames of a camera and send, until told to stop.
+    """Detect in the frames of a camera and send until stopped.
 
     Args:
         sender: The process; its name is that of the camera.
@@ -200,7 +200,7 @@ def _both(first: Prepare, second: Prepare) -> Prepare:
 
 
 def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
-    """What `Health` says of markers without a colour."""
+    """Return what `Health` reports of markers without a colour."""
     return {"uncalibrated": int(bool(missing))} | {f"uncalibrated.{name}": 1 for name in missing}
 
 

@@ -1,4 +1,7 @@
-"""Detect a whole recording offline: deterministic, without clock or network, into one file per camera."""
+"""Offline detection of a whole recording, into one file per camera.
+
+Deterministic, without clock or network.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -51,7 +54,9 @@ class RecordedDetections:
 
 
 def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
-    """The camera of a recording: geometry and timing from the recording, colours from `calibration` if given.
+    """Return the camera of a recording.
+
+    Geometry and timing are from the recording, colours from `calibration` if given.
 
     Raises:
         RecordingError: The recording has no such camera.
@@ -91,7 +96,9 @@ def detect_recording(
     *,
     windows_only: bool = False,
 ) -> RecordedDetections:
-    """Detect the markers in every frame of one camera, with colours that follow the light where it has references.
+    """Detect the markers in every frame of one camera.
+
+    The colours follow the light where the camera has references.
 
     Args:
         folder: Recording.
@@ -145,7 +152,9 @@ def calibrate_colours(
     hand: Path | None = None,
     notify: Callable[[str], None] = lambda _text: None,
 ) -> list[ColourRow]:
-    """Make the colour ranges of one camera from a recording and write its camera file.
+    """Make the colour ranges of one camera from a recording.
+
+    Writes its camera file.
 
     With clicks, from the clicked paints of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
     from what moves with the hand in all frames.
@@ -211,7 +220,9 @@ def calibrate_colours(
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder a result goes to; a new calibration tree begins with its first file.
+    """Make the folder a result goes to.
+
+    A new calibration tree begins with its first file.
 
     Raises:
         RecordingError: It cannot be made.
@@ -242,7 +253,9 @@ def tag_collector(folder: Path, camera: str, calibration: Path | None) -> "TagCo
 
 
 def save_detections(path: Path, found: "RecordedDetections | RecordedWristDetections | RecordedTags") -> None:
-    """Write detections_<camera>.npz, or tags_<camera>.npz; equal content gives equal bytes.
+    """Write detections_<camera>.npz, or tags_<camera>.npz.
+
+    Equal content gives equal bytes.
 
     Raises:
         RecordingError: The file cannot be written.

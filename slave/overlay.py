@@ -1,4 +1,6 @@
-"""Draw on a preview what the slave makes of it: pixels in the range of a marker tinted, what was found crossed.
+"""Overlay of the detections on a preview image.
+
+Pixels in the range of a marker are tinted, detections are marked by crosses.
 
 It is drawn on the thread of the previews, while somebody asks for it; the loop does nothing for it but keep what it
 found in its last frames.
@@ -24,7 +26,10 @@ LASER, TIP = (60, 60, 255), (80, 255, 80)
 
 
 class MarkerOverlay:
-    """Overlay of a camera that looks for markers, by the detector in use. Holds nothing of its own."""
+    """Overlay of a camera that looks for markers, by the detector in use.
+
+    Has no state of its own.
+    """
 
     def __init__(self, detector: ReloadableDetector, markers: tuple[str, ...]) -> None:
         """Draw what `detector` finds of the rig's `markers`."""
@@ -36,7 +41,9 @@ class MarkerOverlay:
         return self._markers
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """A new picture (h, w, 3): tinted by the colour table in use, which follows the light; centroids crossed.
+        """Return a new image (h, w, 3) with tinted markers and crosses at centroids.
+
+        Tinted by the colour table in use, which follows the light.
 
         Args:
             small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
@@ -69,7 +76,10 @@ class WristOverlay:
         return ()
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """A new picture with the laser points crossed red and the fingertips green; as of `MarkerOverlay`."""
+        """Return a new image with crosses at laser points (red) and tips (green).
+
+        As of `MarkerOverlay`.
+        """
         del mask
         drawn = (
             np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8) if small.ndim == 2 else small.copy()
@@ -81,7 +91,10 @@ class WristOverlay:
 
 
 def contrast_of(colour: HsvRange) -> tuple[int, int, int]:
-    """What a paint's pixels are tinted with, BGR: the hue across the circle from the middle of its range."""
+    """Return the tint (BGR) for the pixels of a marker colour.
+
+    It is the hue across the circle from the middle of its range.
+    """
     low, high = colour.hsv_low[0], colour.hsv_high[0]
     middle = low + (high - low) % HUES // 2
     pixel = np.array([[[(middle + HUES // 2) % HUES, 255, 255]]], np.uint8)
@@ -90,7 +103,10 @@ def contrast_of(colour: HsvRange) -> tuple[int, int, int]:
 
 
 def _tint(drawn: Image, inside: Mapping[str, np.ndarray], ranges: Mapping[str, HsvRange]) -> None:
-    """Tint the pixels (h, w) of each marker, in place; those of several white; a dark rim sets each area off."""
+    """Tint the pixels (h, w) of each marker, in place.
+
+    Those of several markers are white; a dark rim sets each area off.
+    """
     count = np.zeros(drawn.shape[:2], np.uint8)
     for name, where in inside.items():
         tint = np.array(contrast_of(ranges[name]), np.float64)
@@ -102,7 +118,10 @@ def _tint(drawn: Image, inside: Mapping[str, np.ndarray], ranges: Mapping[str, H
 
 
 def _cross(drawn: Image, uv: Float, whole: Image, colour: tuple[int, int, int]) -> None:
-    """Upright crosses at uv (K, 2) [px of the whole image], in place; NaN: none. Dark below, so that they show."""
+    """Draw upright crosses at uv (K, 2) [px of the whole image], in place.
+
+    NaN: none. Dark below, so that they show.
+    """
     scale = np.array([drawn.shape[1] / whole.shape[1], drawn.shape[0] / whole.shape[0]])
     near, far = ARM_PX
     for u, v in np.rint((uv[np.isfinite(uv).all(axis=1)] + 0.5) * scale - 0.5).astype(int).tolist():

@@ -1,4 +1,6 @@
-"""The camera's picture for whoever looks: small JPEGs, at most 10 Hz, and nothing at all when nobody asked lately.
+"""Preview images of the camera as small JPEGs.
+
+At most 10 Hz, and nothing at all when there was no recent request.
 
 The loop only offers its frames: one comparison when nobody looks, otherwise a reference is left behind ten times
 a second. A thread of its own shrinks, encodes and publishes; while it is busy the newest frame replaces the
@@ -35,7 +37,9 @@ _LOG = logging.getLogger(__name__)
 
 
 class Gate:
-    """Which frames are shown: at least 100 ms apart, until 3 s after the last request.
+    """Gate that decides which frames are shown.
+
+    At least 100 ms apart, until 3 s after the last request.
 
     Holds the end of the looking and the earliest time of the next frame.
     """
@@ -60,7 +64,9 @@ class Gate:
 
 
 class Previews:
-    """Publishes one camera on stream "preview" while somebody looks, and on "still" when one is asked for.
+    """Publisher of the previews of one camera.
+
+    On stream "preview" while somebody looks, and on "still" when one is asked for.
 
     Holds the gate, what is wished to be drawn, the newest frames that wait, those shown last, the bus while there is
     one, and how many pictures went out.
@@ -95,7 +101,9 @@ class Previews:
         self._thread.start()
 
     def ask(self, body: str = "") -> None:
-        """Somebody looks: show the camera for the next 3 s, with what the body, a `PreviewWish`, asks for. Never waits.
+        """Show the camera for the next 3 s because somebody looks.
+
+        With what the body, a `PreviewWish`, asks for. Never waits.
 
         Raises:
             CalibrationError: The body is none, or names a marker that is not sought.
@@ -113,7 +121,10 @@ class Previews:
         self._gate.ask(now_ns)
 
     def shown(self, t_ns: int) -> Frame | None:
-        """The frame of that time [ns], if it was shown within the last second. From any thread."""
+        """Return the frame of that time [ns] if it was shown within the last second.
+
+        From any thread.
+        """
         return next((frame for frame in tuple(self._shown) if frame.t_ns == t_ns), None)
 
     def ask_still(self) -> None:
@@ -131,7 +142,10 @@ class Previews:
             self._wake.set()
 
     def use(self, bus: Bus | None) -> None:
-        """Publish on `bus` from now on, or on none; waits until the present picture is out."""
+        """Publish on `bus` from now on, or on none.
+
+        Waits until the present image is out.
+        """
         with self._lock:
             self._bus = bus
 
@@ -189,7 +203,9 @@ class Previews:
 
 
 def whole_jpeg(image: Image) -> bytes | None:
-    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey in its full size, as good as fits into a message.
+    """Return a JPEG file of `image` in its full size.
+
+    `image` is (H, W, 3) BGR or (H, W) grey; the quality is as good as fits into a message.
 
     None: not even the worst does, which are tens of megapixels, or noise.
     """
@@ -201,7 +217,10 @@ def whole_jpeg(image: Image) -> bytes | None:
 
 
 def small_jpeg(image: Image) -> bytes:
-    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey at half its width and height, smaller still if it must be."""
+    """Return a JPEG file of `image` at half its width and height.
+
+    `image` is (H, W, 3) BGR or (H, W) grey; it is smaller still if it must be.
+    """
     return _within(_half(image))
 
 

@@ -1,4 +1,7 @@
-"""What a recording is asked for and how far it is: its length, its counts, and the line that says so."""
+"""Length, counts and progress line of a recording.
+
+The length is what it was asked for; the line reports how far it is.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +12,9 @@ PLAIN_EVERY = 5  # calls, where no terminal shows the line in place
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """How much to record: until one of the two is reached, or, with neither, until stopped.
+    """Length of a recording.
+
+    Until one of the two is reached, or, with neither, until stopped.
 
     Attributes:
         seconds: Between the first and the last frame [s], by the times of the frames.
@@ -65,7 +70,9 @@ class Progress:
 
 
 class ProgressDisplay:
-    """Shows the progress to whoever looks: on a terminal in place at every call, elsewhere a line at every fifth.
+    """Display of the progress.
+
+    On a terminal in place at every call, elsewhere a line at every fifth.
 
     Holds how often it was called.
     """

@@ -1,4 +1,6 @@
-"""Raw frames to disk while the slave goes on detecting: begun and ended by commands on the bus.
+"""Recording of raw frames to disk while the slave goes on detecting.
+
+Begun and ended by commands on the bus.
 
     raw         begin a recording of raw frames (body: `common.raw_wish.RawWish`), or ask for it to go on
     raw_stop    end it; the answer comes when every frame that waited is written
@@ -88,25 +90,37 @@ class RawFrames:
         self._probe: RawProbe | None = None
 
     def reading(self, source: FrameSource) -> FrameSource:
-        """The camera for the loop, all of whose frames are offered; without a folder the camera itself."""
+        """Return the camera for the loop, all of whose frames are offered.
+
+        Without a folder, the camera itself.
+        """
         if self._settings is None:
             return source
         self._probe = RawProbe(source, self.offer)
         return self._probe
 
     def offer(self, frame: Frame) -> None:
-        """Take a frame while something is recorded; by the loop. Never waits, never raises."""
+        """Take a frame while something is recorded.
+
+        Called by the loop. Never waits, never raises.
+        """
         if self._recorder is None:
             return
         with self._lock:
             self._hand_over(frame, self._recorder)
 
     def commands(self) -> dict[str, Callable[[str], dict[str, float]]]:
-        """Verb -> what to do with its body; the gauges of the answer. Each may raise `PhalanxError`."""
+        """Return the handler of each command verb.
+
+        Each takes the body and returns the metrics of the answer. Each may raise `PhalanxError`.
+        """
         return {"raw": self._raw, "raw_stop": self._raw_stop}
 
     def counts(self) -> dict[str, int]:
-        """Of the present recording, or the last one, `raw.frames`, `raw.dropped`; how many `raw.ended` by a fault."""
+        """Return the counts `raw.frames`, `raw.dropped` and `raw.ended`.
+
+        The first two are of the present recording, or the last one; `raw.ended` is how many ended by a fault.
+        """
         if self._settings is None:
             return {}
         now = None if (last := self._last) is None else last.progress()
@@ -114,19 +128,28 @@ class RawFrames:
         return {"raw.frames": frames, "raw.dropped": dropped, "raw.ended": self._ended}
 
     def metrics(self) -> dict[str, float]:
-        """`raw.megabytes` of the same recording, and whether frames are taken now: `raw.on`."""
+        """Return the metrics `raw.megabytes` and `raw.on`.
+
+        `raw.megabytes` is of the same recording; `raw.on`: whether frames are taken now.
+        """
         if self._settings is None:
             return {}
         written = 0 if (last := self._last) is None else last.progress().written_bytes
         return {"raw.megabytes": round(written * 1e-6, 3), "raw.on": float(self._recorder is not None)}
 
     def look(self) -> None:
-        """Once a period: end what has failed, what nobody asks for any more, and what has no master any more."""
+        """End recordings that failed, are unwanted, or have lost their master.
+
+        Called once a period. Unwanted: nobody asks for it any more.
+        """
         with self._command_lock:
             self._look()
 
     def close(self) -> None:
-        """The slave ends: so does the recording, with the last frame that was read. Safe to call twice."""
+        """End the recording because the slave ends, with the last frame that was read.
+
+        Safe to call twice.
+        """
         if self._probe is not None:
             self._probe.flush()
         with self._command_lock:
@@ -232,7 +255,10 @@ class RawFrames:
             self._end("the master is gone")
 
     def _end(self, why: str) -> None:
-        """Take no more; what waits is written by a thread of its own, for this one has reports to send."""
+        """Stop taking frames and write what waits in a separate thread.
+
+        This thread has reports to send.
+        """
         with self._lock:
             recorder, self._recorder = self._recorder, None
         if recorder is None:
@@ -253,7 +279,9 @@ class RawFrames:
 
 
 class RawProbe:
-    """A camera all of whose frames are offered to somebody, each when the loop comes back for the next one.
+    """Camera that offers all of its frames to a recipient.
+
+    Each is offered when the loop comes back for the next one.
 
     Holds the frame that the loop is at.
     """
@@ -269,7 +297,10 @@ class RawProbe:
         return self._last
 
     def flush(self) -> None:
-        """Offer the frame that the loop is at; once the loop has ended, by whoever ended it."""
+        """Offer the frame that the loop is at.
+
+        Called once the loop has ended, by whoever ended it.
+        """
         last, self._last = self._last, None
         if last is not None:
             self._offer(last)

@@ -1,4 +1,6 @@
-"""Record the raw frames of one camera to disk; the camera never waits for the disk.
+"""Recorder of the raw frames of one camera to disk.
+
+The camera never waits for the disk.
 
     camera loop ── offer ──▶ bounded queue ──▶ encoders (PNG) ──▶ one writer: the file, then its row
                      │
@@ -45,7 +47,9 @@ class _Waiting(NamedTuple):
 
 
 class Recorder:
-    """Writes what it is offered. Holds the queue, its threads, and the counts, each written by one thread alone.
+    """Writer of the frames it is offered.
+
+    Holds the queue, its threads, and the counts, each written by one thread alone.
 
     Memory: the queue, and beyond it one PNG and what the camera holds.
     """
@@ -108,7 +112,9 @@ class Recorder:
         return self.failure is None and self._left_s() != 0.0
 
     def offer(self, frame: Frame) -> None:
-        """Take a frame, or count it as dropped; never waits. Whatever comes after the end is left out.
+        """Take a frame, or count it as dropped; never wait.
+
+        Whatever comes after the end is ignored.
 
         Raises:
             RecordingError: The image is not of the size the camera file says.
@@ -156,7 +162,10 @@ class Recorder:
         )
 
     def close(self) -> None:
-        """Write what waits and end the recording; one without any frame is taken away. Safe to call twice."""
+        """Write what waits and end the recording.
+
+        A recording without any frame is removed. Safe to call twice.
+        """
         if not self._closing.is_set():
             self._closing.set()
             self._waiting.put(None)
@@ -218,7 +227,9 @@ class Recorder:
 
 
 def feed(source: FrameSource, recorder: Recorder, stop: threading.Event) -> None:
-    """Offer every frame until the length is reached, the source ends, the recorder fails or `stop` is set.
+    """Offer every frame to the recorder until an end condition is met.
+
+    Until the length is reached, the source ends, the recorder fails or `stop` is set.
 
     Raises:
         CameraError: The camera is gone.
@@ -229,7 +240,9 @@ def feed(source: FrameSource, recorder: Recorder, stop: threading.Event) -> None
 
 
 def clock_of(clock: Clock, simulated: str = "") -> RecordedClock | None:
-    """Which clock the times of a recording are on, for whoever joins it with others; None: this system cannot say.
+    """Return the clock of the times of a recording.
+
+    It serves whoever joins the recording with others; None: this system cannot determine it.
 
     Args:
         clock: The slave's clock.

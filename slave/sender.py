@@ -44,7 +44,7 @@ DARK_AFTER = 9  # frames without a strobe cycle, 0.1 s at 90 Hz: then every fram
 
 
 def nothing(*_arguments: object) -> None:
-    """For whom nobody needs to be told."""
+    """Do nothing: placeholder callback where nobody needs to be notified."""
 
 
 class Pipeline(Generic[ItemT]):

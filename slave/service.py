@@ -1,4 +1,6 @@
-"""What a slave tells the system's service manager: ready, what it does now, and that its loop goes round.
+"""Notifications from a slave to the system's service manager.
+
+Ready, what it does now, and that its loop goes round.
 
 The watchdog is fed by the loop itself, never by a thread that would live on while the loop hangs. A wait that may be
 long and is no hang says so: for the master it comes round again and again; a lost camera asks for more patience
@@ -23,7 +25,10 @@ WAITING = "waits for the master"
 
 
 class ConnectionLost(Protocol):
-    """Notified that a device is lost, before it is given back and at each try to open it; `Service.connection_lost`."""
+    """Callback for the loss of a device; `Service.connection_lost`.
+
+    Called before the device is given back and at each try to open it.
+    """
 
     def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """`what` is lost; the next try may take so long [s]."""
@@ -31,7 +36,7 @@ class ConnectionLost(Protocol):
 
 
 def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
-    """An `ConnectionLost` that tells nobody."""
+    """Ignore the loss of a device: a `ConnectionLost` that notifies nobody."""
 
 
 class Service:
@@ -65,7 +70,10 @@ class Service:
         self._due_ns = NEVER_NS
 
     def starting(self, patience_s: float, what: str = "compiles") -> None:
-        """To become ready may take so long from now [s]: the manager waits, and so does an installer, by the status."""
+        """Announce that becoming ready may take so long from now [s].
+
+        The manager waits, and so does an installer, by the status.
+        """
         status = f"{one_line(what)}: may take {patience_s:.0f} s"
         self._send(f"STATUS={status}\nEXTEND_TIMEOUT_USEC={round(patience_s * 1e6)}")
 
@@ -101,7 +109,10 @@ class Service:
         self._notify(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
 
     def connection_lost(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
-        """A device is lost, or something else takes time: the next round may be so late [s]."""
+        """Announce that a device is lost or something else takes time.
+
+        The next round may be so late [s].
+        """
         if not self._ready:
             self.starting(patience_s, what)
             return
@@ -114,7 +125,10 @@ class Service:
         self._send("STOPPING=1\nSTATUS=ends")
 
     def failed(self, why: str) -> None:
-        """It ends because of an error; the last line of status tells which."""
+        """Report that the service ends because of an error.
+
+        The last line of status states which.
+        """
         self._send(f"STATUS=failed: {one_line(why)}")
 
     def _notify(self, doing: str, now_ns: int) -> None:
@@ -128,7 +142,10 @@ class Service:
         self._due_ns = now_ns + self._every_ns if self._manager.listens else NEVER_NS
 
     def _fed(self, period_us: int = 0) -> str:
-        """What feeds the watchdog, and changes its period where one is given [us]; nothing where there is none."""
+        """Return the message that feeds the watchdog.
+
+        It changes the watchdog's period where one is given [us]; empty where there is no watchdog.
+        """
         if not self._period_us:
             return ""
         return f"\n{WATCHDOG}={period_us}\nWATCHDOG=1" if period_us else "\nWATCHDOG=1"

@@ -1,4 +1,7 @@
-"""Ctrl-C and a stop by the system as an event, for commands that run until they are told to end."""
+"""Ctrl-C and a stop by the system as an event.
+
+For commands that run until they are requested to end.
+"""
 
 import signal
 import threading

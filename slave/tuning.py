@@ -1,4 +1,6 @@
-"""Change how the camera of a running slave is set: on command, or because its files were changed. No restart.
+"""Change of the camera settings of a running slave without a restart.
+
+On command, or because its files were changed.
 
     settings    say what the camera has, and which colours are in use
     set         other exposure, gains, rate, margin, colours (body: `common.camera_settings.CameraSettings`)
@@ -47,7 +49,7 @@ MARKERS = "markers"
 
 @dataclass(frozen=True, slots=True)
 class CameraFiles:
-    """Which files a slave was started with, and what they said.
+    """Files a slave was started with, and their content.
 
     Attributes:
         camera_path, rig_path: The camera file and the rig file.
@@ -137,7 +139,9 @@ class CameraTuning:
         return self._used
 
     def commands(self) -> dict[str, Callable[[str], Mapping[str, float]]]:
-        """Verb -> what to do with its body; the gauges of the answer.
+        """Return the handler of each command verb.
+
+        Each takes the body and returns the metrics of the answer.
 
         Each raises `PhalanxError` where the body is wrong, or the camera did not take it.
         """
@@ -150,19 +154,28 @@ class CameraTuning:
         }
 
     def counts(self) -> dict[str, int]:
-        """`reload.applied`, `reload.refused`: changed files; and the events of the camera."""
+        """Return the counts of changed files and the events of the camera.
+
+        `reload.applied`, `reload.refused`: changed files.
+        """
         own = {"reload.applied": self._applied, "reload.refused": self._refused}
         return own if self._source is None else {**own, **self._source.counts()}
 
     def metrics(self) -> dict[str, float]:
-        """What the camera has and does now, and what the content in use says of settings, size and colours."""
+        """Return the metrics of the camera and of the content in use.
+
+        What the camera has and does now, and what the content in use specifies of settings, size and colours.
+        """
         used = self._used
         stated = {WANTED + name: value for name, value in figures(used.camera).items()}
         stated |= in_use(used.camera, used.rig.markers)
         return stated if self._source is None else {**self._source.metrics(), **stated}
 
     def look(self) -> None:
-        """Apply the files if they were changed; where that fails, say so once and go on as before."""
+        """Apply the files if they were changed.
+
+        Where that fails, log so once and go on as before.
+        """
         with self._lock:
             if not self._running() or not self._monitored.changed(self._used.paths):
                 return
@@ -225,7 +238,9 @@ class CameraTuning:
         return self._settings("")
 
     def _apply(self, new: CameraFiles, *, forget: bool = False) -> bool:
-        """Have these files in use, wholly or not at all; False if they are. Only to `forget` may they lack colours.
+        """Put these files in use, wholly or not at all.
+
+        False if they are in use. Only to `forget` may they lack colours.
 
         Raises:
             CalibrationError: They need a restart, or lack colours.
@@ -250,7 +265,9 @@ class CameraTuning:
 
 
 def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibration) -> CameraCalibration:
-    """A camera file that has changed from `was` to `now`, but what of it was left as it was is as in use.
+    """Merge a changed camera file into the one in use.
+
+    The file has changed from `was` to `now`; what it left unchanged stays as in use.
 
     That holds of its settings together, and of its colours: a lens that was calibrated meanwhile takes nothing back.
     """
@@ -265,7 +282,7 @@ def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibrat
 
 
 def _with_provenance(camera: CameraCalibration, verb: str, markers: Iterable[str]) -> CameraCalibration:
-    """The file, which says when and how its colours came about."""
+    """Return the camera file with a record of when and how its colours were made."""
     note = "picked in the running slave" if verb == "pick" else "ranges set by hand in the running slave"
     tool, before = f"phalanx-slave {verb}", camera.provenance.get(MARKERS)
     others = before.data if before is not None and before.tool == tool else ()

@@ -1,4 +1,6 @@
-"""The slave's end of the wire: waits for the master's start, then sends without ever waiting.
+"""Slave's end of the connection to the master.
+
+It waits for the master's start, then sends without ever waiting.
 
 A socket around `slave.link`: one thread hears the beacons, one what the master sends to this
 slave. The camera loop calls `send`; a datagram that cannot go now is counted and forgotten,
@@ -82,7 +84,10 @@ class Uplink:
 
     @property
     def started(self) -> bool:
-        """Whether a master has said start and is still there; else what is sent is dropped."""
+        """Return whether a master has sent start and is still there.
+
+        Else what is sent is dropped.
+        """
         with self._lock:
             return self._link.started
 
@@ -100,13 +105,19 @@ class Uplink:
 
     @property
     def wrong(self) -> str | None:
-        """Why no master takes this slave, where that is known: a twin, another wire version, another secret."""
+        """Return why no master accepts this slave, where that is known.
+
+        A duplicate sender, another wire version, another secret.
+        """
         with self._lock:
             return self._link.wrong
 
     @property
     def counts(self) -> dict[str, int]:
-        """Event -> how often: sent, unsent (no start), would_block, send_failed, refused.<reason>."""
+        """Return the event counts.
+
+        Event -> how often: sent, unsent (no start), would_block, send_failed, refused.<reason>.
+        """
         with self._lock:
             counts = {
                 "sent": self._sent,
@@ -117,7 +128,10 @@ class Uplink:
             return counts | {f"refused.{reason}": n for reason, n in self._link.refused.items()}
 
     def wait_for_start(self, timeout_s: float) -> bool:
-        """Wait until the master has said start and its moment is there; False after `timeout_s`."""
+        """Wait until the master has sent start and its start time is reached.
+
+        False after `timeout_s`.
+        """
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while (now_ns := self._clock.now_ns()) < deadline_ns and not self._closing.is_set():
             start_t_ns = self.start_t_ns if self.started else None
@@ -167,18 +181,23 @@ class Uplink:
 
 
 class News:
-    """What of the lines that are told again and again is worth saying: another one, `LOG_NS` after the last at least.
+    """Filter of repeated messages for the log.
+
+    A line passes if it differs from the last one, at least `LOG_NS` after it.
 
     Whoever has the rig key can have this slave told something else with each datagram; its log is not filled by that.
     """
 
     def __init__(self) -> None:
-        """Nothing was said yet."""
+        """Begin without any logged line."""
         self._line: str | None = None
         self._logged_ns: int | None = None
 
     def is_new(self, line: str | None, t_ns: int) -> bool:
-        """Whether to say `line` at `t_ns` [ns]; None: there is nothing to say, and whatever comes next is new."""
+        """Return whether to log `line` at `t_ns` [ns].
+
+        None: there is nothing to log, and whatever comes next is new.
+        """
         if line is None or line == self._line:
             self._line = line
             return False

@@ -1,1 +1,4 @@
-"""A rig without hardware: motions with exact truth, and the images a camera would take of them."""
+"""Simulated rig: motions with exact truth, and the camera images of them.
+
+No hardware is needed.
+"""

@@ -1,4 +1,7 @@
-"""What may lie before a marker, a bead or a tag in one image: outlines of skin, sleeve, things and other markers."""
+"""Occluders of a marker, a bead or a tag in one image.
+
+Outlines of skin, sleeve, things and other markers.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +40,10 @@ class Places:
 
 
 def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
-    """Outlines of the phalanges, the sleeve and the palm that may lie before each marker."""
+    """Return the outlines of hand parts that may occlude each marker.
+
+    The phalanges, the sleeve and the palm.
+    """
     surface = _phalanges_before(snapshot, places)
     speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)
     sleeve = Shape(snapshot.sleeve[0], snapshot.speed_uv[SLEEVE_SPHERES[0]])
@@ -57,7 +63,9 @@ def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
 def things_before(
     snapshot: Snapshot, places: Places, k: int, depth_m: float, but: SeenPart | None = None
 ) -> Sequence[Shape]:
-    """Outlines of things, and of parts of tracked objects, that pass before marker `k` nearer than a depth.
+    """Return the outlines of things that pass before marker `k`.
+
+    Nearer than a depth; parts of tracked objects are included.
 
     `but` cannot hide it: its own bead, or what it is stuck on.
     """
@@ -87,7 +95,10 @@ def _sleeve_before(snapshot: Snapshot, places: Places) -> Bool:
 
 
 def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
-    """Depth (...) [m] of the lines from key points `a` to `b` where they pass nearest to `uv` (..., 2) [px]."""
+    """Return the depth (...) [m] of lines where they pass nearest to `uv`.
+
+    Lines from key points `a` to `b`; `uv` (..., 2) [px].
+    """
     start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
     share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
     share = np.minimum(np.maximum(share, 0.0), 1.0)

@@ -1,4 +1,6 @@
-"""A calibration board before the cameras of a rig: held still, turned, held again, as a person does it.
+"""Simulated calibration board in front of the cameras of a rig.
+
+Held still, rotated, held again, as a person does it.
 
 For the calibration of cameras without hardware. The board is flat and exact, each pixel is the mean of the part of
 the board that it sees, light falls off with the board's tilt, and the sensor's noise is that of every simulated
@@ -35,7 +37,9 @@ INTO_VIEW = 0.92  # share of the half view that corners may reach
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Print:
-    """What is on a flat thing and behind it, as shares of the way from one colour to another.
+    """Appearance of a flat thing and its background.
+
+    Given as shares of the way from one colour to another.
 
     Attributes:
         texture: (rows, columns) shares, TEXELS_PER_M; above 0 on the thing.
@@ -53,7 +57,9 @@ class Print:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardScene:
-    """A checkerboard of 9 x 6 inner corners, squares of 25 mm, moved through the view of a rig's cameras.
+    """Checkerboard of 9 x 6 inner corners, squares of 25 mm, moved through the view.
+
+    The view is that of a rig's cameras.
 
     Attributes:
         rig: Which cameras, where.
@@ -95,7 +101,10 @@ class BoardScene:
         return CameraModel.of(self.cameras[camera], self.rig.camera_pose(camera))
 
     def T_rig_board(self, t_s: float) -> Float:
-        """Where the board is (4, 4) [m] at scene time `t_s` [s]; the poses come round again."""
+        """Return the pose (4, 4) [m] of the board at scene time `t_s` [s].
+
+        The poses repeat.
+        """
         count, step_s = len(self.poses), HELD_S + MOVED_S
         k = int(max(t_s, 0.0) // step_s)
         past = max(t_s, 0.0) - k * step_s - HELD_S
@@ -139,7 +148,10 @@ class BoardRenderer:
         self._drawn: tuple[Float, Image] | None = None
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "BoardRenderer":
-        """The same before a camera of other brightness (3,), blue first; nothing here is smeared by `exposure_us`."""
+        """Return the renderer for a camera of other brightness (3,), blue first.
+
+        Nothing here is smeared by `exposure_us`.
+        """
         del exposure_us
         other = copy(self)
         other._gains_bgr = np.array(gains_bgr, dtype=np.float32)
@@ -197,7 +209,9 @@ def _printed() -> Print:
 
 
 def _poses(optics: list[CameraModel], seed: int) -> Float:
-    """Poses (POSES, 4, 4) that at least one camera sees whole, most of them all: near and far, tilted every way.
+    """Return poses (POSES, 4, 4) that at least one camera sees whole.
+
+    Most are seen whole by all cameras: near and far, tilted every way.
 
     Raises:
         CalibrationError: No pose was found that the rig's first camera sees whole: it looks past the volume.
@@ -216,7 +230,10 @@ def _poses(optics: list[CameraModel], seed: int) -> Float:
 
 
 def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
-    """A random pose of the board before one camera, camera frame: its middle anywhere in the view."""
+    """Return a random pose of the board before one camera, in the camera frame.
+
+    Its middle is anywhere in the view.
+    """
     z = 1.0 / rng.uniform(1.0 / FAR_M, 1.0 / NEAR_M)
     reach = np.array([camera.width_px / camera.matrix[0, 0], camera.height_px / camera.matrix[1, 1]]) / 2.0
     middle = np.append(rng.uniform(-1.0, 1.0, 2) * INTO_VIEW * reach, 1.0) * z
@@ -228,7 +245,10 @@ def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
 
 
 def _sees(camera: CameraModel, T: Float) -> bool:
-    """Whether the whole board, with half a square around the corners, is in a camera's picture."""
+    """Return whether the whole board is in a camera's picture.
+
+    With half a square around the corners.
+    """
     rim = np.array([[-1, -1, 0], [COLUMNS, -1, 0], [COLUMNS, ROWS, 0], [-1, ROWS, 0]]) * SQUARE_M
     uv = camera.project(rim @ T[:3, :3].T + T[:3, 3])
     inside = (uv > 2.0) & (uv < np.array([camera.width_px, camera.height_px]) - 3.0)
@@ -236,7 +256,10 @@ def _sees(camera: CameraModel, T: Float) -> bool:
 
 
 def _between(now: Float, then: Float, share: float) -> Float:
-    """The pose on the way from one to the other: smooth start and end, about one axis."""
+    """Interpolate between two poses.
+
+    Smooth start and end, about one axis.
+    """
     s = share * share * (3.0 - 2.0 * share)
     rotation = np.asarray(cv2.Rodrigues(then[:3, :3] @ now[:3, :3].T)[0], np.float64)
     T = np.eye(4)

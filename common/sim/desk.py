@@ -1,4 +1,6 @@
-"""What lies behind the hand, and what the sensor adds: the desk as one camera sees it, and tiles of noise.
+"""Image background and sensor noise.
+
+The desk as one camera sees it behind the hand, and tiles of noise.
 
 Both are made once and only copied afterwards: cameras do not move.
 """
@@ -22,7 +24,10 @@ LENS_SIGMA_PX = 0.62
 
 
 def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
-    """Image (H, W, 3) BGR of a worn dark grey desk at rig depth `depth_m` [m], fixed in the rig frame."""
+    """Return the image (H, W, 3) BGR of a worn dark grey desk.
+
+    At rig depth `depth_m` [m], fixed in the rig frame.
+    """
     height, width = optics.height_px, optics.width_px
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
@@ -40,7 +45,9 @@ def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
 
 
 def _wear(seed: int) -> npt.NDArray[np.float32]:
-    """Relative brightness (SIDE, SIDE, 3) about 1: blotches, grain and brushed streaks.
+    """Return the relative brightness (SIDE, SIDE, 3) of wear, about 1.
+
+    Blotches, grain and brushed streaks.
 
     Single precision and one plane for what has no colour: a slave that starts again waits for this.
     """
@@ -62,7 +69,10 @@ def _wear(seed: int) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseTiles:
-    """Sensor noise, drawn once: what to add and what to subtract (2 x H + margin, W + margin, 3)."""
+    """Sensor noise, drawn once.
+
+    What to add and what to subtract (2 x H + margin, W + margin, 3).
+    """
 
     plus: tuple[Image, ...]
     minus: tuple[Image, ...]

@@ -1,4 +1,6 @@
-"""Postures in which a hand pinches, grips a knob or lays its thumb on a key: found on the hand itself, skin on skin.
+"""Postures of a hand that pinches, grips a knob or lays its thumb on a key.
+
+Solved on the hand model itself, skin on skin.
 
 What a posture must do is a handful of residuals, each over the width that it may miss by; the angles that meet them
 best and stay nearest to a natural posture are found by damped Gauss-Newton steps with differences for derivatives.
@@ -48,7 +50,10 @@ class Knob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Key:
-    """A thumb on a key: finger 1 ... 4, segment 0 ... 2 from the knuckle, and the posture (5, 3) [deg]."""
+    """Thumb on a key: finger 1 ... 4, segment 0 ... 2, and the posture (5, 3) [deg].
+
+    Segments are counted from the knuckle.
+    """
 
     finger: int
     segment: int
@@ -79,12 +84,18 @@ class Posed:
         return cls(posture_deg, found.position_m, found.rotation, capsules)
 
     def palmar(self, finger: int, segment: int) -> Float:
-        """Unit vectors (N, 3) out of the palmar side of a segment: -y of the joint it begins at."""
+        """Return unit vectors (N, 3) out of the palmar side of a segment.
+
+        They are -y of the joint it begins at.
+        """
         return -self.rotation[:, CHAINS[finger, segment], :, 1]
 
 
 def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
-    """Posture (5, 3) [deg] in which the pads of the thumb and of finger 1 ... 4 meet, the others well away."""
+    """Return the posture (5, 3) [deg] in which thumb and finger 1 ... 4 pinch.
+
+    Their pads meet, the other fingers are well away.
+    """
     start = np.array(POSES["pinch"], dtype=np.float64)
     start[1:, 1:] = (12.0, 18.0)
     start[finger, 1:] = (46.0, 44.0)
@@ -104,7 +115,9 @@ def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
 
 
 def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> Float:
-    """Posture (5, 3) [deg] in which the thumb's tip lies on segment 0 ... 2, from the knuckle, of finger 1 ... 4.
+    """Return the posture (5, 3) [deg] in which the thumb's tip lies on a key.
+
+    Segment 0 ... 2, from the knuckle, of finger 1 ... 4.
 
     All fingers bend alike, as far as the thumb needs to reach the key, and that finger a little on its own.
     """
@@ -144,7 +157,10 @@ def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> F
 
 
 def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
-    """The posture (5, 3) [deg] of a thumb that has gone back from a key, straight off the skin."""
+    """Return the posture (5, 3) [deg] of a thumb retracted from a key.
+
+    Straight off the skin.
+    """
     there = Posed.of(model, key.posture_deg[None], wobble)
     target = there.joints_m[0, TIPS[0]] + HOVER_M * there.palmar(key.finger, key.segment)[0]
 
@@ -155,7 +171,10 @@ def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
 
 
 def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
-    """The posture (5, 3) [deg] of the same fingers whose thumb is out of the way, and on no finger on its way."""
+    """Return the posture (5, 3) [deg] of the same fingers with the thumb aside.
+
+    The thumb is out of the way, and touches no finger on its way.
+    """
     aside = [(across, bend, 6.0) for across in (0.0, 15.0, 30.0, 45.0) for bend in (-10.0, 5.0, 20.0)]
     share = np.linspace(0.0, 1.0, 9)[:, None]
     ways = np.tile(hover_deg, (len(aside), len(share), 1, 1))
@@ -189,7 +208,10 @@ def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
 
 
 def _middle_and_axis(tips_m: Float) -> tuple[Float, Float]:
-    """Middle (N, 3) between the tip of the thumb and those of the fingers (N, 5, 3), and their plane's normal."""
+    """Return the middle (N, 3) between the finger tips, and their plane's normal.
+
+    Between the tip of the thumb and those of the fingers (N, 5, 3).
+    """
     middle = 0.5 * tips_m[:, 0] + 0.5 * tips_m[:, 1:].mean(axis=1)
     across = tips_m[:, 0] - middle
     along = tips_m[:, 1] - tips_m[:, 4]
@@ -206,8 +228,9 @@ def _solved(
     misses: Callable[[Posed], Float],
     wobble: Float,
 ) -> tuple[Float, float]:
-    """The posture (5, 3) [deg] that misses least and strays least, over the widths, in the angles that are free, and
-    by how much, squared.
+    """Solve for the posture (5, 3) [deg] with the least residual and deviation.
+
+    The deviation is relative to the widths, in the free angles. Also returns the squared residual.
     """
 
     def residuals(x: Float) -> Float:

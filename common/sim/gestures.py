@@ -1,4 +1,6 @@
-"""A hand that pinches, turns knobs, taps its keys and points, and moves freely between: with the truth of all it says.
+"""Simulated hand that pinches, turns knobs, taps its keys and points.
+
+It moves freely between; the true gestures are known.
 
 In 75 s two rounds of everything, in an order, at a pace, in places and with knobs that are drawn from the seed: each
 finger is pinched, a knob is turned to and fro, another is turned farther than a hand turns at once and gripped again,
@@ -52,7 +54,7 @@ _LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """One thing that the hand says.
+    """Annotation of one gesture of the hand.
 
     Attributes:
         kind, name: As of a Gesture message.
@@ -66,7 +68,10 @@ class Annotation:
 
 
 class Track:
-    """Values that go smoothly (C2) from one to the next, and rest between. It holds them."""
+    """Values that change smoothly (C2) from one to the next, and rest between.
+
+    It holds them.
+    """
 
     def __init__(self, first: Float) -> None:
         self._start, self._stop, self._value = [-1.0], [0.0], [np.asarray(first, dtype=np.float64)]
@@ -94,7 +99,9 @@ class Track:
 
 
 class Gestures:
-    """A minute of gestures. The state it holds is its script, fixed by the constructor.
+    """One minute of gestures.
+
+    The state it holds is its script, fixed by the constructor.
 
     Attributes:
         said: Everything the hand says, in order.
@@ -140,7 +147,10 @@ class Gestures:
         return PERIOD_S
 
     def dial_rad(self, t_s: float) -> float:
-        """By how much knobs have been turned up to a time [s], clockwise as seen from the back of the hand."""
+        """Return by how much knobs have been turned up to a time [s].
+
+        Clockwise as seen from the back of the hand.
+        """
         return float(self._knob_angle.at(max(t_s, 0.0) % PERIOD_S)[0])
 
     def at(self, t_s: float) -> HandState:
@@ -272,7 +282,10 @@ class Gestures:
         self._now += rest_s
 
     def _taps(self) -> None:
-        """Some keys, one after another; the thumb comes and goes over the key that is nearest to it, touching none."""
+        """Add taps on some keys, one after another.
+
+        The thumb comes and goes over the key that is nearest to it, touching none.
+        """
         door = hover_posture(self._model, self._keys[0], self._own)
         aside = pad_before(self._model, door, self._own)
         self._go(aside, 0.5, 0.2, 1.0)

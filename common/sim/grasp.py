@@ -1,4 +1,6 @@
-"""A hand that grasps a bar, lifts it, turns it and puts it back, five times a minute.
+"""Simulated hand that grasps a bar, lifts it, rotates it and puts it back.
+
+Five times a minute.
 
 From rest the hand comes from below with open fingers until the bar lies before them, and closes (`grip`); palm and
 fingers then hide the finger tips from cameras that see the back of the hand. It lifts the bar, turns it briskly in
@@ -52,14 +54,18 @@ _OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
 
 class Grasp:
-    """Five grasps in 60 s. The state it holds is its script, fixed by the constructor.
+    """Five grasps in 60 s.
+
+    The state it holds is its script, fixed by the constructor.
 
     Attributes:
         pace: (ROUNDS,) by what the times of each round are multiplied.
     """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = BAR_RADIUS_M) -> None:
-        """Write the script, and close the hand round the bar once (some tenths of a second).
+        """Write the script, and close the hand round the bar once.
+
+        Takes some tenths of a second.
 
         Args:
             model: Whose limits and coupling hold.
@@ -93,7 +99,10 @@ class Grasp:
         return PERIOD_S
 
     def round_at(self, t_s: float) -> tuple[int, float]:
-        """Which round it is at `t_s` [s], and how far in it the hand is, in seconds of a round at full length."""
+        """Return the round at `t_s` [s], and the time within it.
+
+        The time is in seconds of a round at full length.
+        """
         t = max(t_s, 0.0) % PERIOD_S
         k = min(int(t / ROUND_S), ROUNDS - 1)
         return k, (t - k * ROUND_S) / float(self.pace[k])
@@ -125,7 +134,10 @@ class Grasp:
         return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
 
     def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:
-        """How round `k` turns the palm about the rig's axes (3,) [rad], and bends the wrist by that (2,) [deg]."""
+        """Return the palm rotation (3,) [rad] and wrist flexion (2,) [deg] of a round.
+
+        Of round `k`; the rotation is about the rig's axes.
+        """
         rotation, swing = np.zeros(3), np.zeros(2)
         for place in (0, 1):
             start = LIFTED_S + 0.1 + place * _ROTATION_S

@@ -25,7 +25,10 @@ _NEAR, _TOUCHES_M, _PRESSED_M, _ACROSS_M = 200, 0.0012, 0.0010, 0.012
 
 
 def bar_in_palm(model: HandModel, radius_m: float) -> Float:
-    """`T_palm_object` (4, 4) [m] of a bar of that radius in the closed hand; its axis is its z."""
+    """Return `T_palm_object` (4, 4) [m] of a bar of that radius in the closed hand.
+
+    The bar's axis is its z.
+    """
     axis = np.array([model.side_sign * np.cos(ASLANT), 0.0, np.sin(ASLANT)])
     rotation = np.stack([np.cross([0.0, 1.0, 0.0], axis), [0.0, 1.0, 0.0], axis], axis=1)
     _, y, z = model.rest_position_m[MIDDLE_PROXIMAL].tolist()
@@ -34,7 +37,10 @@ def bar_in_palm(model: HandModel, radius_m: float) -> Float:
 
 
 def gaps_m(model: HandModel, angles_rad: Float, T_palm_object: Float, radius_m: float) -> Float:
-    """Air (..., 5, 3) [m] between the skin of each phalanx and a long bar, of angles (..., 5, 4); negative: inside."""
+    """Return the gap (..., 5, 3) [m] between each phalanx's skin and a long bar.
+
+    At angles (..., 5, 4); negative: inside.
+    """
     bones, girth = _phalanges(model, angles_rad)
     return _clear_of(bones, girth, T_palm_object, radius_m).min(axis=-1)
 
@@ -70,7 +76,10 @@ def closed_round(
 def _thumb(
     model: HandModel, fingers_deg: Float, T_palm_object: Float, radius_m: float, wobble: Float
 ) -> Float:
-    """The thumb's posture (3,) [deg]: touches the bar, lies on the fingers at most, its tip below the palm."""
+    """Return the thumb's posture (3,) [deg] in which it touches the bar.
+
+    It lies on the fingers at most, its tip below the palm.
+    """
     grid = np.stack(np.meshgrid(*_THUMB_DEG, indexing="ij"), axis=-1).reshape(-1, 3)
     posture = np.tile(fingers_deg, (len(grid), 1, 1))
     posture[:, 0] = grid
@@ -90,7 +99,10 @@ def _thumb(
 
 
 def _phalanges(model: HandModel, angles_rad: Float) -> tuple[Float, Float]:
-    """Points (..., 5, 3, n, 3) [m] along the phalanges, palm frame, and the fingers' radius there (..., 5, 3, n)."""
+    """Return points (..., 5, 3, n, 3) [m] along the phalanges, and their radii.
+
+    Palm frame; the fingers' radius there is (..., 5, 3, n).
+    """
     joints = model.chains(angles_rad).position_m
     radius = np.broadcast_to(model.radius_m[CHAINS], joints.shape[:-1])
     return _thick(
@@ -100,7 +112,10 @@ def _phalanges(model: HandModel, angles_rad: Float) -> tuple[Float, Float]:
 
 
 def _thick(ends: Float, radius_m: Float) -> tuple[Float, Float]:
-    """Points (..., n, 3) along bones with ends (..., 2, 3), and their radii (..., n) of those at the ends (..., 2)."""
+    """Return points (..., n, 3) along bones and their radii (..., n).
+
+    Bones have ends (..., 2, 3); the radii follow from those at the ends (..., 2).
+    """
     along = _ALONG[:, None]
     points = (1.0 - along) * ends[..., :1, :] + along * ends[..., 1:, :]
     return points, (1.0 - _ALONG) * radius_m[..., :1] + _ALONG * radius_m[..., 1:]

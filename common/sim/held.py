@@ -1,4 +1,4 @@
-"""Things that a simulated hand takes: what they are and where they are at an instant."""
+"""Things that a simulated hand holds: what they are and where at a time."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,9 @@ from common.arrays import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cylinder:
-    """A matt dark cylinder, closed at both ends; its axis is its own z, its origin the middle.
+    """Matt dark cylinder, closed at both ends.
+
+    Its axis is its own z, its origin the middle.
 
     Attributes:
         T_rig_object: (4, 4) [m].

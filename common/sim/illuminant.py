@@ -1,4 +1,6 @@
-"""Light that changes: what a lamp of another colour temperature, or another exposure, makes of the picture.
+"""Changing illumination and its effect on the picture.
+
+A lamp of another colour temperature, or another exposure.
 
 The camera's white balance is fixed, set under the light that the colours were calibrated in. Another light multiplies
 every channel in linear light (von Kries' law of coefficients, with the channels of linear sRGB as receptors):
@@ -52,7 +54,9 @@ def planckian_xy(kelvin: float) -> tuple[float, float]:
 
 
 def white(kelvin: float) -> Float:
-    """Linear sRGB (3,) of a Planckian radiator of luminance 1; below about 1900 K its blue would be negative: 0.
+    """Return the linear sRGB (3,) of a Planckian radiator of luminance 1.
+
+    Below about 1900 K its blue would be negative: 0.
 
     Raises:
         PhalanxError: As `planckian_xy`.
@@ -63,13 +67,18 @@ def white(kelvin: float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One light: its colour temperature [K], and the brightness of the picture relative to calibration."""
+    """One light: its colour temperature [K], and the brightness of the picture.
+
+    The brightness is relative to calibration.
+    """
 
     kelvin: float = CALIBRATED_KELVIN
     exposure: float = 1.0
 
     def gains_bgr(self, calibrated_kelvin: float = CALIBRATED_KELVIN) -> Float:
-        """Factors (3,) of the channels in linear light, blue first, relative to the calibrated light.
+        """Return the factors (3,) of the channels in linear light, blue first.
+
+        Relative to the calibrated light.
 
         Raises:
             PhalanxError: A temperature outside 1667-25000 K.
@@ -79,7 +88,9 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class LightSchedule:
-    """How the light of a scene changes: knots (time [s], kelvin, exposure), straight lines between them.
+    """Schedule of a scene's light: knots (time [s], kelvin, exposure).
+
+    Straight lines between the knots.
 
     Two knots at one time are a jump. Before the first knot and after the last nothing changes.
 

@@ -1,4 +1,6 @@
-"""An IMU on a simulated hand or forearm: what a common part says of the motion, raw; its orientation it does not know.
+"""Simulated IMU on a hand or forearm.
+
+Raw output of a common part; it does not know its orientation.
 
 The motion's exact rates, as means since the last sample, and forces, and on top of them the errors of a part, an
 LSM6DSO if none is named. The
@@ -33,7 +35,10 @@ _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it
 
 @dataclass(frozen=True, slots=True)
 class InertialPart:
-    """Errors of a kind of sensor, one sigma: noise per root hertz; zero and scale of its gyroscope."""
+    """Errors of a kind of inertial sensor, one sigma.
+
+    Noise per root hertz; zero and scale of its gyroscope.
+    """
 
     gyro_noise: float
     accel_noise: float
@@ -48,7 +53,10 @@ ICM20948 = InertialPart(
 
 
 class SimulatedImu:
-    """What the IMU of a rig would say of a motion. Pure in time: holds the errors of this recording."""
+    """Simulated IMU of a rig during a motion.
+
+    Pure in time: holds the errors of this recording.
+    """
 
     def __init__(
         self, motion: HandMotion, imu: ImuCalibration, seed: int, part: InertialPart = LSM6DSO
@@ -82,7 +90,9 @@ class SimulatedImu:
 
     @classmethod
     def of(cls, scene: Scene | WristScene) -> "SimulatedImu":
-        """The IMU of a scene's rig: on the palm before markers, on the forearm in a wrist device.
+        """Return the IMU of a scene's rig.
+
+        On the palm in a marker rig, on the forearm in a wrist device.
 
         Raises:
             CalibrationError: The rig has none, or it is not known how that is mounted.
@@ -95,7 +105,9 @@ class SimulatedImu:
         return cls(motion, scene.rig.imu, scene.seed)
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
-        """All samples of a span of scene time [s], and before it as long as a filter takes to settle.
+        """Yield all samples of a span of scene time [s] and of a lead-in before it.
+
+        The lead-in is as long as a filter takes to settle.
 
         `t_ns` counts from scene time 0 at `zero_ns`; there is none before that.
         """
@@ -105,7 +117,7 @@ class SimulatedImu:
             yield self.sample(seq, t_s, zero_ns + round(t_s * 1e9))
 
     def bias_rad_s(self, t_s: float) -> Float:
-        """What its gyroscope would say at rest (3,) [rad/s]."""
+        """Return the gyroscope bias (3,) [rad/s]: its reading at rest."""
         return self._zero + _WANDER_RAD_S * np.sin(2.0 * pi * t_s / _WANDER_S + self._phase)
 
     def sample(self, seq: int, t_s: float, t_ns: int) -> ImuSample:

@@ -1,4 +1,6 @@
-"""A motion that follows a real hand: the Leap recordings of the data folder (`leapjs/*.npz`).
+"""Motion that follows a real hand: the Leap recordings of the data folder.
+
+The files are `leapjs/*.npz`.
 
 They hold `t` (T,) [s] and, of the first hand, joints (T, 21, 3) [m] (slot 0 the wrist, unknown; then thumb base,
 MCP, IP, tip and index ... little MCP, PIP, DIP, tip), palm centre, palm normal (out of the palm) and direction. Leap
@@ -28,7 +30,9 @@ REACH_M = np.array([0.13, 0.08, 0.10])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeapMotion:
-    """A recorded motion on an even grid, played with cubic Hermite curves (C1) and closed into a loop.
+    """Recorded motion on an even grid, closed into a loop.
+
+    Played with cubic Hermite curves (C1).
 
     Attributes:
         centre_m: (3,) [m] middle of the volume, rig frame.
@@ -59,7 +63,9 @@ class LeapMotion:
 
 
 def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
-    """Read one recording as a motion of `model` about `centre_m` (3,) [m]; a hand of the other side is mirrored.
+    """Read one recording as a motion of `model` about `centre_m` (3,) [m].
+
+    A hand of the other side is mirrored.
 
     Raises:
         RecordingError: The file is missing, or lacks a key or a sample that is needed.
@@ -100,7 +106,10 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
 
 
 def palm_rotation(normal: Float, direction: Float) -> Float:
-    """Palm frames (T, 3, 3) of palm normals and finger directions (T, 3): y = -normal, z near the direction."""
+    """Return palm frames (T, 3, 3) of palm normals and finger directions (T, 3).
+
+    y = -normal, z near the direction.
+    """
     y = -normal / np.linalg.norm(normal, axis=1, keepdims=True)
     z = direction - (direction * y).sum(axis=1, keepdims=True) * y
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
@@ -109,7 +118,9 @@ def palm_rotation(normal: Float, direction: Float) -> Float:
 
 
 def joint_angles(model: HandModel, joints: Float, rotation: Float) -> Float:
-    """Angles (T, 5, 4) [rad], within the limits, of joints (T, 21, 3) and palm frames (T, 3, 3), same axes.
+    """Return joint angles (T, 5, 4) [rad], within the limits.
+
+    From joints (T, 21, 3) and palm frames (T, 3, 3), same axes.
 
     A finger's first bone is R_y(s abduction) R_rest R_x(-flexion) (-z): azimuth and elevation in the palm. The
     thumb's bone is read in its own rest frame.
@@ -166,7 +177,10 @@ def _close(values: Float) -> Float:
 
 
 def _hermite(values: Float, place: float) -> Float:
-    """Catmull-Rom interpolation at a fractional index of samples (N, ...) that repeat (Catmull & Rom, 1974)."""
+    """Interpolate periodic samples (N, ...) at a fractional index.
+
+    Catmull-Rom interpolation (Catmull & Rom, 1974).
+    """
     n = len(values)
     k = int(place) % n
     s = place - int(place)

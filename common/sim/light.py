@@ -1,4 +1,6 @@
-"""Colours of the simulated scene: reflectances, light, and the step between linear light and sRGB bytes.
+"""Colours of the simulated scene.
+
+Reflectances, light, and the step between linear light and sRGB bytes.
 
 Paint reflectances are those of the rendered recordings (truth_meta.json, paint_reflectance_linear_srgb), so that
 colours learnt here and there agree.
@@ -50,7 +52,10 @@ _ENCODE_STEPS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SrgbTables:
-    """The sRGB curve as tables: byte -> linear 0..1 (256,), and 4096 linear steps -> byte."""
+    """sRGB curve as lookup tables.
+
+    byte -> linear 0..1 (256,), and 4096 linear steps -> byte.
+    """
 
     linear: Float32
     byte: Image
@@ -81,7 +86,10 @@ def bgr_bytes(linear_rgb: Float) -> tuple[int, int, int]:
 
 
 def shades(linear_rgb: tuple[float, float, float], gloss: float = 0.0) -> tuple[tuple[int, int, int], ...]:
-    """Colours (BGR bytes) of the layers of a Lambert surface, its brightest layer with `gloss` of white."""
+    """Return the colours (BGR bytes) of the layers of a Lambert surface.
+
+    Its brightest layer has `gloss` of white.
+    """
     albedo = np.array(linear_rgb)
     light = AMBIENT + (1.0 - AMBIENT) * _LAYER_MEAN_COSINE
     whiteness = np.array([0.0, 0.1, 0.45, 1.0]) * gloss
@@ -89,12 +97,15 @@ def shades(linear_rgb: tuple[float, float, float], gloss: float = 0.0) -> tuple[
 
 
 def face_shade(linear_rgb: tuple[float, float, float], cosine: float) -> tuple[int, int, int]:
-    """Colour (BGR bytes) of a flat Lambert face whose normal has this cosine to the light."""
+    """Return the colour (BGR bytes) of a flat Lambert face.
+
+    Its normal has this cosine to the light.
+    """
     return bgr_bytes((AMBIENT + (1.0 - AMBIENT) * max(cosine, 0.0)) * np.array(linear_rgb))
 
 
 def marker_colour(marker: str) -> tuple[float, float, float]:
-    """Linear RGB reflectance of a marker's paint.
+    """Return the linear RGB reflectance of a marker's colour.
 
     Raises:
         CalibrationError: The simulator has no paint of that name.

@@ -1,4 +1,6 @@
-"""Seeded hand motions: where the hand is and how its fingers bend, as a pure function of time.
+"""Seeded hand motions: hand pose and finger flexion.
+
+A pure function of time.
 
 A motion is a sum. A resting posture with slow natural drift is always there; on top of it acts come and go, each
 faded in and out by a smooth window (C2), so that the whole is smooth for every t, and closed over its period.
@@ -47,7 +49,7 @@ WAVE_CREST = ((12, 8, 12), (5, 34, 30), (0, 34, 30), (-5, 34, 30), (-10, 34, 30)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandState:
-    """One instant.
+    """State of the hand at one time.
 
     Attributes:
         T_rig_palm: Palm pose (4, 4) [m].
@@ -73,13 +75,19 @@ class HandMotion(Protocol):
         ...
 
     def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0, after the period from the beginning."""
+        """Return the hand at time `t_s` [s].
+
+        Before 0 the pose of 0, after the period from the beginning.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """What one act adds to the rest: posture change (5, 3) [deg], shift (3,) [m], turn (3,) [rad], rig axes."""
+    """Change that one act adds to the rest state.
+
+    Posture change (5, 3) [deg], shift (3,) [m], rotation (3,) [rad], rig axes.
+    """
 
     posture: Float
     shift: Float
@@ -88,7 +96,10 @@ class Change:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Act:
-    """One act on the time line; `change` takes the seconds since its start, and is faded at both ends."""
+    """One act on the time line.
+
+    `change` takes the seconds since its start, and is faded at both ends.
+    """
 
     name: str
     start_s: float
@@ -98,7 +109,10 @@ class Act:
 
 
 def smooth_step(x: float) -> float:
-    """0 below 0, 1 above 1, between them 6x^5 - 15x^4 + 10x^3: first and second derivative vanish at the ends."""
+    """Return a smooth step: 0 below 0, 1 above 1, between 6x^5 - 15x^4 + 10x^3.
+
+    First and second derivative vanish at the ends.
+    """
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
 
@@ -151,7 +165,9 @@ class ScriptedMotion:
 
 
 def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
-    """Angles (..., 5, 4) [rad] inside the limits, of postures (..., 5, 3) [deg] and `wobble` (5, 4) about -1..1.
+    """Return angles (..., 5, 4) [rad] of postures (..., 5, 3) [deg].
+
+    The angles are inside the limits; `wobble` (5, 4) is about -1..1.
 
     The wobble moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the DIP coupling by up to 12 %.
     """
@@ -164,7 +180,9 @@ def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
 
 
 def base_pose(model: HandModel, centre_m: Float, shift_m: Float, rotation_rad: Float) -> Float:
-    """`T_rig_palm` (4, 4) of the hand seen from behind its back, fingers up in the image.
+    """Return `T_rig_palm` (4, 4) of the hand seen from behind its back.
+
+    Fingers up in the image.
 
     The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `rotation_rad` (3,) turns the
     palm about the rig's axes through that middle. Fingers point a little towards the cameras.
@@ -175,7 +193,10 @@ def base_pose(model: HandModel, centre_m: Float, shift_m: Float, rotation_rad: F
 
 
 class Waves:
-    """Some values that wander slowly within -1..1: random Fourier sums, closed over the period."""
+    """Values that wander slowly within -1..1.
+
+    Random Fourier sums, closed over the period.
+    """
 
     def __init__(self, rng: np.random.Generator, count: int, period_s: float = PERIOD_S) -> None:
         slow, fast = (max(round(rate * period_s / PERIOD_S), 1) for rate in (5, 30))
@@ -277,7 +298,10 @@ def _rotate_about(axes: tuple[int, ...], each_s: float) -> Callable[[float], Cha
 
 
 def _half(rng: np.random.Generator, start_s: float, half: int) -> tuple[Act, ...]:
-    """All acts once, within 30 s from `start_s`; the halves differ in tempo, order and direction."""
+    """Return all acts once, within 30 s from `start_s`.
+
+    The halves differ in tempo, order and direction.
+    """
     acts: list[Act] = []
     t = start_s + 0.6
 

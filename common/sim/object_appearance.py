@@ -1,4 +1,7 @@
-"""How one camera sees tracked objects: from key points in space to outlines and shading (`objects_seen`)."""
+"""Tracked objects as one camera sees them.
+
+From key points in space to outlines and shading (`objects_seen`).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +22,10 @@ FACING_LEAST = 0.02  # cosine to the line of sight from which on a sheet shows i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Key points of the objects at their moments: (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s]."""
+    """Key points of the objects at their times.
+
+    (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s].
+    """
 
     at: Float
     uv: Float
@@ -29,7 +35,10 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearances:
-    """How one camera looks: towards the light (3,), camera frame; `unit_circle`; points (..., 3) [m] to pixels."""
+    """Viewing parameters of one camera.
+
+    Direction towards the light (3,), camera frame; `unit_circle`; points (..., 3) [m] to pixels.
+    """
 
     to_light: Float
     circle: Float
@@ -73,7 +82,10 @@ class Appearances:
         return SeenObjects.of(parts, beads, [self._sheet(sheet, points) for sheet in surface.sheets])
 
     def _rims(self, rods: Sequence[Rod], points: Points) -> Float:
-        """Edges (R, 2, LAYERS, n, 3) [m] of the shading of all rods at their ends (`things.tube_rims`)."""
+        """Return the shading edges of all rods at their ends.
+
+        Shape (R, 2, LAYERS, n, 3) [m]; see `things.tube_rims`.
+        """
         ends = np.array([points.at[rod.ends] for rod in rods]).reshape(-1, 2, 3)
         radius = np.array([rod.radius_m for rod in rods])
         axis = unit(ends[:, 1] - ends[:, 0])
@@ -84,7 +96,11 @@ class Appearances:
         return ends[:, :, None, None] + rims[:, None]
 
     def _ball_points(self, balls: Sequence[Ball], points: Points) -> tuple[Float, Float, Float]:
-        """Edges (B, n, 3) [m] of balls, middles (B, LAYERS, 3) of their shading, where they mirror the lamp (B, 3)."""
+        """Return the edges, shading centres and lamp reflections of balls.
+
+        Edges (B, n, 3) [m] of the balls, centres (B, LAYERS, 3) of their shading, points (B, 3) where they mirror the
+        lamp.
+        """
         middle = np.array([points.at[ball.middle][0] for ball in balls]).reshape(-1, 3)
         radius = np.array([ball.radius_m for ball in balls])
         d2 = (middle * middle).sum(axis=1)

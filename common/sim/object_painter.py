@@ -1,4 +1,4 @@
-"""Beads and tags of tracked objects: what each covers of the image, how it looks there, and the truth of it.
+"""Beads and tags of tracked objects: image coverage, appearance and ground truth.
 
 As with a hand's markers (`painter`), everything nearer is cut out of the coverage, and the same coverage blends the
 paint into the image.
@@ -26,7 +26,9 @@ TOUCHING_M = 0.001  # a tag lies on what it is stuck on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectView:
-    """What one camera truly sees of one tracked object in one frame; features as `TrackedObjects.features`.
+    """Ground truth of what one camera sees of one tracked object in one frame.
+
+    Features as `TrackedObjects.features`.
 
     Attributes:
         visible: (F,) visible share of the outline of each bead and of the paper of each tag, which is 0 from behind.
@@ -49,7 +51,10 @@ class PaintedFeature:
 
 
 class ObjectPainter:
-    """Paints the beads and tags of one view. It holds prepared colours; every call is pure."""
+    """Renderer of the beads and tags of one view.
+
+    It holds prepared colours; every call is pure.
+    """
 
     def __init__(self, view: View, tables: light.SrgbTables) -> None:
         """Prepare colours.
@@ -114,7 +119,10 @@ class ObjectPainter:
         return [PaintedFeature(feature, cover) for (feature, _), cover in zip(features, covers, strict=True)]
 
     def appearance(self, item: PaintedFeature, box: Box) -> Float32:
-        """Linear light (h, w, 3) of its surface over pixels x0, y0, x1, y1, as if it filled them."""
+        """Return the linear light of the item's surface over a box of pixels.
+
+        Shape (h, w, 3), over pixels x0, y0, x1, y1, as if the surface filled them.
+        """
         if isinstance(item.feature, SeenSheet):
             return sheet_appearance(
                 item.feature, raster.moments(item.feature.shape, self._view.exposure_s), box

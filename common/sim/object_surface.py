@@ -1,4 +1,6 @@
-"""What a tracked object looks like, as few points as a fast renderer can live with: rods, blocks, balls, beads, tags.
+"""Surface of a tracked object, as few points as a fast renderer can live with.
+
+Rods, blocks, balls, beads, tags.
 
 All places are key points of one array, as those of the hand (`surface`), so that a camera brings each to the moment at
 which its own row is exposed.
@@ -36,7 +38,10 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """A ball: key point of its middle (a slice of one), radius [m]; of a painted bead its marker (place in the rig)."""
+    """Ball, given by the key point of its centre and its radius.
+
+    The key point is a slice of one, the radius is in [m]; a painted bead also has its marker (index in the rig).
+    """
 
     middle: slice
     radius_m: float
@@ -45,7 +50,9 @@ class Ball:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A printed tag: four key points of its paper, then the four of its black square, as `tag_corners` has them.
+    """Printed tag: four key points of its paper, then the four of its black square.
+
+    The order is that of `tag_corners`.
 
     Attributes:
         on: Place of the block that it is stuck on among the parts; None: on nothing that could be before it.
@@ -121,7 +128,10 @@ class _Layout:
         self.which = 0
 
     def add(self, points: Float) -> slice:
-        """Take points (n, 3) [m], frame of the present object; where they are among the key points."""
+        """Add points to the key points and return their slice.
+
+        Points (n, 3) [m] in the frame of the present object.
+        """
         start = len(self.owner)
         self.points.append(points)
         self.owner += [self.which] * len(points)
@@ -157,7 +167,10 @@ def _sheets(profile: ObjectProfile, first: int, layout: _Layout) -> list[Sheet]:
 
 
 def _block_under(shapes: Sequence[Shape], point: Float) -> int | None:
-    """The box on whose surface a point (3,) of the object lies, by its place among the shapes."""
+    """Return the index of the box on whose surface a point of the object lies.
+
+    The point is (3,); the index is the box's place among the shapes.
+    """
     for k, shape in enumerate(shapes):
         if isinstance(shape, BoxShape):
             own = (

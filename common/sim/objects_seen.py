@@ -1,4 +1,7 @@
-"""Tracked objects in one image: outlines, shading, and how far away each part is behind a pixel."""
+"""Tracked objects in one image: outlines, shading and depth of each part.
+
+The depth is how far away each part is behind a pixel.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -145,7 +148,9 @@ class SeenObjects:
         )
 
     def before(self, uv: Float, depth_m: float, low: Float, high: Float) -> list[SeenPart]:
-        """What passes before a pixel (2,) nearer than a depth, and reaches into the box `low`, `high` (2,) [px].
+        """Return the parts that pass in front of a pixel and reach into a box.
+
+        Parts nearer than a depth at pixel (2,); box `low`, `high` (2,) [px].
 
         Its depth is that of its axis where that passes nearest to the pixel.
         """

@@ -1,4 +1,6 @@
-"""Markers: what each covers of the image, its paint in linear light, and the truth that a camera sees of it.
+"""Markers: pixel coverage, marker colour in linear light and ground truth.
+
+The ground truth is what a camera sees of each marker.
 
 Coverage is measured with everything nearer cut out, and the same coverage blends the paint into the image, so
 image and truth come from one drawing.
@@ -46,7 +48,10 @@ class MarkerView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painted:
-    """One marker of the hand in one frame: what it covers, and the moment of its row [s], scene time."""
+    """One marker of the hand in one frame: what it covers and the time of its row.
+
+    The time of its row is in [s], scene time.
+    """
 
     marker: int
     coverage: Coverage
@@ -59,7 +64,10 @@ Window: TypeAlias = tuple[int, int, int, int]  # x0, y0, x1, y1 [px]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covered:
-    """All that is painted in one frame: markers of the hand in the order of the rig, beads and tags of objects."""
+    """Everything painted in one frame.
+
+    Markers of the hand in the order of the rig, then beads and tags of objects.
+    """
 
     markers: tuple[Painted, ...]
     features: tuple[PaintedFeature, ...]
@@ -67,7 +75,10 @@ class Covered:
 
 
 class Painter:
-    """Paints the markers of one view. It holds prepared colours; every call is pure."""
+    """Renderer of the markers of one view.
+
+    It holds prepared colours; every call is pure.
+    """
 
     def __init__(self, view: View) -> None:
         """Prepare colours.
@@ -130,7 +141,10 @@ class Painter:
         return Covered(tuple(sorted(painted, key=lambda item: item.marker)), tuple(features), snapshot)
 
     def _places(self, snapshot: Snapshot, box_uv: Float) -> Places:
-        """Where the markers of the hand are, caps first, then boxes with these corners (B, 8, 2) [px]."""
+        """Return the positions of the markers of the hand, caps first, then boxes.
+
+        The boxes have the corners `box_uv` (B, 8, 2) [px].
+        """
         view = self._view
         boxes = [box.corners for box in view.surface.boxes]
         corners = snapshot.cap_uv, box_uv
@@ -147,7 +161,10 @@ class Painter:
         )
 
     def window(self, image: Image, group: list[AnyPainted], snapshot: Snapshot) -> tuple[int, int, Image]:
-        """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""
+        """Paint a group of markers and blur its window, all in linear light.
+
+        Returns where the window goes and its pixels.
+        """
         width, height = self._size
         x0 = max(min(p.coverage.x for p in group) - MARGIN_PX, 0)
         y0 = max(min(p.coverage.y for p in group) - MARGIN_PX, 0)
@@ -200,7 +217,10 @@ class Painter:
         return appearance
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:
-        """Markers whose windows touch, together; markers outside the image or hidden left out."""
+        """Group markers whose windows touch.
+
+        Markers that are outside the image or hidden are omitted.
+        """
         groups: list[tuple[Window, list[AnyPainted]]] = []
         for item in (*painted.markers, *painted.features):
             cover = item.coverage

@@ -1,4 +1,6 @@
-"""The six poses of the Digits study, one after another, with the palm turned every way: what occlusion is measured on.
+"""Six poses of the Digits study in sequence, with the palm rotated every way.
+
+Occlusion is measured on them.
 
 Open palm, counting two, pointing, small grasp, large grasp and pinch (Kim et al., "Digits", UIST 2012, poses A-F) in
 a new order each round; each is held for a while, in a place and with a turn of the palm of its own, with slow drift
@@ -19,7 +21,9 @@ REACH_M = np.array([0.05, 0.03, 0.05])  # half of the box that the palm's middle
 
 
 class StudyPoses:
-    """Six poses, four times in 60 s. The state it holds is its script, fixed by the constructor.
+    """Six poses, four times in 60 s.
+
+    The state it holds is its script, fixed by the constructor.
 
     Attributes:
         order: (ROUNDS * 6,) names of the poses, station by station.

@@ -1,4 +1,6 @@
-"""Polygons to pixels: capsules drawn with smooth edges, and the exact share of each pixel that a marker covers.
+"""Rasterisation of polygons: smooth-edged capsules and exact pixel coverage.
+
+The coverage is the exact share of each pixel that a marker covers.
 
 Pixel (0, 0) is the centre of the top-left pixel, in OpenCV's drawing as everywhere here.
 """
@@ -31,7 +33,10 @@ _MOMENTS = tuple((np.arange(n) + 0.5) / n - 0.5 for n in range(1, MAX_STEPS + 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """A convex outline in one image: corners (N, 2) [px] and how fast it moves (2,) [px/s]."""
+    """Convex outline in one image, with its velocity.
+
+    Corners (N, 2) [px]; velocity (2,) [px/s].
+    """
 
     corners: Float
     velocity: Float
@@ -74,7 +79,9 @@ class Coverage:
 
 
 def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
-    """Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2) joined by their outer tangents.
+    """Return the outlines of pairs of discs joined by their outer tangents.
+
+    Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2).
 
     Complex numbers are points of the plane: e^(i angle) turns by an angle, its powers walk along an arc.
     """
@@ -103,7 +110,10 @@ def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
 
 
 def discs(centre: Float, radius: Float, circle: Float) -> Float:
-    """Outlines (..., n, 2) [px] of discs about `centre` (..., 2), each a `circle` (n, 2) of that radius (...)."""
+    """Return the outlines of discs.
+
+    Outlines (..., n, 2) [px] about `centre` (..., 2), each a `circle` (n, 2) of that radius (...).
+    """
     points = _complex(centre)[..., None] + radius[..., None] * _complex(circle)
     return points.view(np.float64).reshape(*points.shape, 2)
 
@@ -130,7 +140,9 @@ def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
 
 
 def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -> list[Coverage]:
-    """Measure what each marker covers, by drawing at six times the resolution at each moment of the exposure.
+    """Measure the pixel coverage of each marker.
+
+    Each is drawn at six times the resolution at each moment of the exposure.
 
     Args:
         markers: Markers, each with what hides it.
@@ -203,7 +215,10 @@ def _covered(
 
 
 def moments(shape: Shape, exposure_s: float) -> Float:
-    """Moments (n,) of an exposure, from its middle [s], at which a shape is drawn: about one per pixel of way."""
+    """Return the moments of an exposure at which a shape is drawn.
+
+    Moments (n,) [s] from the middle of the exposure: about one per pixel of motion.
+    """
     way = hypot(*shape.velocity.tolist()) * exposure_s
     n = min(max(ceil(way / BLUR_STEP_PX), 1), MAX_STEPS)
     return _MOMENTS[n - 1] * exposure_s
@@ -226,7 +241,10 @@ def _complex(points: Float) -> Complex:
 
 
 def _inset(corners: Float, middle: Float, owner: Int) -> Float:
-    """Corners (N, 2) moved towards the middle of their shape `owner` (N,) by what the fill adds."""
+    """Move corners towards the centre of their shape by what the fill adds.
+
+    Corners (N, 2); `owner` (N,) is the index of each corner's shape.
+    """
     spread = corners - middle[owner]
     reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
     return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)

@@ -1,4 +1,6 @@
-"""Write a rendered sequence as a recording of raw frames with its exact truth, for the offline line and its tests.
+"""Export of a rendered sequence as a recording of raw frames with exact truth.
+
+It serves the offline pipeline and its tests.
 
 The form is that of every recording (recording.json, frames.csv, PNG files); the truth has the keys and conventions
 of rendered recordings: truth.npz, truth_meta.json.
@@ -50,7 +52,10 @@ class RenderedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """Truth of one row: every camera's view and its time of row 0 [s], and the scene at the reference time."""
+    """Ground truth of one row.
+
+    Every camera's view and its time of row 0 [s], and the scene at the reference time.
+    """
 
     views: tuple[MarkerView, ...]
     t_row0: tuple[float, ...]
@@ -59,7 +64,9 @@ class _Row:
 
 
 class SceneTake:
-    """What the cameras of a rig take of a scene, and its exact truth. It holds the truth of the frames taken so far.
+    """Frames that the cameras of a rig take of a scene, with the exact ground truth.
+
+    It holds the ground truth of the frames taken so far.
 
     Cameras run as the scene's timing says, all stamped on one clock. The reference time of a row is the middle
     of the exposure of the centre row of the rig's first camera.
@@ -91,7 +98,10 @@ class SceneTake:
         return self._start_s, self._start_s + (self.count - 1) * self._period_s + max(self._offsets)
 
     def manifest(self, continuous: bool = True) -> Manifest:
-        """What is rendered; the clicks are the exact centroids in the first frame of each camera."""
+        """Return the manifest of what is rendered.
+
+        The clicks are the exact centroids in the first frame of each camera.
+        """
         scene = self._scene
         clicks: dict[str, dict[str, tuple[float, float]]] = {}
         for name, renderer, offset in zip(scene.rig.cameras, self._renderers, self._offsets, strict=True):
@@ -146,7 +156,10 @@ class SceneTake:
         } | self._truth_of_objects()
 
     def _truth_of_objects(self) -> Arrays:
-        """Of every tracked object its poses, what each camera saw of its features, and the corners of its tags."""
+        """Return the ground truth of every tracked object.
+
+        Its poses, what each camera saw of its features, and the corners of its tags.
+        """
         arrays: Arrays = {}
         for name in self._scene.rig.objects:
             seen = [[view.objects[name] for view in row.views] for row in self._rows]
@@ -184,7 +197,9 @@ def record_scene(
     *,
     imu: bool = False,
 ) -> int:
-    """Render `seconds` of a scene with every camera of its rig; return the number of frames per camera.
+    """Render `seconds` of a scene with every camera of its rig.
+
+    Returns the number of frames per camera.
 
     Args:
         folder: New or empty.
@@ -244,7 +259,10 @@ def _period_s(scene: Scene) -> float:
 
 
 def named_angles(model: HandModel, angles_rad: Float) -> Float:
-    """Angles (21,) [rad] in the order of ANGLE_NAMES, of angles (5, 4): abduction there is from the palm's +z."""
+    """Return joint angles in the order of ANGLE_NAMES.
+
+    Angles (21,) [rad], of angles (5, 4), whose abduction is measured from the palm's +z.
+    """
     thumb = angles_rad[0]
     ahead = -model.rest_rotation[CHAINS[1:, 0], :, 2]
     spread = angles_rad[1:, 0] + model.side_sign * np.arctan2(ahead[:, 0], ahead[:, 2])

@@ -1,4 +1,6 @@
-"""Write one hand as marker cameras and its wrist device see it at the same time: one recording of kind `both`.
+"""Export of one hand seen by marker cameras and its wrist device simultaneously.
+
+The result is one recording of kind `both`.
 
 All frames are on one clock, in the order of their stamps, and so are the samples of the wrist device's IMU. The truth
 is that of a marker recording, and beside it that of a wrist recording, its keys prefixed with `wrist_`.
@@ -31,7 +33,9 @@ def record_both(
     step: int = 1,
     wrist_rig: RigCalibration | None = None,
 ) -> tuple[int, int]:
-    """Render `seconds` of two scenes of one motion; return the number of frames per marker camera, and of triples.
+    """Render `seconds` of two scenes of one motion.
+
+    Returns the number of frames per marker camera, and of strobe cycles.
 
     Args:
         folder: New or empty.

@@ -1,4 +1,6 @@
-"""Scene -> camera image: hand, paint, desk, card, blur and noise, with the truth of what each marker shows.
+"""Renderer from scene to camera image, with the truth of what each marker shows.
+
+It draws hand, paint, desk, card, blur and noise.
 
 Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look round;
 sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the light, where
@@ -36,7 +38,10 @@ BEND_COSINE = 0.6  # a finger bent more than this is drawn in two parts, each at
 
 
 class Renderer:
-    """Images of one scene by one camera. It holds prepared desk, noise and colours; a frame is a pure function of t."""
+    """Renderer of one scene as seen by one camera.
+
+    It holds prepared desk, noise and colours; a frame is a pure function of t.
+    """
 
     def __init__(self, scene: Scene, camera: str) -> None:
         """Prepare desk, noise and colour tables (some tenths of a second).
@@ -59,7 +64,9 @@ class Renderer:
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "Renderer":
-        """The same scene before a camera with other settings; shares all that was prepared.
+        """Return a renderer of the same scene for a camera with other settings.
+
+        It shares everything that was prepared.
 
         Args:
             exposure_us: Exposure [us], which smears what moves.
@@ -73,7 +80,10 @@ class Renderer:
         return other
 
     def render(self, t_s: float) -> Image:
-        """Image (H, W, 3) BGR of the frame whose row 0 is at mid-exposure at scene time `t_s` [s]."""
+        """Render the frame whose row 0 is at mid-exposure at scene time `t_s`.
+
+        Returns an image (H, W, 3) BGR; `t_s` in [s].
+        """
         return self._draw(t_s)[0]
 
     def visible_fraction(self, t_s: float) -> Float:
@@ -156,7 +166,10 @@ class Renderer:
         raster.fill(image, raster.fixed(face), light.face_shade(light.THING_LINEAR_RGB, cosine))
 
     def _draw_part(self, image: Image, part: SeenPart, snapshot: Snapshot) -> None:
-        """A part of a tracked object, as blurred by its motion as that is more than the hand's, which follows."""
+        """Draw a part of a tracked object, blurred by its motion if that is larger.
+
+        Larger than the motion of the hand, whose blur follows afterwards.
+        """
         own = part.shape.velocity
         speed = float(np.hypot(*own))
         smeared = float(np.hypot(*self._way(snapshot))) / self._view.exposure_s

@@ -1,4 +1,6 @@
-"""A hand that follows the guided routine as people do: late, at its own tempo, and never holding a joint quite still.
+"""Hand that follows the guided routine the way people do.
+
+It is late, at its own tempo, and never holds a joint quite still.
 
 The palm rests on something and faces the cameras, so that the finger tips are seen however the fingers bend.
 """
@@ -19,7 +21,10 @@ TILT_DEG = 15.0  # of the fingers towards the cameras
 
 
 class HandRoutine:
-    """The guided routine once. The state it holds is its script, fixed by the constructor."""
+    """One pass through the guided routine.
+
+    The state it holds is its script, fixed by the constructor.
+    """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int, rest: float = REST) -> None:
         """Write the script.

@@ -1,4 +1,4 @@
-"""A scene: hand, motion, occluders and cameras, as exact truth for every instant.
+"""Scene of hand, motion, occluders and cameras, with exact truth at every time.
 
 Every process that builds the scene from the same files and seed sees the same world: nothing in it remembers.
 """
@@ -29,7 +29,7 @@ APART_PPM = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTruth:
-    """Everything true of one instant.
+    """Complete ground truth of a scene at one time.
 
     Attributes:
         t_s: The instant [s], scene time.
@@ -54,7 +54,9 @@ class SceneTruth:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A dark card that passes between the cameras and the hand, once a period, at steady speed.
+    """Dark card that passes between the cameras and the hand, once a period.
+
+    It moves at steady speed.
 
     Attributes:
         middle_s: When its middle is before the reference point [s].
@@ -97,7 +99,10 @@ STANDARD_CARDS = (
 
 @dataclass(frozen=True, slots=True)
 class CameraTiming:
-    """How a camera's frames lie in time: start after the others [ns], rate of its clock [ppm]."""
+    """Timing of one camera's frames: start offset and clock rate.
+
+    Start after the others [ns], rate of its clock [ppm].
+    """
 
     start_offset_ns: int
     clock_ppm: float
@@ -151,7 +156,9 @@ class Scene:
         seed: int = STANDARD_SEED,
         objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
-        """The standard scene of demo and benchmarks: every motion in each half of 60 s, two occlusion gaps.
+        """Create the standard scene of demo and benchmarks.
+
+        Every motion in each half of 60 s, two occlusion gaps.
 
         Raises:
             CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger; an object
@@ -172,7 +179,10 @@ class Scene:
         seed: int = STANDARD_SEED,
         objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
-        """A scene without occluders around any motion, such as one that follows a recording."""
+        """Create a scene without occluders for any motion.
+
+        For example a motion that follows a recording.
+        """
         model, centre = HandModel.of(hand), view_centre(rig)
         return cls(rig, cameras, model, motion, centre, (), seed, objects=objects or {})
 
@@ -202,11 +212,17 @@ class Scene:
         return self.tracked.poses(state, self.centre_m)
 
     def untracked(self, state: HandState) -> tuple[Cylinder, ...]:
-        """Things that are not tracked: a tracked object is in the place of the thing that the hand takes."""
+        """Return the things that are not tracked.
+
+        A tracked object takes the place of the thing that the hand takes.
+        """
         return state.things[len(self.rig.objects) :]
 
     def _marker_points(self, joints: HandJoints, poses: tuple[Float, ...]) -> Float:
-        """Centroids (M, 3) [m] of all markers of the rig; NaN for a free one that is on no object."""
+        """Return the centroids of all markers of the rig.
+
+        Shape (M, 3) [m]; NaN for a free marker that is on no object.
+        """
         if not self.rig.free_markers:
             return self.model.marker_points(joints, self.rig.markers)
         points = np.full((len(self.rig.markers), 3), np.nan)
@@ -217,7 +233,7 @@ class Scene:
         return points
 
     def joints(self, times_s: tuple[float, ...]) -> HandJoints:
-        """Joints at several instants at once, stacked along the first axis."""
+        """Return the joints at several times, stacked along the first axis."""
         states = [self.motion.at(t) for t in times_s]
         return self.model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
@@ -230,12 +246,18 @@ class Scene:
         return tuple(quad for quad in corners if quad is not None)
 
     def timing(self, camera: str) -> CameraTiming:
-        """How the standard scene runs its cameras: each 5 ms after the one before, clocks 50 ppm apart."""
+        """Return the timing of a camera in the standard scene.
+
+        Each camera is 5 ms after the one before, clocks 50 ppm apart.
+        """
         place = self.rig.cameras.index(camera)
         return CameraTiming(place * LATE_NS, place * APART_PPM)
 
 
 def view_centre(rig: RigCalibration) -> Float:
-    """Middle of the scene (3,) [m], rig frame: before the rig's first two cameras, at the hand's working distance."""
+    """Return the centre of the scene in the rig frame.
+
+    Shape (3,) [m]: in front of the rig's first two cameras, at the hand's working distance.
+    """
     centres = np.stack([rig.camera_pose(name)[:3, 3] for name in rig.cameras[:2]])
     return centres.mean(axis=0) + np.array([0.0, 0.01, HAND_DEPTH_M])

@@ -35,11 +35,12 @@ def scene_by_name(
     seed: int,
     objects: Mapping[str, ObjectProfile] | None = None,
 ) -> Scene:
-    """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
-    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
-    that travels (`object`), one that moves as before a wrist
-    device at the same time (`TOGETHER`), or one that follows a recorded motion. `objects` are the files of the
-    objects that the rig names (`common.sim.tracked`).
+    """Return the scene of the given name.
+
+    `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a hand that
+    follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object that travels
+    (`object`), one that moves as in front of a wrist device at the same time (`TOGETHER`), or one that follows a
+    recorded motion. `objects` are the files of the objects that the rig names (`common.sim.tracked`).
 
     Raises:
         PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot be read.
@@ -78,8 +79,10 @@ def view_by_name(
     seed: int,
     objects: Mapping[str, ObjectProfile] | None = None,
 ) -> Scene | BoardScene | WristScene:
-    """What a simulated camera may look at: a scene with a hand, that of a wrist rig where the rig is one, `board`, a
-    checkerboard to calibrate cameras with, or `card`, a painted card to calibrate the depth of a pair with.
+    """Return the scene of the given name that a simulated camera looks at.
+
+    A scene with a hand, that of a wrist rig where the rig is one, `board`, a checkerboard to calibrate cameras with,
+    or `card`, a painted card to calibrate the depth of a pair with.
 
     Raises:
         PhalanxError: As `scene_by_name`; the scene is none of this kind of rig.
@@ -102,7 +105,9 @@ def renderer_of(
 def renderer_of(
     scene: Scene | BoardScene | WristScene, camera: str, *, live: bool = False
 ) -> Renderer | BoardRenderer | WristRenderer:
-    """What draws the scene as one camera sees it; that of a wrist scene is told what lights each frame.
+    """Return the renderer of the scene for one camera.
+
+    The renderer of a wrist scene also takes the illumination of each frame.
 
     Args:
         scene: What the camera looks at.

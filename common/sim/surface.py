@@ -1,4 +1,4 @@
-"""The skin and paint of a simulated hand, as few points as a fast renderer can live with.
+"""Skin and paint of a simulated hand, as few points as a fast renderer needs.
 
 The hand is spheres joined to tapered capsules (phalanges) and hulls (palm, thumb web, sleeve). All places that
 move are *key points* of one array, so that a camera can bring each to the moment at which its own row is exposed.
@@ -45,7 +45,10 @@ _JOINTS, _AXES, _PALM = _UNIT_ROWS[:20], _UNIT_ROWS[20:80].reshape(20, 3, 83), _
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cap:
-    """A painted finger end: marker index, finger, radius [m]; key points of sphere centre and base centre."""
+    """Painted finger end.
+
+    Marker index, finger, radius [m]; key points of sphere centre and base centre.
+    """
 
     marker: int
     finger: int
@@ -56,7 +59,10 @@ class Cap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """A painted box: marker index and its eight key points, top four (in ring order) first."""
+    """Painted box: marker index and its eight key points.
+
+    The four top key points (in ring order) come first.
+    """
 
     marker: int
     corners: slice
@@ -86,7 +92,9 @@ class HandSurface:
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
-        """Lay out the key points of a hand with these markers, without those of them that sit on no hand.
+        """Lay out the key points of a hand with these markers.
+
+        Markers that sit on no hand are omitted.
 
         Raises:
             CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
@@ -120,7 +128,10 @@ class HandSurface:
         return cls(radius, tuple(caps), tuple(boxes), table[:, :80].copy(), table[:, 80:].copy())
 
     def key_points(self, T_rig_palm: Float, chains: Chains) -> Float:
-        """Key points (..., K, 3) [m], rig frame, of palm poses (..., 4, 4) and bent fingers."""
+        """Return the key points of a hand in the rig frame.
+
+        Key points (..., K, 3) [m], of palm poses (..., 4, 4) and flexed fingers.
+        """
         R, (cuff, end) = np.swapaxes(T_rig_palm[..., :3, :3], -1, -2), SLEEVE_SPHERES
         points = (self.weights @ _chain_rows(chains) + self.still) @ R
         way = unit(points[..., end, :] + TO_ELBOW)
@@ -130,7 +141,10 @@ class HandSurface:
 
 
 def _chain_rows(chains: Chains) -> Float:
-    """Positions [m], then axes, of the joints of all chains, finger by finger (..., 80, 3), palm frame."""
+    """Return the positions, then the axes, of the joints of all chains.
+
+    Finger by finger (..., 80, 3), positions in [m], palm frame.
+    """
     batch = chains.position_m.shape[:-3]
     axes = np.swapaxes(chains.rotation, -1, -2)
     return np.concatenate([chains.position_m.reshape(*batch, 20, 3), axes.reshape(*batch, 60, 3)], axis=-2)
@@ -167,12 +181,18 @@ def _sphere_radii(model: HandModel) -> Float:
 
 
 def cap_centroid_ahead(radius_m: float) -> float:
-    """Distance [m] of the painted surface's centroid ahead of the sphere's centre: the middle of [-0.7 R, R]."""
+    """Return how far the painted surface's centroid is ahead of the sphere's centre.
+
+    Distance [m]: the middle of [-0.7 R, R].
+    """
     return 0.5 * (1.0 - CYLINDER_SHARE) * radius_m
 
 
 def box_corners() -> Float:
-    """Corners (8, 3) [m] around the area centroid of top and sides; palm axes, top ring first."""
+    """Return the corners of a box around the area centroid of its top and sides.
+
+    Shape (8, 3) [m]; palm axes, top ring first.
+    """
     x, y, z = BOX_M
     top, sides = x * z, 2.0 * (x + z) * y
     above = sides * 0.5 * y / (top + sides)  # the top lies this far above the centroid
@@ -181,7 +201,9 @@ def box_corners() -> Float:
 
 
 def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> Float:
-    """Points (C, 2 n, 3) whose projections' convex hull is exactly the outline of a cap each; camera frame.
+    """Return points whose projections' convex hull is the outline of a cap.
+
+    Points (C, 2 n, 3), camera frame; the hull is exactly the outline of each cap.
 
     Args:
         centre: Sphere centres (C, 3) [m]; base: centres of the rims (C, 3) [m].

@@ -1,4 +1,7 @@
-"""Printed tags in a picture: ink on paper, in linear light, as it looks over a box of pixels while it moves."""
+"""Printed tags in an image: ink on paper, in linear light, blurred by motion.
+
+The appearance is that over a box of pixels while the tag moves.
+"""
 
 from functools import cache
 
@@ -30,7 +33,9 @@ def printed(family: TagFamily, number: int) -> Image:
 
 
 def sheet_appearance(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int, int]) -> Float32:
-    """Linear light (h, w, 3), blue first, of a tag over a box of pixels x0, y0, x1, y1, as if it filled it.
+    """Return the linear light of a tag over a box of pixels, as if it filled it.
+
+    Shape (h, w, 3), blue first; box x0, y0, x1, y1.
 
     Args:
         seen: The tag.

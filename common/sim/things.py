@@ -1,4 +1,7 @@
-"""Things that a hand takes, as one camera sees them: outlines, light, and how far away they are behind each pixel."""
+"""Things that a hand takes, as one camera sees them.
+
+Outlines, light, and the depth of each behind each pixel.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,7 +49,9 @@ class SeenThing:
 
 
 def tube_rims(centre: Float, axis: Float, radius_m: float, to_light: Float, circle: Float) -> Float:
-    """Edges (LAYERS, n, 3) [m] of a tube's shading where it is cut at `centre`: its own, then where it is lit more.
+    """Return the edges of a tube's shading where it is cut at `centre`.
+
+    Edges (LAYERS, n, 3) [m]: the tube's own edge, then those where it is lit more.
 
     Args:
         centre: (3,) [m]; axis: unit vector (3,) of the tube.

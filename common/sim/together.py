@@ -53,7 +53,9 @@ MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
 def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """The motion of that name (`TOGETHER`) about a place (3,) [m], rig frame; None: there is no such.
+    """Return the motion of the given name about a centre, or None if there is none.
+
+    Names are those of `TOGETHER`; the centre is (3,) [m], rig frame.
 
     The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the bend of
     the wrist and the shifts are the same.
@@ -74,7 +76,10 @@ def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> 
 
 
 class FlexedWrist:
-    """A motion, and a wrist that bends as in normal use while it goes on. It holds which way, from its seed."""
+    """Motion during which the wrist also flexes as in normal use.
+
+    The seed decides which way the wrist bends, and the object holds it.
+    """
 
     def __init__(self, motion: HandMotion, seed: int) -> None:
         """Of a motion with the usual period."""
@@ -93,7 +98,10 @@ class FlexedWrist:
 
 
 class Curls:
-    """All fingers curl and stretch, six times a minute, while the palm slowly turns. It holds its script."""
+    """All fingers curl and stretch periodically while the palm slowly rotates.
+
+    Six times a minute. It holds its script.
+    """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
@@ -125,7 +133,10 @@ class Curls:
 
 
 class Travel:
-    """The hand goes to and fro, ten ways a minute, and its fingers move slowly. It holds its script."""
+    """The hand moves to and fro while its fingers move slowly.
+
+    Ten ways a minute. It holds its script.
+    """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
@@ -159,7 +170,10 @@ class Travel:
 
 
 class Moves:
-    """Ten seconds of everything that a mounting shows itself in. It holds its script, fixed by the constructor."""
+    """Ten seconds of all motions that reveal the mounting.
+
+    It holds its script, fixed by the constructor.
+    """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""

@@ -1,4 +1,6 @@
-"""Tracked objects of a scene: where each is at an instant, which of its points a camera can find, and their truth.
+"""Tracked objects of a scene: poses, detectable points and ground truth.
+
+Where each object is at a given time, and which of its points a camera can find.
 
 The first object of a rig is what the motion moves: the one that travels (`travel`), or the thing that the hand takes,
 in whose place it then is. Any other, and all of them in a scene that moves none, stand still beside the hand.
@@ -24,7 +26,10 @@ _FACING = np.array(
 
 
 def facing(tilt_rad: float) -> Float:
-    """Rotation (3, 3), object -> rig: its y axis points to the cameras, its z to the left, raised by a tilt [rad]."""
+    """Return the rotation of an object whose y axis points to the cameras.
+
+    Rotation (3, 3), object -> rig; its z axis points to the left, raised by a tilt [rad].
+    """
     return np.asarray(axis_rotation(2, tilt_rad) @ _FACING)
 
 
@@ -62,7 +67,10 @@ class TrackedObjects:
         return cls(tuple(profiles), beads)
 
     def poses(self, state: HandState, centre_m: Float) -> tuple[Float, ...]:
-        """`T_rig_object` (4, 4) [m] of each, of a scene whose middle is at (3,) [m], rig frame."""
+        """Return the pose `T_rig_object` of each object.
+
+        Poses (4, 4) [m], of a scene whose centre is at (3,) [m], rig frame.
+        """
         moved = state.objects or tuple(thing.T_rig_object for thing in state.things)
         return tuple(
             moved[k] if k < len(moved) else resting_pose(k, centre_m) for k in range(len(self.profiles))
@@ -76,6 +84,9 @@ class TrackedObjects:
 
 
 def resting_pose(which: int, centre_m: Float) -> Float:
-    """Pose (4, 4) [m], rig frame, of the object of that number where nothing moves it."""
+    """Return the rest pose of an object, where nothing moves it.
+
+    Pose (4, 4) [m], rig frame, of the object of that number.
+    """
     side = np.array([-1.0 if which % 2 == 0 else 1.0, 1.0 if which % 4 < 2 else -1.0, 1.0])
     return rigid(facing(TILT_RAD), centre_m + side * RESTING_M)

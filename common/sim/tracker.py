@@ -1,4 +1,6 @@
-"""A Vive tracker on a simulated object: what base stations would say of it, in a frame of their own, y up.
+"""Vive tracker on a simulated object.
+
+It reports what base stations would measure, in a frame of their own, y up.
 
 Where T_rig_tracking and T_object_tracker are not measured yet they are as somebody would have set them up, so that the
 procedure that measures them has something to find. The noise is that of Lighthouse: 0.3 mm and 0.05 degrees that
@@ -32,7 +34,9 @@ SET_UP_TRACKER = rigid(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTracker:
-    """What a tracker says at any moment of a scene. Pure in time: the same seed says the same.
+    """Simulated tracker that reports its pose at any time of a scene.
+
+    Pure in time: the same seed gives the same reports.
 
     Attributes:
         scene: What happens.
@@ -50,7 +54,9 @@ class SimulatedTracker:
 
     @classmethod
     def of(cls, scene: Scene, profile: ObjectProfile, seed: int) -> "SimulatedTracker":
-        """That of an object of the scene's rig, where its files say that it sits.
+        """Create the tracker of an object of the scene's rig.
+
+        It sits where the files of the rig and the object state.
 
         Raises:
             CalibrationError: The scene does not know the object.
@@ -60,7 +66,10 @@ class SimulatedTracker:
         return cls(scene, profile.name, tracking_of(scene.rig), tracker_of(profile), seed)
 
     def pose(self, t_s: float) -> Float | None:
-        """`T_tracking_device` (4, 4) [m] at a time of the scene [s]; None: it sees no base station."""
+        """Return the pose `T_tracking_device` of the tracker at a time of the scene.
+
+        Shape (4, 4) [m], time in [s]; None: it sees no base station.
+        """
         phase = np.random.default_rng([self.seed, 5]).uniform(0.0, HIDDEN_EVERY_S)
         if (t_s + phase) % HIDDEN_EVERY_S < HIDDEN_S:
             return None
@@ -81,11 +90,17 @@ class SimulatedTracker:
 
 
 def tracking_of(rig: RigCalibration) -> Float:
-    """`T_rig_tracking` (4, 4) of a rig's file, or that of a simulated rig where it is not measured yet."""
+    """Return `T_rig_tracking` of a rig's file, or a simulated one.
+
+    Shape (4, 4); that of a simulated rig where it is not measured yet.
+    """
     return SET_UP_TRACKING if rig.T_rig_tracking is None else np.array(rig.T_rig_tracking, dtype=np.float64)
 
 
 def tracker_of(profile: ObjectProfile) -> Float:
-    """`T_object_tracker` (4, 4) of an object's file, or that of a simulated object where it is not measured yet."""
+    """Return `T_object_tracker` of an object's file, or a simulated one.
+
+    Shape (4, 4); that of a simulated object where it is not measured yet.
+    """
     mounted = profile.T_object_tracker
     return SET_UP_TRACKER if mounted is None else np.array(mounted, dtype=np.float64)

@@ -1,4 +1,6 @@
-"""A tracked object that travels and turns freely at half a metre, beside a hand: what object tracking is measured on.
+"""Tracked object that travels and rotates freely at half a metre, beside a hand.
+
+Object tracking is measured on it.
 
     0 - 12 s    wanders and turns at once, about all axes
     12 - 15 s   rests
@@ -47,7 +49,10 @@ CARDS = (Card(middle_s=40.0, width_m=0.09, top_m=-0.40, bottom_m=0.005, depth_m=
 
 
 class ObjectTravel:
-    """The motion of object and hand. The state it holds is its script, fixed by the constructor."""
+    """Motion of a travelling object and the hand.
+
+    The state it holds is its script, fixed by the constructor.
+    """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand and an object about a place (3,) [m]; the same seed, the same motion."""

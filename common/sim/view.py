@@ -1,4 +1,6 @@
-"""The scene in front of one camera at one frame: every part where it is when its own row is exposed.
+"""Scene in front of one camera at one frame.
+
+Every part is where it is when its own row is exposed.
 
 Rolling shutter: the middle of the exposure of row v is `t + v row_time`, so a part's place and its row are found
 together, by two rounds of projecting and moving (the hand moves far less than a row per row time). Between three
@@ -50,7 +52,9 @@ _PALM, _WEB, _CUFF, _ELBOW = list(PALM_HULL), list(WEB_HULL), *SLEEVE_SPHERES
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """One frame's geometry, every part at the moment of its row. C caps in the order of `HandSurface.caps`.
+    """Geometry of one frame, with every part at the moment of its row.
+
+    C caps in the order of `HandSurface.caps`.
 
     Attributes:
         points: (K, 3) key points [m], camera frame.
@@ -93,7 +97,10 @@ class Snapshot:
 
 
 class View:
-    """Projects one scene into one camera. It holds what never changes; every call is pure."""
+    """Projection of one scene into one camera.
+
+    It holds what never changes; every call is pure.
+    """
 
     def __init__(self, scene: Scene, camera: str) -> None:
         """Prepare.
@@ -145,7 +152,10 @@ class View:
         return other
 
     def project(self, points: Float) -> Float:
-        """Pixels (..., 2) of points (..., 3) [m] in the camera frame; what is too near or far out is held there."""
+        """Project points in the camera frame to pixels.
+
+        Points (..., 3) [m] to pixels (..., 2); points too near or too far outside are clamped there.
+        """
         uv = self.optics.distort(points[..., :2] / np.maximum(points[..., 2:], NEAREST_M))
         return np.minimum(np.maximum(uv, -FURTHEST_PX), FURTHEST_PX)
 
@@ -198,13 +208,19 @@ class View:
         )
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
-        """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
+        """Return the outline of the last phalanx where it lies in front of its own cap.
+
+        For cap number `cap`: this is so where the finger points away; None otherwise.
+        """
         if not snapshot.from_behind[cap]:
             return None
         return Shape(raster.hull(snapshot.rim_uv[cap]), snapshot.speed_uv[self.cap_base[cap]])
 
     def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
-        """Whether the plane of the palm passes between the camera and points (..., 3) [m], camera frame."""
+        """Check whether the plane of the palm passes between the camera and points.
+
+        Points (..., 3) [m], camera frame.
+        """
         normal, offset = _palm_plane(snapshot)
         # The plane meets the ray at (offset / (normal . p)) p: before p if that factor is between 0 and 1.
         along = points @ normal
@@ -225,7 +241,11 @@ class View:
         return tuple(shapes)
 
     def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float, tuple[Cylinder, ...]]:
-        """Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,); things in the middle of them."""
+        """Return the key points, each at its own moment, with pixels and speeds.
+
+        Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,); also the things, halfway through
+        these moments.
+        """
         readout_s = self.optics.height_px * self.row_s
         t_middle = t_s + 0.5 * readout_s
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
@@ -253,7 +273,10 @@ class View:
         return np.concatenate([hand, self.objects.key_points(poses)], axis=1)
 
     def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
-        """Each thing at the moment of the row of its middle; `things` is where they are halfway through the frame."""
+        """Return each thing at the moment of the row of its centre.
+
+        `things` is where they are halfway through the frame.
+        """
         views: list[SeenThing] = []
         for k, thing in enumerate(things):
             middle = transform(self.T_camera_rig, thing.T_rig_object[:3, 3])
@@ -263,7 +286,10 @@ class View:
         return tuple(views)
 
     def _cuff(self, points: Float) -> Float:
-        """Front edges (LAYERS, n, 3) of the sleeve's shading, the first the sleeve's own edge."""
+        """Return the front edges of the sleeve's shading.
+
+        Shape (LAYERS, n, 3); the first is the sleeve's own edge.
+        """
         start, end = points[SLEEVE_SPHERES[0]], points[SLEEVE_SPHERES[1]]
         radius = float(self.surface.radius_m[SLEEVE_SPHERES[0]])
         return tube_rims(start, unit(start - end), radius, self.to_light, self.circle)
@@ -283,13 +309,19 @@ def _hulls(discs: Float) -> tuple[Float, ...]:
 
 
 def _looks_into(cuff: Float, end: Float) -> bool:
-    """Whether a camera sees the opening of a sleeve from `cuff` to `end` (3,) [m], camera frame, not its side."""
+    """Check whether a camera sees the opening of a sleeve, not its side.
+
+    The sleeve goes from `cuff` to `end` (3,) [m], camera frame.
+    """
     along = end - cuff
     return float(along @ cuff) > INTO_COSINE * float(np.linalg.norm(along) * np.linalg.norm(cuff))
 
 
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
-    """Normal (3,) and offset of the plane through wrist, index and little knuckle, camera frame."""
+    """Return the plane through the wrist, index knuckle and little knuckle.
+
+    Normal (3,) and offset, camera frame.
+    """
     wrist, index, little = snapshot.points[20], snapshot.points[4], snapshot.points[16]
     (ax, ay, az), (bx, by, bz) = index - wrist, little - wrist
     normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -1,4 +1,6 @@
-"""A checkerboard before the camera of a wrist device, held in one place after another: ambient, laser and LED frames.
+"""Checkerboard in front of a wrist device's camera, in one place after another.
+
+It is held in each place; the frames are ambient, laser and LED.
 
 For the calibration of a wrist device without hardware. The board is flat, exact and white paper (Lambert); a wall
 stands behind it. Light falls off as it does: LEDs with the square of the distance, with the cosine on the paper and
@@ -90,7 +92,9 @@ def board_poses(
     count: int,
     seed: int,
 ) -> Float:
-    """Poses (count, 4, 4) as a person shows them: whole in the image, near and far, tilted, crossed by the laser.
+    """Return board poses as a person shows them.
+
+    Shape (count, 4, 4): whole in the image, near and far, tilted, crossed by the laser.
 
     Without a plane they are anywhere in the image.
 
@@ -121,13 +125,19 @@ def board_poses(
 
 
 def _crossed(points: Float, plane: LaserPlane) -> float:
-    """How far points (n, 3) reach to both sides of a plane, the lesser of the two [m]."""
+    """Return how far points reach to both sides of a plane, the lesser of the two.
+
+    Points (n, 3), result in [m].
+    """
     side = points @ np.array(plane.normal) - plane.offset_m
     return float(min(side.max(), -side.min()))
 
 
 class WristBoardRenderer:
-    """Images of a scene. It holds the rays of every fine pixel; an image is a pure function of pose and light."""
+    """Renderer of a board scene for the wrist camera.
+
+    It holds the rays of every fine pixel; an image is a pure function of pose and light.
+    """
 
     def __init__(self, scene: WristBoardScene) -> None:
         """Prepare the rays.
@@ -218,7 +228,10 @@ class WristBoardRenderer:
         )
 
     def _exposed(self, light: Float32, pose: int, lit: Illumination) -> Image:
-        """What the sensor makes of it: blur of the lens, noise of photons and of reading, 8 bits."""
+        """Convert light to a sensor image.
+
+        Blur of the lens, noise of photons and of reading, 8 bits.
+        """
         import cv2
 
         blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), LENS_SIGMA_PX), np.float64)
@@ -234,7 +247,7 @@ def record_wrist_board(
     rig: RigCalibration | None = None,
     illuminations: tuple[Illumination, ...] = ILLUMINATIONS,
 ) -> int:
-    """Render every pose as one strobed triple; return the number of poses.
+    """Render every pose as one strobe cycle and return the number of poses.
 
     Args:
         folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.

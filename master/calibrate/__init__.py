@@ -1,1 +1,4 @@
-"""Calibrations: pure fits, observations -> (value, residual), and the thin commands around them."""
+"""Calibrations: pure fits and the thin commands around them.
+
+A fit maps observations -> (value, residual).
+"""

@@ -48,7 +48,10 @@ class LaserLine:
 
 
 class LaserIntersection:
-    """Cuts the fingers of one hand with the laser of one device. What it holds was prepared by the constructor."""
+    """Intersection of one hand's fingers with one device's laser.
+
+    Its state was prepared by the constructor.
+    """
 
     def __init__(self, setup: WristSetup, rays: int = RAYS) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
@@ -61,7 +64,9 @@ class LaserIntersection:
         return other
 
     def __call__(self, angles_rad: Float) -> tuple[Float, Float, Float]:
-        """Laser points (5, C, A, 2) [m] of angles (C, A, 5, 4), and where on the finger they lie.
+        """Return the laser points for joint angles and their places on the fingers.
+
+        Points (5, C, A, 2) [m] of angles (C, A, 5, 4).
 
         Returns:
             As of `LaserLine`: points, lengths (5, C, A), places (5, C, A).
@@ -76,7 +81,10 @@ class LaserIntersection:
         )
 
     def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> LaserLine:
-        """The line on fingers with spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...)."""
+        """Compute the laser line on fingers given as spheres.
+
+        Spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...).
+        """
         batch, spheres = spheres.shape[:-2], spheres.reshape(-1, *spheres.shape[-2:])
         radius = np.broadcast_to(radius, (*batch, spheres.shape[1])).reshape(-1, spheres.shape[1])
         thumb = np.broadcast_to(thumb, batch).ravel()
@@ -123,7 +131,9 @@ class LaserIntersection:
         return np.sin(angle) * across + np.cos(angle) * along
 
     def _tangents(self, spheres: Float, radius: Float, known: Float) -> tuple[Float, Float]:
-        """Turns (N,) [rad] of the first and the last ray of the plane that touches a finger; 0 where none does.
+        """Return the angles (N,) [rad] of the first and last rays that touch a finger.
+
+        Rays in the plane; 0 where none does.
 
         The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its quadric
         (`common.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
@@ -139,7 +149,10 @@ class LaserIntersection:
         return np.nan_to_num(low), np.nan_to_num(high)
 
     def _sides(self, known: Float) -> tuple[Float, Float]:
-        """Turns (K - 1, N) of both rays that touch the side of each cone; NaN where none does."""
+        """Return the angles (K - 1, N) of both rays that touch the side of each cone.
+
+        NaN where none does.
+        """
         d2, k0, lean, shift = known[6:10]
         axis = np.tensordot(self._axes.axes, known[:3], 1)  # (2, K - 1, N): across, along
         slope = d2 * np.tensordot(self._axes.axes, known[3:6], 1) + lean * axis
@@ -163,13 +176,19 @@ def _known(chain: Capsules, origin: Float) -> Float:
 
 
 def _hits(known: Float, rays: Float) -> Float:
-    """How far along rays (3, R, N) cones of these terms (12, K - 1, N) begin (K - 1, R, N); inf: missed."""
+    """Return how far along the rays (3, R, N) the cones begin.
+
+    Cones of terms (12, K - 1, N); result (K - 1, R, N); inf: missed.
+    """
     hits: Float = first_hits(known[:, :, None], rays[:, None])
     return hits
 
 
 def _seen_part(here: Float, there: Float) -> tuple[Float, Float]:
-    """From where to where (...) chords are seen whose ends are seen as clearly as that (above 0, or not at all)."""
+    """Return the visible section (...) of chords from the clearance at their ends.
+
+    The section's first and last place; an end is visible where its clearance is above 0.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         gone = here / (here - there)
     edges = (here > 0.0) != (there > 0.0)
@@ -186,7 +205,7 @@ def _at_edge(
     before: Float,
     from_camera: Float,
 ) -> None:
-    """Let chords that another part of the finger cuts off end at the edge of that part.
+    """Clip occluded chords at the edge of the occluding part of the finger.
 
     Args:
         first, last: (R - 1, N) seen part of each chord, which is changed.
@@ -216,7 +235,9 @@ def _at_edge(
 
 
 def _depths(known: Float, rays: Float) -> tuple[Float, Float]:
-    """How deep rays (3, M) pass into both spheres and the side of cones of terms (12, M), below 0: beside them (3, M).
+    """Return the depths at which rays pass into both spheres and the side of cones.
+
+    Rays (3, M), cones of terms (12, M), depths (3, M); below 0: beside them.
 
     Also the feet (M,) of their hits of the side, as in `common.tapered_capsules`.
     """

@@ -1,4 +1,7 @@
-"""Out of a calibration tree, and into it: which rig file gets a result, where it comes from, the file whole or not."""
+"""Reading from and writing to a calibration tree.
+
+Which rig file gets a result, and where it comes from. A file is written whole or not at all.
+"""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,7 +41,9 @@ def load_marker_rig(calibration: Path, name: str) -> RigCalibration:
 
 
 def rig_in_tree(out: Path | None, file_name: str, rig: RigCalibration) -> RigCalibration:
-    """The rig file that gets a result: the one in the tree `out` where there is one, else `rig` itself.
+    """Return the rig file that gets a result.
+
+    The one in the tree `out` where there is one, else `rig` itself.
 
     Raises:
         CalibrationError: The one in `out` is broken, or has other cameras, or another first one.

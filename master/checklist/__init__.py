@@ -1,1 +1,4 @@
-"""What is not as it should be, from what all processes say: one list for people and programs (docs/checklist.md)."""
+"""Checklist of current problems, from what all processes report.
+
+One list for people and programs (docs/checklist.md).
+"""

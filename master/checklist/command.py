@@ -1,4 +1,7 @@
-"""`phalanx check`: the checklist of a running master in the terminal; the exit code says whether all is well."""
+"""`phalanx check`: the checklist of a running master in the terminal.
+
+The exit code states whether all is well.
+"""
 
 from argparse import Namespace
 
@@ -13,7 +16,7 @@ ANSWER_S = 3.0  # a master tells once a second
 
 
 def check(options: Namespace) -> int:
-    """Print what is not as it should be; exit code 1 if there is anything, 0 if all is well."""
+    """Print current problems; return exit code 1 if there is any, else 0."""
     items: tuple[CheckItem, ...] = ()
     connection = join_bus(options.bus, options.site)
     try:

@@ -1,4 +1,7 @@
-"""What the checklist is made from: how things were planned (the files), and how the master finds them at one look."""
+"""Inputs of the checklist: the plan and the present state.
+
+How things were planned (the files), and how the master finds them at one look.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,7 +49,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class SenderNow:
-    """One camera or IMU, as the master hears it.
+    """State of one camera or IMU, as received by the master.
 
     Attributes:
         connected: Received within the last second.
@@ -89,7 +92,7 @@ class MasterNow:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What one rule says of one subject at one look.
+    """Verdict of one rule on one subject at one look.
 
     Attributes:
         code, subject, sentence, fix: As of `CheckItem`.
@@ -118,12 +121,15 @@ class Verdict:
         return not self.markers or not other.markers or bool({*self.markers} & {*other.markers})
 
     def item(self) -> CheckItem:
-        """As it is told."""
+        """Return the verdict as a published checklist item."""
         return CheckItem(self.code, self.subject[:64], self.sentence[:500], self.fix[:500])
 
 
 def beyond(value: float, show: float, clear: float) -> bool | None:
-    """Whether `value` is above `show` (wrong) or below `clear` (well); between them nothing changes."""
+    """Compare `value` with two thresholds, with hysteresis.
+
+    Above `show`: wrong; below `clear`: well; between them nothing changes.
+    """
     return True if value >= show else False if value < clear else None
 
 

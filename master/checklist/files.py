@@ -1,4 +1,7 @@
-"""What is wrong with the calibration files as they are on the disk: missing, or older than what they rest on."""
+"""Problems of the calibration files on the disk.
+
+Missing, or older than what they rest on.
+"""
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime, timedelta
@@ -19,7 +22,10 @@ PartT = TypeVar("PartT", bound=Struct)
 
 
 class FileMonitor:
-    """Looks at the files of the rigs that run. Holds how they were, and what was wrong with them."""
+    """Monitor of the files of the running rigs.
+
+    Holds how they were, and what was wrong with them.
+    """
 
     def __init__(self, calibration: Path, rigs: tuple[str, ...]) -> None:
         """Watch these rigs of a calib_json tree, and what they name."""
@@ -125,7 +131,10 @@ _NEEDS_LENS = {
 
 
 def _older(part: Provenance | None, base: Provenance | None) -> bool:
-    """Whether `part` was measured before `base`, on which it rests; of a part without a date nothing is known."""
+    """Return true if `part` was measured before `base`, on which it rests.
+
+    Of a part without a date nothing is known.
+    """
     if part is None or base is None:
         return False
     return datetime.fromisoformat(part.date) + TOGETHER < datetime.fromisoformat(base.date)

@@ -1,4 +1,7 @@
-"""What the master hears, or does not: senders that are away, lost datagrams, clocks, rates. And its disk."""
+"""Rules on the links of the master, and on its disk.
+
+Senders that are away, lost datagrams, clocks, rates.
+"""
 
 from collections.abc import Iterator
 
@@ -23,7 +26,7 @@ RESERVE_MB, RESERVE_WELL_MB = 200.0, 250.0  # as much as a recording leaves free
 
 
 class _Received:
-    """How one sender was heard so far."""
+    """Reception history of one sender so far."""
 
     def __init__(self) -> None:
         self.since_ns: int | None = None  # connected since
@@ -53,10 +56,13 @@ class _Received:
 
 
 class LinkRules:
-    """Push machine. Holds when the first look was, and how each sender was heard."""
+    """Push machine of the link rules.
+
+    Holds when the first look was, and how each sender was received.
+    """
 
     def __init__(self) -> None:
-        """Nobody was heard yet."""
+        """Start with no sender received."""
         self._first_ns: int | None = None
         self._started_ns: int | None = None
         self._received: dict[str, _Received] = {}
@@ -92,7 +98,7 @@ class LinkRules:
             yield disk_verdict("master", now.disk_free_mb)
 
     def _rejected_peers(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
-        """Who says that it is `name` and is not taken."""
+        """Yield a verdict for each process that claims to be `name` and is rejected."""
         duplicate, unknown_peer = sender.duplicate, sender.unknown_peer
         host = None if duplicate is None else duplicate.host
         yield Verdict(
@@ -131,14 +137,17 @@ class LinkRules:
         )
 
     def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
-        """Whether it is not heard: at once where it was there, after a grace where it never was."""
+        """Return true if a sender is not received.
+
+        At once where it was there, after a grace period where it never was.
+        """
         assert self._first_ns is not None
         if sender.connected:
             return False
         return self._received[name].ever or t_ns - self._first_ns >= GRACE_NS or None
 
     def _mute(self, name: str, t_ns: int) -> bool:
-        """Whether it is heard, and sends nothing though it should."""
+        """Return true if a sender is connected and sends nothing though it should."""
         received = self._received[name]
         started = self._started_ns is not None and t_ns - self._started_ns >= SETTLED_NS
         return started and received.settled(t_ns) and t_ns - received.came_ns >= MUTE_NS

@@ -1,4 +1,6 @@
-"""The checklist as a push machine: reports and counts in, what is not as it should be out. No clock, no socket.
+"""Checklist as a push machine.
+
+Reports and counts in, current problems out. No clock, no socket.
 
 Four things keep it quiet:
 
@@ -53,7 +55,10 @@ _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
 
 
 class _Latch:
-    """Whether one thing is wrong. Holds since when it seems to be, and what was last said of it."""
+    """Latch that decides if one thing is wrong.
+
+    Holds since when it seems to be, and what was last reported of it.
+    """
 
     def __init__(self) -> None:
         self.since_ns: int | None = None
@@ -72,7 +77,10 @@ class _Latch:
 
 
 class ChecklistMonitor:
-    """Holds what each rule holds, what is wrong, and until when each cause silences what follows from it."""
+    """Monitor that evaluates all checklist rules.
+
+    Holds the state of each rule, what is wrong, and until when each cause silences what follows from it.
+    """
 
     def __init__(self, plan: Plan) -> None:
         """Watch who is to be there by `plan`."""
@@ -84,14 +92,20 @@ class ChecklistMonitor:
         self.follow(plan)
 
     def follow(self, plan: Plan) -> None:
-        """Go on with other files of the same senders; what slaves say is judged anew."""
+        """Continue with other files of the same senders.
+
+        What slaves report is judged anew.
+        """
         self._plan = plan
         cameras = {camera.name: camera for camera in plan.cameras}
         self._slaves = {name: SlaveRules(cameras.get(name)) for name in (*cameras, *plan.imus)}
         self._moved = [MovedRule() for _ in plan.groups]
 
     def push_health(self, health: Health, t_ns: int) -> None:
-        """Take the report of a slave that came at `t_ns` [ns]; of anybody else it is left."""
+        """Take the report of a slave that came at `t_ns` [ns].
+
+        Reports of anybody else are ignored.
+        """
         if health.source in self._slaves:
             self._reports.setdefault(health.source, SlaveReports()).push(health, t_ns)
 
@@ -100,7 +114,10 @@ class ChecklistMonitor:
         self._now = now
 
     def look(self, t_ns: int) -> tuple[CheckItem, ...]:
-        """What is not as it should be at `t_ns` [ns], which rises: each code and subject once, in the codes' order."""
+        """Return the current problems at `t_ns` [ns], which rises.
+
+        Each code and subject once, in the codes' order.
+        """
         if self._now is None:
             return ()
         judged: set[tuple[CheckCode, str]] = set()

@@ -1,4 +1,7 @@
-"""Whether the rays of the cameras still meet: of a camera that was knocked they miss those of the others."""
+"""Rule that detects a moved camera.
+
+Checks that the rays of the cameras still meet: those of a camera that was knocked miss those of the others.
+"""
 
 from collections.abc import Iterator, Mapping
 
@@ -13,7 +16,10 @@ _NAME = 64  # characters of a name in counts
 
 
 class MovedRule:
-    """Push machine over what one pipeline counts. Holds its counters of the last second."""
+    """Push machine over the counters of one pipeline.
+
+    Holds its counters of the last second.
+    """
 
     def __init__(self) -> None:
         """Nothing was counted yet."""

@@ -1,5 +1,8 @@
-"""Feeds the checklist of a running master and publishes it: five times a second, on a thread of its own, for the one
-that reports stands still while changed files are read."""
+"""Publisher of the checklist of a running master.
+
+Feeds it and publishes it five times a second, on a thread of its own, since the one that reports stands still while
+changed files are read.
+"""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +30,7 @@ DEPTH = 64  # reports of slaves that may wait for a look: 32 senders, twice a se
 
 
 class Received(Protocol):
-    """What the master hears; an `Ingest`."""
+    """Interface to what the master receives; an `Ingest`."""
 
     @property
     def quarantine(self) -> Quarantine:
@@ -41,7 +44,7 @@ class Received(Protocol):
 
     @property
     def connected(self) -> frozenset[str]:
-        """Who was heard within the last second."""
+        """Return the senders received within the last second."""
         ...
 
     def counts_of(self, sender: str) -> CameraCounts:
@@ -55,8 +58,11 @@ class Received(Protocol):
     def rejected_peers(
         self,
     ) -> tuple[Mapping[str, RejectedPeer], Mapping[str, RejectedPeer], Mapping[str, RejectedPeer]]:
-        """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
-        somebody says hello without its secret."""
+        """Return the rejected processes of each sender, by reason.
+
+        Sender -> where a second process of its name was rejected lately; where it speaks another version; where
+        somebody says hello without its secret.
+        """
         ...
 
     def marker_counts(self) -> Mapping[str, MarkerCounts]:
@@ -77,7 +83,10 @@ class Counting(Protocol):
 
 
 class ChecklistPublisher:
-    """Belongs to one thread. Holds the watch, its subscription, and what was published last."""
+    """Publisher of the checklist; belongs to one thread.
+
+    Holds the monitor, its subscription, and what was published last.
+    """
 
     def __init__(
         self,
@@ -115,7 +124,10 @@ class ChecklistPublisher:
         self._published_ns = 0
 
     def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]] | None) -> None:
-        """Look again and again until the stop; `setups` says which are in use."""
+        """Look again and again until the stop.
+
+        `setups` returns which are in use.
+        """
         while not stop.wait(POLL_S):
             try:
                 self.look(None if setups is None else setups())
@@ -128,7 +140,9 @@ class ChecklistPublisher:
                 self._received.quarantine.note(MASTER, error)
 
     def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
-        """Look once, and publish where it is due; `setups` that are in use now, None: as before.
+        """Look once, and publish where it is due.
+
+        `setups` that are in use now, None: as before.
 
         Raises:
             BusError: The bus is closed.
@@ -171,5 +185,8 @@ class ChecklistPublisher:
 
 
 def _keys(items: tuple[CheckItem, ...] | None) -> list[tuple[str, str]] | None:
-    """What is told, without the numbers in the sentences, which change all the time."""
+    """Return code and subject of each published item, without its sentence.
+
+    The numbers in the sentences change all the time.
+    """
     return None if items is None else [(item.code, item.subject) for item in items]

@@ -1,4 +1,7 @@
-"""What a slave said of itself: its last reports, and what happened between two of them."""
+"""Reports of a slave about itself.
+
+Its last reports, and what happened between two of them.
+"""
 
 from collections.abc import Mapping
 
@@ -11,14 +14,16 @@ LEAST_NS = (
 
 
 class SlaveReports:
-    """Push machine. Holds the newest report of one process, and the one that it is compared with.
+    """Push machine over the reports of one process.
+
+    Holds the newest report, and the one that it is compared with.
 
     Attributes:
         number: How many comparisons there were: a rule looks at each once.
     """
 
     def __init__(self) -> None:
-        """Nothing was said yet."""
+        """Start with no report received."""
         self._now: Health | None = None
         self._before: Health | None = None
         self._came_ns = 0
@@ -38,12 +43,12 @@ class SlaveReports:
         self._now = health
 
     def is_recent(self, t_ns: int) -> bool:
-        """Whether it says something of now."""
+        """Return true if the newest report is recent."""
         return self._now is not None and t_ns - self._came_ns < STALE_NS
 
     @property
     def session(self) -> int | None:
-        """Which process said it."""
+        """Return the session of the process that sent the newest report."""
         return None if self._now is None else self._now.session
 
     @property
@@ -62,7 +67,10 @@ class SlaveReports:
         return {} if self._now is None else self._now.counts
 
     def increase(self, event: str) -> int | None:
-        """How often it happened between the last two reports; None: it is not told, or there are no two."""
+        """Return how often an event happened between the last two reports.
+
+        None: it is not reported, or there are no two.
+        """
         if self._now is None or self._before is None or event not in self._now.counts:
             return None
         return max(self._now.counts[event] - self._before.counts.get(event, 0), 0)

@@ -1,4 +1,7 @@
-"""What slaves say of themselves: camera settings, light, colours, markers, temperature, disk, strobe."""
+"""Rules on the reports of slaves about themselves.
+
+Camera settings, light, colours, markers, temperature, disk, strobe.
+"""
 
 from collections.abc import Iterator
 from math import log
@@ -35,7 +38,10 @@ SLIPPED, SLIPPED_LEAST = 0.04, 2  # share and number of the cycles between two r
 
 
 class SlaveRules:
-    """Push machine over the reports of one slave. Holds what each rule that needs two reports found last."""
+    """Push machine over the reports of one slave.
+
+    Holds what each rule that needs two reports found last.
+    """
 
     def __init__(self, camera: CameraPlan | None) -> None:
         """Of a camera, or of an IMU (None)."""
@@ -45,7 +51,10 @@ class SlaveRules:
         self._kept: list[Verdict] = []
 
     def look(self, name: str, reports: SlaveReports, t_ns: int) -> Iterator[Verdict]:
-        """All that its last reports tell; nothing where they are old."""
+        """Return all verdicts from the last reports of a slave.
+
+        Nothing where they are old.
+        """
         if not reports.is_recent(t_ns):
             return
         if reports.number != self._judged:
@@ -69,7 +78,7 @@ class SlaveRules:
 
 
 def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
-    """Whether the camera has what it was told."""
+    """Check that the camera has the settings that were requested."""
     metrics = reports.metrics
     wrong: list[str] = []
     for setting, (share, least) in OFF.items():

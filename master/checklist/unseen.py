@@ -1,4 +1,6 @@
-"""Which markers of a hand a camera does not find though it finds the others: paint, or a range of colours, is wrong.
+"""Markers of a hand that one camera does not find though it finds the others.
+
+The cause is a wrong marker colour, or a wrong range of colours.
 
 A hand hides its own markers all the time, so what is not seen now means nothing. Three things mean something:
 
@@ -37,7 +39,10 @@ class _Marker:
 
 
 class UnseenMarkers:
-    """Push machine over the reports of one slave, of the markers of one hand. Holds how long each was missing."""
+    """Push machine that times how long each marker of one hand has been missing.
+
+    It reads the reports of one slave.
+    """
 
     def __init__(self, camera: str, markers: tuple[str, ...]) -> None:
         """Watch these markers."""
@@ -74,7 +79,10 @@ class UnseenMarkers:
 
     @staticmethod
     def _recoloured(one: _Marker, colour: float | None) -> bool:
-        """Take the number of its colours; whether that is another one: then it begins anew."""
+        """Store the marker's colour number and return whether it has changed.
+
+        After a change the timing starts again.
+        """
         changed = one.colour is not None and colour is not None and colour != one.colour
         if changed:
             one.before_change = one.ever or one.before_change

@@ -1,10 +1,16 @@
-"""Counts over the last second or so, of counters that only rise: what happens now, not since the start."""
+"""Counter increments over the last second or so.
+
+The counters only rise; the increments show what happens now, not since the start.
+"""
 
 from collections import deque
 
 
 class Window:
-    """Push machine. Holds the counters as they were at the looks of the last `span_ns`, and one look before."""
+    """Push machine that holds recent snapshots of counters.
+
+    It keeps the snapshots of the last `span_ns` and one before.
+    """
 
     def __init__(self, span_ns: int) -> None:
         """Look back so far [ns]."""
@@ -12,7 +18,10 @@ class Window:
         self._looks: deque[tuple[int, tuple[int, ...]]] = deque()
 
     def push(self, t_ns: int, *counters: int) -> None:
-        """Take the counters of a look; one that has fallen is another process's, and all begins anew."""
+        """Add a snapshot of the counters.
+
+        A counter that has fallen belongs to another process, so the window then starts again.
+        """
         if self._looks and any(now < old for now, old in zip(counters, self._looks[-1][1], strict=True)):
             self._looks.clear()
         self._looks.append((t_ns, counters))

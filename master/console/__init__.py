@@ -1,1 +1,4 @@
-"""The console: a page on the master's PC that shows, tunes, records and sets up. A process of its own."""
+"""Web console on the master's PC that shows, tunes, records and sets up.
+
+It runs as a process of its own.
+"""

@@ -1,4 +1,4 @@
-"""The console as a program: its pages, the shell around them, and the server, with what guards it."""
+"""Console program: its pages, the shell around them, and the guarded server."""
 
 import os
 import socket
@@ -31,7 +31,10 @@ _AWAY_S = 30.0  # a page that was not heard for so long, as on a busy machine, g
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """One page: where it is, how it is called, its icon (a name of the Material font), and what fills it."""
+    """One console page: its path, title, icon and content.
+
+    The icon is a name of the Material font.
+    """
 
     route: str
     title: str
@@ -51,12 +54,18 @@ PAGES: tuple[Page, ...] = (
 
 
 def start_page(state: ConsoleState) -> str:
-    """Where somebody who opens the console begins: the set-up while no rig can be used."""
+    """Return the page on which the console opens.
+
+    It is the set-up page while no rig can be used.
+    """
     return PAGES[0].route if state.rigs() else "/setup"
 
 
 def register(state: ConsoleState, logout: bool = False) -> None:
-    """Make every page known to NiceGUI, with a button that logs out where there is a login. Once in a process."""
+    """Register every page with NiceGUI.
+
+    The pages have a logout button where there is a login. Call it once in a process.
+    """
     entries = tuple(Entry(page.route, page.title, page.icon) for page in PAGES)
 
     def add(page: Page) -> None:
@@ -88,7 +97,9 @@ class LoginPage:
 
 
 def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], None]) -> LoginPage:
-    """The door of a console: none on this machine alone; elsewhere a password, and TLS unless it is to be open.
+    """Return the login page of a console.
+
+    There is none on this machine alone; elsewhere it asks for a password, and uses TLS unless it is to be open.
 
     Args:
         settings: How the console was started.
@@ -142,7 +153,10 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, notify: Callab
 
 
 def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> FastAPI:
-    """All that the console serves, behind its guards: own pages only, then the login (or: the same user)."""
+    """Return the complete console application behind its guards.
+
+    The guards admit own pages only, then check the login (or: the same user).
+    """
     app = FastAPI(openapi_url=None)
     serve_sockets(app, state)
     ui.run_with(

@@ -1,4 +1,7 @@
-"""The controls of one camera on the page Tune: settings, colours, picking them in the picture, save, revert."""
+"""Controls of one camera on the page Tune.
+
+They cover settings, colours, picking colours in the picture, save and revert.
+"""
 
 import asyncio
 from collections.abc import Callable
@@ -28,7 +31,7 @@ _SETTINGS: tuple[tuple[str, str, str, float, float, int, bool], ...] = (
 
 
 class CameraPanel:
-    """Holds the controls of one page for one camera, and what the slave answered last."""
+    """Controls of one page for one camera, with the last answer of the slave."""
 
     def __init__(self, state: ConsoleState, camera: str, markers: tuple[str, ...]) -> None:
         """Build them in the present slot.
@@ -114,7 +117,10 @@ class CameraPanel:
         self._do(self._save_both, f"saved to the camera file of {self._camera}", "saved")
 
     def _save_both(self) -> InUse:
-        """The slave's file, then the copy of this machine, which is another where the slave is elsewhere."""
+        """Save the slave's file, then the copy on this machine.
+
+        The copy is a different file where the slave is elsewhere.
+        """
         saved = self._tuner.save()
         path = self._state.camera_path(self._camera)
         if path.exists():
@@ -153,7 +159,7 @@ class CameraPanel:
         self._colours.show(now.markers)
 
     def _fail(self, text: str) -> None:
-        """Say what the slave said, as it said it, and show what holds instead."""
+        """Show the slave's error text unchanged, and the settings now in effect."""
         self._error.set_text(text)
         self._error.set_visibility(True)
         with self._client:

@@ -1,4 +1,7 @@
-"""The colours of a camera's markers: which one is being tuned, its hue, saturation and value, and what is tinted."""
+"""Colours of a camera's markers on the page.
+
+It shows which one is being tuned, its hue, saturation and value, and what is tinted.
+"""
 
 import colorsys
 from collections.abc import Callable, Mapping

@@ -1,4 +1,7 @@
-"""Tells a process what a page wants, one change at a time, the newest: a slider that is dragged floods nobody."""
+"""Queue that sends a page's changes to a process, one at a time, newest only.
+
+Dragging a slider therefore floods nobody.
+"""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -13,7 +16,7 @@ QUIET_S = 0.12  # so long nothing more changes until the change is sent
 
 
 class CommandQueue(Generic[AnswerT]):
-    """Holds what is to be told, merged by key, while the last of it is on its way."""
+    """Queue of pending changes, merged by key, while the last one is being sent."""
 
     def __init__(
         self,
@@ -21,7 +24,7 @@ class CommandQueue(Generic[AnswerT]):
         on_answer: Callable[[AnswerT], object],
         on_error: Callable[[str], object],
     ) -> None:
-        """Nothing to tell yet.
+        """Start with an empty queue.
 
         Args:
             tell: Sends a change and waits for the answer, on a thread.
@@ -38,7 +41,10 @@ class CommandQueue(Generic[AnswerT]):
         return self._task is not None and not self._task.done()
 
     def change(self, key: str, value: object, part: str | None = None) -> None:
-        """Tell `key: value` soon; with `part`, one entry of the map `key`. The newest of each counts."""
+        """Send `key: value` soon.
+
+        With `part`, only one entry of the map `key` is sent. The newest value of each counts.
+        """
         self._waiting[key, part] = value
         if not self.busy:
             self._task = background_tasks.create(self._work(), name="telling")

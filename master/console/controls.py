@@ -1,4 +1,7 @@
-"""Controls that the pages share: a labelled slider with a number beside it, and what was read back."""
+"""Controls that the pages share.
+
+They include a labelled slider with a number beside it, and the value that was read back.
+"""
 
 import math
 from collections.abc import Callable
@@ -7,7 +10,9 @@ from nicegui import ui
 
 
 class Setting:
-    """A slider and a number for one value, logarithmic where it spans decades. Holds the value last shown.
+    """Slider and number field for one value, with the value last shown.
+
+    The slider is logarithmic where the value spans decades.
 
     A change by a person is told once to `on_change`; `show` changes the controls and tells nobody.
     """

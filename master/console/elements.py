@@ -1,4 +1,7 @@
-"""Elements of the console's pages that NiceGUI does not have: a camera's picture, the hand in 3D."""
+"""Elements of the console's pages that NiceGUI does not have.
+
+They are a camera's picture and the hand in 3D.
+"""
 
 from collections.abc import Callable
 from typing import cast
@@ -8,7 +11,10 @@ from nicegui.events import GenericEventArguments
 
 
 class CameraView(Element, component="static/camera_view.js"):
-    """What a camera sees, as long as the page is visible. With `on_pick` a click, or a cross moved by keys, picks."""
+    """Live camera picture, shown as long as the page is visible.
+
+    With `on_pick`, a click, or a cross moved by keys, picks a point.
+    """
 
     def __init__(
         self, camera: str, label: str, on_pick: Callable[[float, float, int], object] | None = None
@@ -47,5 +53,8 @@ def _place(event: GenericEventArguments) -> tuple[float, float, int]:
 
 
 def full_frame_uv(x: float, y: float, width_px: int, height_px: int) -> tuple[float, float]:
-    """Shares of a picture as a pixel of the whole frame; (0, 0) is the centre of the top-left pixel."""
+    """Convert shares of a picture to a pixel of the whole frame.
+
+    (0, 0) is the centre of the top-left pixel.
+    """
     return x * width_px - 0.5, y * height_px - 0.5

@@ -1,4 +1,7 @@
-"""The filter of one rig on the page Tune: tried on the running master at once, saved, or taken back."""
+"""Filter of one rig on the page Tune.
+
+It is tried on the running master at once, then saved or taken back.
+"""
 
 import asyncio
 from collections.abc import Callable, Mapping

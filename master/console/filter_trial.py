@@ -1,4 +1,7 @@
-"""The 1 € filter of a rig, tried on a running master, then saved to the rig's file. Waits: not on the page's thread."""
+"""Trial of a rig's 1 € filter on a running master, then saved to the rig's file.
+
+It blocks, so do not call it on the page's thread.
+"""
 
 import json
 from collections.abc import Callable, Mapping
@@ -15,7 +18,7 @@ NAMES = ("min_cutoff_hz", "beta", "d_cutoff_hz", "jitter_m")
 
 
 def saved_filter(rig_path: Path) -> FilterCalibration:
-    """What the file says.
+    """Return the filter settings stored in the rig's file.
 
     Raises:
         CalibrationError: It is missing or broken.
@@ -33,7 +36,9 @@ def try_filter(ask: Callable[[Command], Health], rig: str, values: Mapping[str, 
 
 
 def save_filter(rig_path: Path, values: Mapping[str, float]) -> None:
-    """Write them to the rig's file, with when and by what; a running master follows its files.
+    """Write the filter settings to the rig's file, with when and by what.
+
+    A running master follows its files.
 
     Raises:
         CalibrationError: The file is missing, broken or read-only, or a value is out of range.

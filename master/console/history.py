@@ -1,4 +1,7 @@
-"""The last minute in figures, for the plots: latency, rates, loss, clocks, temperature. Bounded, pure."""
+"""History of the last minute in figures, for the plots.
+
+It covers latency, rates, loss, clocks and temperature. Bounded, pure.
+"""
 
 import math
 from collections import deque
@@ -65,7 +68,9 @@ class History:
         return rows[-1][1].get(name) if rows else None
 
     def _counted(self, report: Health) -> dict[str, float]:
-        """Frames that arrive from each camera, and messages that are lost on the way from each sender, per second.
+        """Return frame and loss rates per second.
+
+        Frames are those that arrive from each camera; lost messages are counted for each sender.
 
         A count of the master that is absent is 0: what never happened it does not tell.
         """

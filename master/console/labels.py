@@ -1,4 +1,7 @@
-"""What hands, objects and gestures are doing, in the words of the pages. Pure: messages in, text out."""
+"""Plain-text labels for the state of hands, objects and gestures.
+
+Pure: messages in, text out.
+"""
 
 import math
 from collections import Counter
@@ -25,7 +28,10 @@ FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 def joint_states(pose: HandPose) -> list[tuple[str, str, bool]]:
-    """(joint, state, tracked now) of all 26; state is `unknown` where the joint is not valid."""
+    """Return (joint, state, tracked now) for all 26 joints.
+
+    The state is `unknown` where the joint is not valid.
+    """
     return [
         (name, SOURCES[Source(int(source))] if valid else "unknown", bool(tracked))
         for name, source, valid, tracked in zip(JOINTS, pose.source, pose.valid, pose.tracked, strict=True)
@@ -81,5 +87,5 @@ def readable(name: str) -> str:
 
 
 def gesture_lines(gestures: Mapping[tuple[str, str], Gesture], hand: str) -> list[str]:
-    """What a hand says now."""
+    """Return text lines for the current gestures of one hand."""
     return [gesture_line(one) for (whose, _), one in sorted(gestures.items()) if whose == hand]

@@ -1,4 +1,7 @@
-"""The console's connection to the bus: opened again by itself whenever a master comes or goes."""
+"""Connection of the console to the bus.
+
+It reopens by itself whenever a master comes or goes.
+"""
 
 import logging
 import threading
@@ -19,7 +22,10 @@ Take = Callable[[Message], None]
 
 
 class Link:
-    """Holds the bus while there is one, who is alive, and one thread that keeps both up to date."""
+    """Bus connection that also holds which processes are alive.
+
+    It holds the bus while there is one, and one thread keeps both up to date.
+    """
 
     def __init__(self, open_bus: Callable[[], Bus], take: Mapping[str, Take]) -> None:
         """Begin to connect.

@@ -1,4 +1,6 @@
-"""Processes of this machine that the console starts by command line: cameras, a master, calibrations. They end with it.
+"""Local processes that the console starts by command line.
+
+They are cameras, a master and calibrations, and they end with the console.
 
 Each runs in a process group of its own; a thread reads its lines. A `supervisor` process holds the groups and
 ends them when the console is gone, so that a console that was killed leaves no camera busy.
@@ -25,7 +27,10 @@ _CHUNK = 8192
 
 
 class LocalProcess:
-    """One command that runs. Holds the child, its last lines, and what it said without ending the line: a question."""
+    """One running command, with its child process and its last output lines.
+
+    It also holds output that does not end the line: a question.
+    """
 
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> None:
         """Start it.
@@ -91,7 +96,10 @@ class LocalProcess:
         self._signal(signal.SIGINT)
 
     def stop(self, ends_s: float = ENDS_S) -> int:
-        """End it, wait until it has ended, and return its exit code; kill it after `ends_s` [s]."""
+        """Stop the process, wait until it has ended, and return its exit code.
+
+        It is killed after `ends_s` [s].
+        """
         self._stopped = True
         if self._child.poll() is None:
             self._signal(signal.SIGTERM)
@@ -126,10 +134,13 @@ class LocalProcess:
 
 
 class LocalProcesses:
-    """All that the console started, by name. Holds the warden; one process of a name at a time."""
+    """All processes that the console started, by name.
+
+    It holds the supervisor process, and allows one process of a name at a time.
+    """
 
     def __init__(self) -> None:
-        """Start the warden.
+        """Start the supervisor process.
 
         Raises:
             PhalanxError: This interpreter cannot be started.
@@ -171,7 +182,10 @@ class LocalProcesses:
             return {name: one for name, one in self._all.items() if one.ended() is None}
 
     def shared(self, kind: type[T], make: Callable[[], T]) -> T:
-        """The one object of a type that leads these processes, made when first asked for: all pages see the same."""
+        """Return the one shared object of a type that manages these processes.
+
+        It is made when first asked for, so all pages see the same object.
+        """
         with self._lock:
             found = self._shared.get(kind)
             if not isinstance(found, kind):
@@ -187,7 +201,10 @@ class LocalProcesses:
         self._send(f"-{process.pid}")
 
     def close(self) -> None:
-        """End all at once, then the warden. Safe to call twice."""
+        """End all processes at once, then the supervisor.
+
+        Safe to call twice.
+        """
         running = list(self.running().values())
         stoppers = [threading.Thread(target=one.stop, daemon=True) for one in running]
         for thread in stoppers:

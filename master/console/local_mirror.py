@@ -1,4 +1,6 @@
-"""The copy of a camera's file on this machine, after its slave saved: the master and the wizards read this one.
+"""Copy of a camera's file on this machine, updated after its slave saved.
+
+The master and the wizards read this copy.
 
 A slave of this machine has written the very file; one of another machine has written its own, and only what its answer
 tells can be copied: settings and colour ranges, not what the calibration says.

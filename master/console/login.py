@@ -1,4 +1,6 @@
-"""The console's password: made or read at the start, kept as its scrypt hash, compared in constant time.
+"""Password of the console, made or read at the start.
+
+It is kept as its scrypt hash and compared in constant time.
 
 It is needed wherever the page can be reached from another machine (docs/security.md). scrypt is slow and takes memory
 on purpose: who steals the file of the hash tries a dozen passwords a second, not millions.
@@ -87,7 +89,9 @@ def password_from(file: Path) -> PasswordHash:
 
 
 def kept_password(folder: Path, notify: Callable[[str], None]) -> PasswordHash:
-    """Of the password whose hash is kept in a folder; at the first start it is made, and said this once.
+    """Return the hash of the password kept in a folder.
+
+    At the first start the password is made, and printed this once.
 
     Raises:
         PhalanxError: The file is there and cannot be used, or it cannot be written.

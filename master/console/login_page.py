@@ -1,4 +1,6 @@
-"""The door of the console: nothing behind it is answered before somebody logged in, and all ends with the session.
+"""Login page of the console.
+
+Nothing behind it is answered before somebody has logged in, and everything ends with the session.
 
 It stands before everything that the console serves: pages, NiceGUI's own socket and files, our sockets, downloads. Only
 the page of the login itself is open. A socket ends when its session does, also while nothing is said on it.
@@ -34,7 +36,10 @@ _HEADERS = {
 
 
 class LoginRequired:
-    """ASGI middleware that lets only browsers through that logged in. Holds sessions and failed tries."""
+    """ASGI middleware that admits only logged-in browsers.
+
+    It holds sessions and failed tries.
+    """
 
     def __init__(
         self,
@@ -131,7 +136,10 @@ class LoginRequired:
         return answer
 
     async def _socket(self, session: Session, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a socket on until its session ends; then who serves it hears that the browser has gone."""
+        """Pass a socket on until its session ends.
+
+        The handler then receives a disconnect, as if the browser had gone.
+        """
         ended = asyncio.ensure_future(_end(session, self._clock()))
 
         async def receive_or_end() -> Message:
@@ -165,7 +173,10 @@ async def _end(session: Session, now_s: float) -> None:
 
 
 async def _password(request: Request) -> str | None:
-    """What the form says; None where it says nothing, too much, too slowly, or something else."""
+    """Return the password from the form, or None.
+
+    None means that the form holds nothing, too much, something else, or arrives too slowly.
+    """
     body = b""
     try:
         async with asyncio.timeout(_BODY_S):

@@ -1,4 +1,7 @@
-"""Who is logged in, and who tried too often. Push machines: they are told the time, and both have a bounded memory."""
+"""Login sessions, and the limit on failed tries.
+
+Push machines: they receive the time as an argument, and both have bounded memory.
+"""
 
 import asyncio
 import hashlib
@@ -24,7 +27,10 @@ class Session:
 
 
 class Sessions:
-    """Holds the sessions by the hash of their token: what is looked up tells nothing about what would have fitted."""
+    """Sessions stored by the hash of their token.
+
+    Thus a lookup reveals nothing about which token would have matched.
+    """
 
     def __init__(self, life_s: float = LIFE_S, most: int = MOST_SESSIONS) -> None:
         """Nobody is logged in. With more than `most` the oldest is logged out."""
@@ -58,7 +64,10 @@ class Sessions:
 
 
 class Backoff:
-    """Holds how often each address failed, and until when it waits; who was quiet for longest is forgotten first."""
+    """Failed logins per address, with the time until which each must wait.
+
+    The address that was quiet for longest is forgotten first.
+    """
 
     def __init__(self, most: int = MOST_ADDRESSES) -> None:
         """Nobody failed."""
@@ -71,7 +80,10 @@ class Backoff:
         return max(0.0, until_s - now_s)
 
     def failed(self, address: str, now_s: float) -> None:
-        """It gave a wrong password: after three the wait doubles each time, to five minutes."""
+        """Record a wrong password from an address.
+
+        After three, the wait doubles each time, to five minutes.
+        """
         key = _network(address)
         count = self._failures.pop(key, (0, 0.0))[0] + 1
         wait_s = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(count - FREE_TRIES, 30))
@@ -93,7 +105,10 @@ def _hash(token: str) -> bytes:
 
 
 def _network(address: str) -> str:
-    """Whose tries count together: an IPv4 address, or the 64 bits of IPv6 that one machine has for itself."""
+    """Return the network whose failed tries are counted together.
+
+    It is an IPv4 address, or the 64 bits of IPv6 that one machine has for itself.
+    """
     try:
         found = ip_address(address.split("%", 1)[0])
     except ValueError:

@@ -1,4 +1,7 @@
-"""Which user of this machine is at the other end of a connection that never left it, as Linux tells in /proc/net."""
+"""Local user at the other end of a connection that never left this machine.
+
+Linux reports it in /proc/net.
+"""
 
 import os
 import sys
@@ -12,7 +15,9 @@ Peer = tuple[str, int]
 
 
 def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool:
-    """Whether the client belongs to the user of this process, or to root; True where the system does not tell.
+    """Return whether the client belongs to this process's user, or to root.
+
+    True where the system does not report it.
 
     Args:
         client, server: Address and port of both ends, as the server sees them.

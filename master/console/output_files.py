@@ -1,4 +1,7 @@
-"""The settings of the live outputs as the page changes them, and the process that follows them. All of it waits."""
+"""Settings of the live outputs, and the process that follows them.
+
+The page changes the settings. All of it blocks.
+"""
 
 import sys
 import time
@@ -31,7 +34,9 @@ def read_outputs(state: ConsoleState) -> OutputSettings:
 
 
 def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> OutputSettings:
-    """Change one output in the file, whole or not at all; the process runs while something is on.
+    """Change one output in the settings file, whole or not at all.
+
+    The process runs while any output is on.
 
     Raises:
         CalibrationError: The file is broken or read-only, or a value is none; the text names the key.
@@ -50,7 +55,9 @@ def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> 
 
 
 def follow(state: ConsoleState, settings: OutputSettings) -> None:
-    """Have the process exactly while something is on; one that somebody else started is left alone.
+    """Run the output process exactly while some output is on.
+
+    A process that somebody else started is left alone.
 
     Raises:
         PhalanxError: It cannot be started.
@@ -65,7 +72,10 @@ def follow(state: ConsoleState, settings: OutputSettings) -> None:
 
 
 def _of_others(state: ConsoleState) -> bool:
-    """Whether somebody else sends. Our own that has just ended is seen a moment longer: wait until it is gone."""
+    """Return whether somebody else runs the output process.
+
+    Our own process that has just ended stays visible a moment longer, so this waits until it is gone.
+    """
     until = time.monotonic() + (_GONE_S if state.local.get(PROCESS) is not None else 0.0)
     while NAME in state.alive and time.monotonic() < until:
         time.sleep(0.1)

@@ -1,4 +1,7 @@
-"""The live outputs on the page: a switch and the address of each, whether it is open, and what it sent."""
+"""Live outputs on the page.
+
+For each output they show a switch and the address, whether it is open, and what it sent.
+"""
 
 import asyncio
 from collections.abc import Callable
@@ -93,7 +96,7 @@ def status_words(name: str, report: Health | None) -> str:
 
 
 def waiting_words(state: ConsoleState, running: bool, report: Health | None) -> str:
-    """Why an output that is switched on says nothing yet."""
+    """Return why an output that is switched on sends nothing yet."""
     if report is not None:
         return "a moment …"  # the process looks at its file once a second
     if not running and NAME not in state.alive:

@@ -1,4 +1,7 @@
-"""Playing on the page: begin a recording in place of a master; pause, seek and speed of whichever plays."""
+"""Playback controls on the page.
+
+Begin a recording in place of a master; pause, seek and set the speed of whichever player runs.
+"""
 
 import asyncio
 import json
@@ -53,10 +56,16 @@ def start_playing(state: ConsoleState, name: str) -> None:
 
 
 class Controls:
-    """Pause, position and speed of whichever player is on the bus. Holds what the page shows of it."""
+    """Pause, position and speed of whichever player is on the bus.
+
+    It holds what the page shows of the player.
+    """
 
     def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
-        """Build them in the present slot; `notify` is told why a command was refused, or nothing."""
+        """Build the controls in the present slot.
+
+        `notify` receives the reason why a command was refused, or nothing.
+        """
         self._state, self._notify = state, notify
         self._answer: Health | None = None
         self._at, self._speed, self._paused = 0.0, 1.0, False
@@ -77,7 +86,7 @@ class Controls:
         self._speeds.on_value_change(self._sped)
 
     def update(self) -> None:
-        """Show what the player said last."""
+        """Show the player's last reported state."""
         now = self._newest()
         position = None if now is None else now.metrics.get("play.position_s")
         self._all.set_visibility(position is not None)

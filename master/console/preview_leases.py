@@ -1,4 +1,4 @@
-"""Asks cameras for their pictures while somebody looks at them, and not a moment longer."""
+"""Request camera previews while somebody looks at them, and not longer."""
 
 import threading
 import time
@@ -14,7 +14,10 @@ _ANSWER_S = 1.5
 
 
 class PreviewLeases:
-    """Holds for each camera who looks until when, and one thread per camera as long as somebody does."""
+    """Viewers of each camera, with the time until which each looks.
+
+    It holds one thread per camera as long as somebody looks.
+    """
 
     def __init__(self, ask: Callable[[Command, float], Health]) -> None:
         """Nobody looks yet; `ask` sends a command and waits for the answer."""
@@ -25,7 +28,10 @@ class PreviewLeases:
         self._errors: dict[str, str] = {}
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
-        """Somebody looks at `camera` for the next 3 s, with the pixels of these markers tinted. Never waits."""
+        """Request the preview of `camera` for the next 3 s.
+
+        The pixels of these markers are tinted. Never waits.
+        """
         with self._lock:
             self._until.setdefault(camera, {})[mask] = time.monotonic() + LEASE_S
             if camera not in self._threads:
@@ -55,7 +61,10 @@ class PreviewLeases:
             time.sleep(ASK_EVERY_S)
 
     def _mask(self, camera: str) -> tuple[str, ...] | None:
-        """All markers that somebody wants tinted; None when nobody looks, and the thread is forgotten."""
+        """Return all markers that somebody wants tinted.
+
+        None when nobody looks; the thread is then forgotten.
+        """
         with self._lock:
             now = time.monotonic()
             wanted = {mask: until for mask, until in self._until.get(camera, {}).items() if until > now}

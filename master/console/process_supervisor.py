@@ -1,4 +1,6 @@
-"""End what the console started once the console is gone: `python -m master.console.process_supervisor`.
+"""Supervisor that ends the console's processes once the console is gone.
+
+Run as `python -m master.console.process_supervisor`.
 
 It reads "+PID" and "-PID" lines from a pipe whose other end only the console holds. The end of the pipe is the end of
 the console: each process group that is still listed is told to end, and killed if it does not.
@@ -27,7 +29,7 @@ def watch(lines: Iterable[str]) -> set[int]:
 
 
 def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
-    """Tell process groups to end; kill those that are still there after `ends_s` [s]."""
+    """Ask process groups to end, and kill those still there after `ends_s` [s]."""
     left = {group for group in groups if _send(group, signal.SIGTERM)}
     deadline = time.monotonic() + ends_s
     while left and time.monotonic() < deadline:
@@ -38,7 +40,7 @@ def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
 
 
 def _send(group: int, number: int) -> bool:
-    """Whether the group was there to be told."""
+    """Send a signal to a process group and return whether the group existed."""
     try:
         os.killpg(group, number)
     except (ProcessLookupError, PermissionError):

@@ -1,4 +1,7 @@
-"""What hands say, as a person follows it: what lasts now, and the last things that were said. Bounded."""
+"""Received gestures of the hands, in the form a person follows them.
+
+It covers the gestures that last now, and the last things reported. Bounded.
+"""
 
 import time
 from collections import deque
@@ -13,22 +16,25 @@ _MOST = 64
 
 @dataclass(frozen=True, slots=True)
 class ReceivedGesture:
-    """One thing that a hand said: when it was heard [s, monotonic], and the message that began or ended it."""
+    """One received gesture, with its time of receipt [s, monotonic].
+
+    It holds the message that began or ended it.
+    """
 
     received_s: float
     gesture: Gesture
 
 
 class ReceivedGestures:
-    """Holds the newest message of each gesture that lasts, and the last begins, ends and taps."""
+    """Newest message of each lasting gesture, and the last begins, ends and taps."""
 
     def __init__(self) -> None:
-        """Nothing was said."""
+        """Start without any gesture."""
         self._held: dict[tuple[str, str], ReceivedGesture] = {}
         self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
 
     def push(self, gesture: Gesture, now_s: float) -> None:
-        """Hear one message at `now_s` [s], monotonic."""
+        """Receive one message at `now_s` [s], monotonic."""
         key = (gesture.hand, gesture.kind)
         received = ReceivedGesture(now_s, gesture)
         if gesture.phase != "update":

@@ -1,4 +1,7 @@
-"""Recording on the page: start, stop and how it goes. The recorder is a process of its own; files lie in one folder."""
+"""Recording on the page: start, stop and progress.
+
+The recorder is a process of its own; files lie in one folder.
+"""
 
 import asyncio
 import re
@@ -35,7 +38,7 @@ def recording_path(state: ConsoleState, name: str) -> Path:
 
 
 def start_recording(state: ConsoleState, name: str, previews: bool) -> Path:
-    """Begin to record what the master takes and tells.
+    """Start to record what the master receives and publishes.
 
     Raises:
         PhalanxError: The name is none, is taken, or the recorder cannot be started.

@@ -1,4 +1,6 @@
-"""Who may talk to the console: pages that it served itself, under the name it is reached by. Nobody else's.
+"""Filter for who may talk to the console.
+
+Only pages that it served itself, under the name it is reached by, may do so.
 
 A page of another site, open in the same browser, could otherwise open a web socket to this one (browsers send those
 across origins), show it in a frame and steal a click, or reach it under a name of its own that it lets point here (DNS
@@ -62,7 +64,7 @@ def names_of(host: str) -> frozenset[str]:
 
 
 class OwnPagesOnly:
-    """ASGI middleware that lets only requests through which `refusal` finds nothing against."""
+    """ASGI middleware that passes only requests to which `refusal` has no objection."""
 
     def __init__(
         self, app: ASGIApp, allowed: Collection[str], same_user: Callable[[Peer, Peer], bool] | None = None

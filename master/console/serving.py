@@ -1,4 +1,6 @@
-"""The console's server: uvicorn, with bounds for whoever connects and does not, or not yet, ask like a browser.
+"""Web server of the console: uvicorn with limits on connections.
+
+The limits apply to whoever connects and does not, or not yet, send requests like a browser.
 
 uvicorn by itself waits for ever for a request that never comes or never ends, keeps headers however many there are, and
 gives TLS a minute. A stranger would hold every place, or all memory, without a password.
@@ -23,13 +25,19 @@ _LEAVE_S = 2  # pages that are open do not keep the console from ending
 
 
 class BoundedHttp(HttpToolsProtocol):
-    """One connection. Holds, besides what uvicorn holds, a deadline and how much of a request's head has come."""
+    """One connection, with a deadline and the size of the request head so far.
+
+    It holds these besides what uvicorn holds.
+    """
 
     _deadline: asyncio.TimerHandle | None = None
     _head_bytes = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """Begin to wait for a request; not for one of an address that has half of all places."""
+        """Start to wait for a request.
+
+        A connection is aborted if its address already has half of all places.
+        """
         super().connection_made(transport)
         host = self._host(self)
         if sum(self._host(one) == host for one in self.connections) > MOST_OF_ONE:

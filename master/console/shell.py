@@ -1,4 +1,7 @@
-"""What every page of the console has around it: header with connection and checklist, navigation, light and dark."""
+"""Common frame of every console page.
+
+It has a header with connection and checklist, navigation, and light and dark mode.
+"""
 
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -34,7 +37,10 @@ class Entry:
 
 @contextmanager
 def shell(state: ConsoleState, entries: Sequence[Entry], here: str, logout: bool = False) -> Generator[None]:
-    """Build header and navigation, and a way to log out; what is built within stands in the middle of the page."""
+    """Build header and navigation, and a way to log out.
+
+    What is built within stands in the middle of the page.
+    """
     ui.add_css(_STYLE)
     ui.colors(primary=_PRIMARY)
     with ui.header(elevated=False).classes("console-header items-center gap-2 q-px-md"):

@@ -1,4 +1,6 @@
-"""The console's own web sockets: pictures of a camera as the slave made them, and hands for the 3D view.
+"""Web sockets of the console.
+
+They carry pictures of a camera as the slave made them, and hands for the 3D view.
 
 Each message is sent when the page has shown the one before, so a slow page or network sees fewer, never old ones. An
 open socket is a look at the camera: when it closes, the camera stops showing itself within seconds.
@@ -26,13 +28,16 @@ _TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
 
 
 class _Wish(msgspec.Struct):
-    """What a page says of the picture it wants."""
+    """Request of a page for the picture it wants."""
 
     mask: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_MARKERS)]
 
 
 class Shown:
-    """What the page at the other end said: whether it has shown the last message, and which markers it wants tinted."""
+    """Last message from the page at the other end.
+
+    It states whether the page has shown the last message, and which markers it wants tinted.
+    """
 
     def __init__(self) -> None:
         """It wants the first message."""
@@ -76,7 +81,10 @@ def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
 
 @asynccontextmanager
 async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
-    """Accept the page, and listen to it beside the block, which ends when the page goes."""
+    """Accept the page's socket and listen to it while the block runs.
+
+    The block ends when the page goes.
+    """
     await socket.accept()
     shown = Shown()
     sending = asyncio.current_task()

@@ -1,4 +1,7 @@
-"""What the console knows: read from the bus on threads of its own, shown by the pages, which hold no data."""
+"""State of the console, read from the bus on threads of its own.
+
+The pages show it and hold no data.
+"""
 
 import threading
 import time
@@ -67,14 +70,14 @@ class ConsoleSettings:
 
 
 class Newest(Generic[MessageT]):
-    """Holds the newest message of each sender, at most 64, and when it was heard."""
+    """Newest message of each sender, at most 64, with its time of receipt."""
 
     def __init__(self) -> None:
-        """Nothing was heard."""
+        """Start without any message."""
         self._received: dict[str, tuple[float, MessageT]] = {}
 
     def put(self, name: str, message: MessageT) -> None:
-        """Hear one."""
+        """Receive one message."""
         if name in self._received or len(self._received) < MAX_NAMES:
             self._received[name] = (time.monotonic(), message)
 
@@ -84,7 +87,7 @@ class Newest(Generic[MessageT]):
         return message if time.monotonic() - received_s < within_s else None
 
     def present(self, within_s: float = STALE_S) -> dict[str, MessageT]:
-        """The newest of all that were heard of late."""
+        """Return the newest message of each sender received recently."""
         now_s = time.monotonic()
         return {
             name: one
@@ -94,7 +97,10 @@ class Newest(Generic[MessageT]):
 
 
 class ConsoleState:
-    """Holds the link to the bus, the newest of all that came by it, figures of the last minute, and local processes."""
+    """Link to the bus, newest messages, recent figures and local processes.
+
+    The messages are the newest of all that came over the bus; the figures are those of the last minute.
+    """
 
     def __init__(self, settings: ConsoleSettings, open_bus: Callable[[], Bus] | None = None) -> None:
         """Begin to listen.
@@ -126,27 +132,30 @@ class ConsoleState:
 
     @property
     def poses(self) -> dict[str, HandPose]:
-        """Hand -> its newest pose, of those heard within 3 s."""
+        """Return each hand's newest pose, of those received within 3 s."""
         return self._poses.present()
 
     @property
     def objects(self) -> dict[str, ObjectPose]:
-        """Object -> its newest pose, of those heard within 3 s."""
+        """Return each object's newest pose, of those received within 3 s."""
         return self._objects.present()
 
     @property
     def contacts(self) -> dict[str, Contact]:
-        """HAND/OBJECT -> the newest contact, of those heard within 3 s."""
+        """Return the newest contact per HAND/OBJECT, of those received within 3 s."""
         return self._contacts.present()
 
     @property
     def health(self) -> dict[str, Health]:
-        """Process -> its newest report, of those heard within 3 s."""
+        """Return each process's newest report, of those received within 3 s."""
         return self._health.present()
 
     @property
     def checklist(self) -> Checklist | None:
-        """What is not as it should be; None: no master says."""
+        """Return the checklist: what is not as it should be.
+
+        None if no master reports it.
+        """
         return self._checklists.get(MASTER)
 
     @property
@@ -159,15 +168,24 @@ class ConsoleState:
         return self._previews.get(camera)
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
-        """A page shows this camera for the next 3 s, with the pixels of these markers tinted. Never waits."""
+        """Request this camera's preview for a page for the next 3 s.
+
+        The pixels of these markers are tinted. Never waits.
+        """
         self._preview_leases.look(camera, mask)
 
     def preview_error(self, camera: str) -> str:
-        """Why there is no picture of a camera that somebody looks at; empty while it answers."""
+        """Return why there is no picture of a camera that somebody looks at.
+
+        Empty while the camera answers.
+        """
         return self._sizes.error(camera) or self._preview_leases.error(camera)
 
     def tuner(self, camera: str) -> Tuner:
-        """What tunes a camera, the same for every page: all revert to what it was before the first change."""
+        """Return the tuner of a camera, which is the same for every page.
+
+        Thus all pages revert to what it was before the first change.
+        """
         if camera not in self._tuners:
             self._tuners[camera] = Tuner(camera, self.link.ask)
         return self._tuners[camera]
@@ -186,7 +204,10 @@ class ConsoleState:
         return self.settings.calibration / "cameras" / f"{camera}.json"
 
     def rigs(self) -> dict[str, RigCalibration]:
-        """The rigs whose files are there and right; what is wrong with another one is what the Set-up page is for."""
+        """Return the rigs whose files are present and valid.
+
+        What is wrong with another rig is what the Set-up page is for.
+        """
         found: dict[str, RigCalibration] = {}
         for name in self.rig_names:
             try:
@@ -196,7 +217,10 @@ class ConsoleState:
         return found
 
     def cameras(self) -> tuple[str, ...]:
-        """Cameras of the rigs; without any, those that send something like a camera's report."""
+        """Return the cameras of the rigs.
+
+        Without rigs, return those that send something like a camera's report.
+        """
         named = tuple(dict.fromkeys(camera for rig in self.rigs().values() for camera in rig.cameras))
         return named or tuple(sorted(name for name, one in self.health.items() if "frames" in one.counts))
 

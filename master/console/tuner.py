@@ -1,4 +1,6 @@
-"""How a camera is set, as the page tunes it: what was read back, what it was when the tuning began, and back to that.
+"""Camera settings as the page tunes them.
+
+They are what was read back and what it was when the tuning began, with a way back to that.
 
 Every method asks the slave over the bus and waits for its answer: never on the thread of the page.
 """
@@ -22,7 +24,10 @@ GAINS = ("red_gain", "blue_gain")
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """The colour of a marker in OpenCV's HSV (H 0-179); low[0] above high[0]: it wraps through red."""
+    """Marker colour range in OpenCV's HSV (H 0-179).
+
+    If low[0] is above high[0], the range wraps through red.
+    """
 
     low: tuple[int, int, int]
     high: tuple[int, int, int]
@@ -30,7 +35,7 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class InUse:
-    """What an answer of a slave says.
+    """Settings and colours in use, as a slave's answer reports them.
 
     Attributes:
         wanted: Setting -> what its camera file in use says, by the names of gauges.
@@ -68,7 +73,10 @@ class InUse:
 
 
 def markers_over(used: InUse, known: Iterable[str]) -> dict[str, object]:
-    """The part `markers` of the command "set" after which those of `used` hold and no other of `known`."""
+    """Return the part `markers` of the command "set" that restores `used`.
+
+    After it those of `used` hold and no other of `known`.
+    """
     out: dict[str, object] = {}
     out.update(dict.fromkeys(sorted(set(known) - used.markers.keys())))
     out.update({name: colour_body(colour) for name, colour in used.markers.items()})
@@ -81,7 +89,10 @@ def colour_body(colour: Range) -> dict[str, list[int]]:
 
 
 class Tuner:
-    """Tunes one camera. Holds what was in use when the tuning began or was saved last."""
+    """Tuner of one camera.
+
+    It holds what was in use when the tuning began or was saved last.
+    """
 
     def __init__(self, camera: str, ask: Callable[[Command], Health]) -> None:
         """Nothing was asked yet; `ask` sends a command and waits."""
@@ -111,7 +122,10 @@ class Tuner:
         return self._send("set", json.dumps(change))
 
     def pick(self, marker: str, uv: Sequence[float], t_ns: int | None = None) -> InUse:
-        """Take the colour of a marker from about a pixel of the whole frame, if known of that taken at `t_ns` [ns]."""
+        """Sample a marker's colour around a pixel of the whole frame.
+
+        The frame is the one taken at `t_ns` [ns], if that is known.
+        """
         self._begin()
         pick = ColourPick(marker=marker, uv=(round(float(uv[0]), 2), round(float(uv[1]), 2)), t_ns=t_ns)
         return self._send("pick", msgspec.json.encode(pick).decode())

@@ -1,4 +1,6 @@
-"""Leads a hand that several kinds of sensors watch over what is no motion, part by part: the palm and each finger.
+"""Blending of a hand over jumps that are no motion.
+
+The hand is watched by several kinds of sensors. It is blended part by part: the palm and each finger.
 
 Such a hand is solved elsewhere from one instant to the next whenever another marker is seen or one less, when another
 sensor tells a finger, and when what is told without markers is suddenly else. What is shown goes on as the hand moves,
@@ -27,17 +29,25 @@ _BLENDED_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet whe
 
 
 class Blend:
-    """Push machine. Holds what is left of leaps, what the hand rested on, its markers and its speed."""
+    """Push machine that holds the offsets that remain of jumps.
+
+    It also holds the sources the hand was based on, its markers and its speed.
+    """
 
     def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
-        """Blend each part no faster than a speed [m/s]; `on_palm` (M,) says which markers sit on the back."""
+        """Blend each part no faster than a speed [m/s].
+
+        `on_palm` (M,) marks which markers sit on the back.
+        """
         self._blend_m_s, self._on_palm = blend_m_s, on_palm
         self._offset, self._speed = np.zeros(26), np.zeros(26)
         self._sources = np.zeros(6, np.int64)
         self._points_m = np.full((len(on_palm), 3), np.nan)
 
     def push(self, gap_s: float, sources: Int, shown: Float, solved: Float, points_m: Float) -> Float:
-        """What is to be added to the solved signals (26,) [m] (`master.estimator.smooth`).
+        """Return the offset to be added to the solved signals (26,) [m].
+
+        The signals are those of `master.estimator.smooth`.
 
         Args:
             gap_s: Time since the last; 0: there is none.

@@ -1,4 +1,6 @@
-"""Points fixed to a hand, and how they move with its angles: rigid bodies turning about known axes.
+"""Points fixed to a hand, and how they move with its angles.
+
+The model is rigid bodies rotating about known axes.
 
 A point on a finger is turned by the axes of the joints before it: abduction and flexion at the root (level 0), PIP
 (1) and DIP (2). Turning about axis a through o moves it by a x (point - o). All in the palm frame.
@@ -69,7 +71,10 @@ class BodyPoints:
     def _of(
         cls, model: HandModel, parameters: HandParameters, places: Sequence[tuple[int | None, Float]]
     ) -> "BodyPoints":
-        """Points at (joint of a chain, offset in its frame), or (None, place in the palm frame)."""
+        """Build points from their places on the hand.
+
+        A place is (joint of a chain, offset in its frame), or (None, place in the palm frame).
+        """
         count = len(places)
         finger, level, on_finger = np.zeros(count, int), np.zeros(count, int), np.zeros((count, 1), bool)
         moves = np.zeros((count, 4, len(parameters.free)))
@@ -100,7 +105,10 @@ class BodyPoints:
         )
 
     def place(self, chains: Chains) -> Float:
-        """Where the points are (..., P, 3) [m], palm frame; leading axes as those of the chains."""
+        """Return the positions of the points (..., P, 3) [m], palm frame.
+
+        The leading axes are those of the chains.
+        """
         R = chains.rotation[..., self.finger, self.level, :, :]
         p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
@@ -113,7 +121,10 @@ class BodyPoints:
         return p + (R @ self.offset_m[..., None])[..., 0]
 
     def jacobian(self, chains: Chains, points_m: Float, x: Float) -> Float:
-        """Derivatives (..., P, 3, n) [m/rad] of points (..., P, 3), palm frame, by the parameters, at x (..., n)."""
+        """Return the derivatives of the points by the parameters.
+
+        The result is (..., P, 3, n) [m/rad] for points (..., P, 3), palm frame, at x (..., n).
+        """
         axes = np.empty((*chains.position_m.shape[:-3], 5, 4, 3))
         axes[..., :1, :] = self.abduction_axis
         np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])

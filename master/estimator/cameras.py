@@ -1,4 +1,7 @@
-"""Cameras of a rig as flat arrays, and kernels: project, with derivatives, and undistort."""
+"""Cameras of a rig as flat arrays, with kernels to project and undistort.
+
+Project also gives derivatives.
+"""
 
 from collections.abc import Sequence
 from math import sqrt

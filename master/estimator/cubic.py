@@ -33,7 +33,10 @@ _BRANCH = 0.75  # of a curl: after that the last phalanx folds into the light, a
 
 
 def cubic_pip(distance_m: Float) -> Float:
-    """PIP [rad] by the printed law, clamped outside 0 ... 102.06 mm; NaN where the distance is."""
+    """Return the PIP angle [rad] by the printed law.
+
+    It is clamped outside 0 ... 102.06 mm; NaN where the distance is NaN.
+    """
     d = np.clip(1e3 * distance_m, 0.0, ROOT_MM)
     return np.radians(np.clip(np.polyval(_POLYNOMIAL, d), 0.0, _POLYNOMIAL[-1]))
 
@@ -42,7 +45,10 @@ def cubic_pip(distance_m: Float) -> Float:
 def _laser_points(
     boxed_hand: Float, boxed_device: Float, angles: Float, boxed_work: Float, out: Float
 ) -> None:
-    """Write laser points (C, 5, 3) [m] of hands of angles (C, 20); NaN where the laser misses a finger."""
+    """Write laser points (C, 5, 3) [m] of hands of angles (C, 20).
+
+    NaN where the laser misses a finger.
+    """
     palm, axes = np.zeros((4, 4)), np.zeros((2, 3))
     hand, device, work = boxed_hand[0], boxed_device[0], boxed_work[0]
     flexed_palm(device.palm, 0.0, 0.0, palm, axes)
@@ -60,13 +66,19 @@ def lit(setup: WristSetup, synergy: FlexionSynergy) -> bool:
 
 
 def simulated_lines(setup: WristSetup) -> tuple[FingerLine, ...]:
-    """The lines (5) of a whole curl of the simulated hand, fingers neither spread nor crossed."""
+    """Return the lines (5) of a whole curl of the simulated hand.
+
+    The fingers are neither spread nor crossed.
+    """
     points = _curl(setup, FlexionSynergy.of(setup.model))
     return tuple(principal_line(points[np.isfinite(points[:, f, 0]), f]) for f in range(5))
 
 
 def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
-    """Laser points (C, 5, 3) [m] of a hand that closes; NaN where the laser misses a finger."""
+    """Return laser points (C, 5, 3) [m] of a hand that closes.
+
+    NaN where the laser misses a finger.
+    """
     model = setup.model
     share = np.linspace(0.0, _BRANCH, _CURLS)[:, None]
     curl = synergy.range_rad[:, 0] + share * (synergy.range_rad[:, 1] - synergy.range_rad[:, 0])
@@ -78,14 +90,20 @@ def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
 
 
 class CubicLaw:
-    """Reads laser points of one device by the printed law. What it holds was prepared by the constructor."""
+    """Printed law that maps laser points of one device to angles.
+
+    What it holds was prepared by the constructor.
+    """
 
     def __init__(self, setup: WristSetup) -> None:
         simulated = simulated_lines(setup)
         self.lines = tuple(setup.lines.get(name, line) for name, line in zip(FINGERS, simulated, strict=True))
 
     def __call__(self, points_m: Float) -> Float:
-        """PIPs (5,) [rad] of points (5, 3) on the laser plane [m], camera frame; NaN: not seen, and of the thumb."""
+        """Return the PIPs (5,) [rad] of laser points (5, 3) [m].
+
+        The points are on the laser plane, in the camera frame. NaN: not seen, and for the thumb.
+        """
         pip = np.full(5, np.nan)
         for f, line in enumerate(self.lines[1:], start=1):
             along, _ = on_line(points_m[f], line)

@@ -1,4 +1,6 @@
-"""From what a wrist camera found in a triple to rows: rays, points on the laser plane, and the level asked for.
+"""Conversion of a wrist camera's strobe cycle to estimator rows.
+
+The rows hold rays and points on the laser plane, for the level asked for.
 
 fk     laser points only, of fingers that bend naturally
 ik     only fingers of which laser point and tip are both seen; of the others nothing is said
@@ -21,13 +23,19 @@ _NO_LAW = np.full(5, nan)
 
 
 class CycleReader:
-    """Makes rows of the triples of one device; counts what it leaves out: `outside`, `no_plane`, by finger."""
+    """Reader that converts the strobe cycles of one device to rows.
+
+    It counts what it rejects: `outside`, `no_plane`, by finger.
+    """
 
     def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:
         self._setup, self._cubic, self._counts = setup, cubic, counts
 
     def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
-        """The rows of a triple for an epoch, and its laser points (5, 3) [m], camera frame; NaN: not seen."""
+        """Return the rows of a strobe cycle for an epoch, and its laser points.
+
+        The laser points are (5, 3) [m], camera frame; NaN: not seen.
+        """
         setup, solver_mode = self._setup, self._setup.solver_mode
         uv = np.concatenate([message.laser_uv, message.tip_uv])
         self._reject("outside", uv[:5], message.laser_sigma_px)
@@ -62,7 +70,10 @@ class CycleReader:
         return rows, points_m
 
     def _reject(self, event: str, uv: Float, sigma_px: Float) -> None:
-        """Write NaN to points (5, 2) outside the picture, and to those that may be anywhere in it; count them."""
+        """Write NaN to points (5, 2) that are unusable, and count them.
+
+        These are points outside the picture, and those that may be anywhere in it.
+        """
         optics = self._setup.optics
         right, low = optics.width_px - 0.5, optics.height_px - 0.5
         most_px = max(optics.width_px, optics.height_px)

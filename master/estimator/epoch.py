@@ -1,4 +1,4 @@
-"""What the estimator is handed at an epoch, and what it says."""
+"""Inputs and outputs of the estimator at an epoch."""
 
 from dataclasses import dataclass, field
 
@@ -62,7 +62,9 @@ class OrientationMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristRows:
-    """What one triple of a wrist device shows of five fingers; x, y are those of undistorted rays (x, y, 1).
+    """Measurements of five fingers from one strobe cycle of a wrist device.
+
+    x, y are those of undistorted rays (x, y, 1).
 
     Attributes:
         laser, tip: (5, 2) laser points and fingertips x, y; NaN: not seen.
@@ -110,7 +112,7 @@ class FittedHand(SolvedHand):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """What the estimator says at an epoch.
+    """Result of the estimator at an epoch.
 
     Attributes:
         solution: The hand; None: nothing is known of it.

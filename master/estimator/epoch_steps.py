@@ -1,4 +1,7 @@
-"""The compiled steps of an epoch, with the tables, the state and the room of one hand that they work on."""
+"""Compiled steps of an epoch.
+
+They work on the tables, the state and the scratch arrays of one hand.
+"""
 
 from collections.abc import Sequence
 
@@ -60,7 +63,10 @@ class EpochSteps:
         settings: Settings,
         wrist: WristModel | None,
     ) -> None:
-        """Lay out the tables, and compile. Arguments as of `Estimator`; `posture_prior`: any of those used."""
+        """Lay out the tables, and compile.
+
+        Arguments as of `Estimator`; `posture_prior`: any of those used.
+        """
         self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self.finger = mounts.finger
@@ -157,11 +163,17 @@ class EpochSteps:
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
-        """Step the extras, and search the valleys of the fingers that a wrist device sees."""
+        """Predict the extra unknowns and search the finger minima.
+
+        The search is along the angles of the fingers that a wrist device sees.
+        """
         self._prepare(self._model, self._state, self._space)
 
     def set_priors(self, at: Epoch, *, known: bool) -> None:
-        """Write what is believed beside the past and habits; `known`: whether the past still says anything."""
+        """Write the priors other than the past and the posture prior.
+
+        `known`: whether the past is still informative.
+        """
         epoch_prior, ground, orientation = self.at.epoch_prior, self.at.ground, at.orientation
         epoch_prior.back_normal[:] = at.back_normal
         epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
@@ -193,7 +205,10 @@ class EpochSteps:
         return self._fit(self._model, posture_prior, self.observed, self._blank, self._space)
 
     def take_over(self, *, goes_on: bool) -> Estimate:
-        """Take what was found into the state; `goes_on`: the hand is that of the epoch before."""
+        """Write the solution into the state and return the estimate.
+
+        `goes_on`: the hand is that of the epoch before.
+        """
         out = Estimate.empty()
         self._take_over(self._model, self._state, goes_on, self.observed, self._space, out)
         return out
@@ -207,7 +222,9 @@ class EpochSteps:
         self._state[:] = state
 
     def determines_hand(self, at: Epoch) -> bool:
-        """Return whether the markers fix a hand: not in one line, or across `back_normal`.
+        """Return whether the markers determine a hand.
+
+        They must not lie in one line, unless that line runs across `back_normal`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
@@ -237,7 +254,10 @@ class EpochSteps:
         return bool((marker_chi2 > self._settings.marker_gate).any())
 
     def _lay_out(self, wrist: WristModel) -> None:
-        """Write what is believed of fingers before a wrist device, and of what it leaves open."""
+        """Write the finger priors before a wrist device, and those of the extras.
+
+        The extras are what the device leaves open.
+        """
         prior, state, s = self.at.prior, self.now, self._settings
         prior.base_rad[:], prior.per_pip[:], prior.frame[:] = wrist.base_rad, wrist.per_pip, wrist.frame
         prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad

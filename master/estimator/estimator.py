@@ -76,7 +76,7 @@ class Estimator:
         return int(self._now.t_ns[0])
 
     def has_previous(self, t_ns: int) -> bool:
-        """Whether the state still says anything at `t_ns`."""
+        """Return whether the state is still informative at `t_ns`."""
         age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
         return self._continuous and bool(self._now.known[0]) and 0.0 < age_s <= self.settings.forget_s
 
@@ -185,7 +185,7 @@ class Estimator:
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _knows_place(self) -> bool:
-        """Return whether the place of a hand is known of which only fingers are told."""
+        """Return whether the position of a hand measured only by its fingers is known."""
         return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:

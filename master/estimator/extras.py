@@ -1,4 +1,6 @@
-"""Kernels of what other sensors leave open, and that is filtered: how it goes on by itself, and what an epoch leaves.
+"""Kernels of the filtered extra unknowns that other sensors leave open.
+
+They cover how the extras go on by themselves, and what an epoch leaves.
 
     twist    of the hinges of each finger about its first bone: of the person, all but constant
     bend     of the wrist, flexion and deviation, and their rates: motion about a posture that somebody keeps for a
@@ -48,7 +50,9 @@ class ExtrasScratch:
 
 
 def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
-    """Variances (K,) that doubt grows to; the heading's is that at the beginning.
+    """Return the variances (K,) to which the uncertainty grows.
+
+    The heading's is that at the beginning.
 
     Args:
         settings: Widths.
@@ -83,7 +87,9 @@ def predict_extras(
     epoch_prior: EpochPrior,
     scratch: ExtrasScratch,
 ) -> None:
-    """Step the extras to an epoch, in the state, and write `EpochPrior.z` and `z_info`.
+    """Predict the extras to an epoch, in the state.
+
+    Write `EpochPrior.z` and `z_info`.
 
     Args:
         settings: Paces.

@@ -1,4 +1,6 @@
-"""Kernels of how the MCP of a hand goes with its PIP, learnt from the fingers whose tips are seen.
+"""Kernels of the coupling between MCP and PIP of a hand.
+
+It is learnt from the fingers whose tips are seen.
 
 A natural MCP is a share of the PIP (`master.estimator.flexion_synergy`). But each hand has its own share, and keeps
 to it more closely or less. Both are those of a regression through the origin,
@@ -21,7 +23,10 @@ _BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
 
 @inner
 def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Prior) -> None:
-    """Write share and spread as they are believed, a time after the last triple."""
+    """Write the expected coupling share and spread.
+
+    They hold for a time after the last strobe cycle.
+    """
     kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
     for i in range(3):
         sums[i] *= kept
@@ -34,7 +39,7 @@ def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Pr
 
 @inner
 def learn_coupling(prior: Prior, f: int, scan: Scan, state: HandState) -> None:
-    """Add a finger of which laser and tip tell without doubt."""
+    """Add a finger that laser and tip measure unambiguously."""
     pip, pip2, sums = scan.out[f, 2], scan.pip2[f], state.coupling
     off = scan.out[f, 1] - prior.base_rad[f, 1] - prior.per_pip[f, 1] * pip
     way = scan.way[f, 1] - prior.per_pip[f, 1]

@@ -1,4 +1,6 @@
-"""Kernels of what is believed of a finger along its valley: densities by hand, and the pose that is taken.
+"""Kernels of the probability density of a finger along its minimum over PIP.
+
+They give densities by hand, and the pose that is taken.
 
 Three hands are weighed (`master.estimator.finger_scan`): natural, straight and free ones. Fingers whose tips are seen
 tell which of them it is. A density may have several parts; the one that weighs most, by where the finger was, is taken,
@@ -72,7 +74,9 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
 def weigh_hands(
     hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, scan: Scan
 ) -> None:
-    """Write the evidence of each hand by each finger, and the probabilities of the hands.
+    """Write the evidence of each hand by each finger.
+
+    Write also the probabilities of the hands.
 
     A finger of which the laser alone tells has no say: it is explained by any.
     """
@@ -108,7 +112,10 @@ def weigh_hands(
 
 @inlined
 def _at(scan: Scan, f: int, place: float, out: Float) -> None:
-    """Write the pose (5,) of finger f at a place along its valley, counted in fine steps."""
+    """Write the pose (5,) of finger f at a place along its minimum.
+
+    The place is counted in fine steps.
+    """
     node = min(int(place / FINE), NODES - 2)
     share = place / FINE - node
     for k in range(5):
@@ -119,7 +126,9 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
 def choose(
     hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, scan: Scan
 ) -> None:
-    """Write what is believed of finger f: the median of the part that weighs most, its likeliest pose, and the spread.
+    """Write the estimate of finger f from its density.
+
+    It is the median of the part that weighs most, its likeliest pose, and the spread.
 
     By the densities that `weigh_hands` left.
 

@@ -22,7 +22,9 @@ _STRAIGHT = 0.25  # residual per range above which it is a cloud and no line
 
 
 def principal_line(points_m: Float) -> FingerLine:
-    """The line through laser points of one finger, by the principal component of their scatter.
+    """Fit the line through the laser points of one finger.
+
+    It follows the principal component of their scatter.
 
     Args:
         points_m: (N, 3) [m], camera frame, in any order; NaN rows are left out.
@@ -65,7 +67,10 @@ def principal_line(points_m: Float) -> FingerLine:
 
 
 def on_line(points_m: Float, line: FingerLine) -> tuple[Float, Float]:
-    """Points (..., 3) normalised along the line: 0 straight ... 1 most bent (...), and their deviation (..., 3) [m]."""
+    """Return normalised positions along the line, and deviations from it.
+
+    Points (..., 3) give positions (...), from 0 straight to 1 most flexed, and deviations (..., 3) [m].
+    """
     offset = points_m - np.array(line.origin_m)
     direction = np.array(line.direction)
     along = offset @ direction

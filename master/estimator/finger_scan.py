@@ -1,4 +1,6 @@
-"""Kernels of the search along a finger's valley: for every PIP the best of the other angles, and how likely it is.
+"""Kernels of the search along a finger's minimum.
+
+For every PIP they find the best of the other angles, and how likely it is.
 
 Laser point and fingertip hold a finger's angles in some directions well and in others hardly: near the turn of a
 fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip nothing but habit
@@ -41,7 +43,7 @@ _HIDDEN_M = 1.5e-3  # of a fingertip behind the skin that the camera sees: its o
 
 
 class Prior:
-    """What is believed of fingers before a triple is seen.
+    """Prior of the fingers before a strobe cycle is seen.
 
     Attributes:
         palm: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) as of `flexed_palm`.
@@ -107,7 +109,7 @@ class Prior:
 
 
 class Scan:
-    """What is known of five fingers along their valleys.
+    """Estimates of five fingers along their minima, for every PIP.
 
     Attributes:
         x: (5, NODES, 5) angles and twist [rad] at each PIP.
@@ -217,7 +219,10 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 def _rows(
     settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, tip: bool, scan: Scan
 ) -> float:
-    """Write residuals (8,) and derivatives (8, 4) of what `look` left in `scan.surface`; return half chi square."""
+    """Write residuals (8,) and derivatives (8, 4); return half chi-square.
+
+    They are those of what `look` left in `scan.surface`.
+    """
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
         r[i] = 0.0
@@ -295,7 +300,7 @@ def scan_finger(
     tip: bool,
     scan: Scan,
 ) -> None:
-    """Write the valley of finger f, from `Scan.x` to `chi2`."""
+    """Write the minimum of finger f along its PIPs, from `Scan.x` to `chi2`."""
     a, x, surface = scan.angles, scan.x, scan.surface
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
     scan.chi2[f] = inf

@@ -1,4 +1,6 @@
-"""Kernels of a finger before a wrist device: its skin, where the laser meets it, and its tip.
+"""Kernels of a finger before a wrist device.
+
+They model its skin, where the laser meets it, and its tip.
 
 The skin of a finger is a chain of capsules (`common.palmar_surface`), cut by the plane of the laser. What the camera
 makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
@@ -88,7 +90,10 @@ class Surface:
 
 @inner
 def spheres(device: Any, f: int, work: Surface) -> None:
-    """Write the spheres of finger f of joints `work.R`, `work.P`, and the way of the chain."""
+    """Write the spheres of finger f and the direction of the chain.
+
+    The joints are `work.R`, `work.P`.
+    """
     S, along, bone, R, P = work.S, work.along, work.bone, work.R, work.P
     for k in range(8):
         b = _BONE[k]
@@ -122,7 +127,9 @@ def spheres(device: Any, f: int, work: Surface) -> None:
 
 @inner
 def crossing(device: Any, f: int, work: Surface) -> int:
-    """Write where the ridge of finger f, of `work.S`, crosses the plane, and its way there.
+    """Write where the ridge of finger f crosses the plane, and its direction there.
+
+    The ridge is that of `work.S`.
 
     Returns:
         The stretch on which it does, plus 16 where the chain does not reach the plane and was prolonged.
@@ -178,7 +185,10 @@ def crossing(device: Any, f: int, work: Surface) -> int:
 
 @inlined
 def _terms(S: Float, k: int, r1: float, r2: float, ox: float, oy: float, oz: float, out: Float) -> None:
-    """Write what `_first` needs of the cone between spheres k and k + 1, seen from a point."""
+    """Write the terms that `first_hit` needs of one cone, seen from a point.
+
+    The cone lies between spheres k and k + 1.
+    """
     ax, ay, az = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
     wx, wy, wz = ox - S[k, 0], oy - S[k, 1], oz - S[k, 2]
     bx, by, bz = ox - S[k + 1, 0], oy - S[k + 1, 1], oz - S[k + 1, 2]
@@ -204,7 +214,10 @@ def _away(S: Float, k: int) -> float:
 
 @inlined
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
-    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.tapered_capsules`)."""
+    """Return the distance along a unit ray to the cone of terms (12,).
+
+    inf: the cone is missed (`common.tapered_capsules`).
+    """
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
     best, d2 = inf, t[6]
     k2, k1 = d2 - m2 * m2, d2 * m3 + m2 * t[8]
@@ -226,7 +239,9 @@ def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
 
 @inner
 def laser_centroid(device: Any, f: int, work: Surface) -> float:
-    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.laser_centroid` (3,) [m].
+    """Write the centroid of the lit and visible laser line on finger f.
+
+    It is of `work.S` and goes to `work.laser_centroid` (3,) [m].
 
     Returns:
         Length of that line in the undistorted image [px]; 0: the laser misses the finger, or it is not seen.

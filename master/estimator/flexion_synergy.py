@@ -33,7 +33,10 @@ class FlexionSynergy:
 
     @classmethod
     def of(cls, model: HandModel) -> "FlexionSynergy":
-        """That of a hand: its own couplings where its file states them, else those of Digits."""
+        """Return the flexion synergy of a hand.
+
+        It uses the hand's own couplings where its file states them, else those of Digits.
+        """
         stated = model.profile.couplings is not None
         digits = preset_couplings("D")
         mcp, dip = (model.mcp_per_pip, model.dip_per_pip) if stated else (None, None)

@@ -68,11 +68,14 @@ class Forearm:
 
     @property
     def placed(self) -> bool:
-        """Whether the file says where up is in the rig."""
+        """Return whether the file states where up is in the rig."""
         return self._rig_world is not None
 
     def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""
+        """Take one sample of the IMU.
+
+        The quaternion (4,) is IMU axes -> its world, and the heading drift is given if reported.
+        """
         self._samples.push(t_ns, wxyz, heading_sigma_rad)
         if isnan(sum(wxyz.tolist())):
             return
@@ -83,7 +86,9 @@ class Forearm:
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
 
     def orientation_at(self, t_ns: int, z: Float, z_cov: Float) -> OrientationMeasurement | None:
-        """How the forearm turns the palm at an epoch; None: no sample is near, or the rig does not place its world.
+        """Return how the forearm rotates the palm at an epoch.
+
+        None: no sample is near, or the rig does not place the IMU's world.
 
         Args:
             t_ns: The epoch.
@@ -119,7 +124,10 @@ class Forearm:
         return atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
 
     def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
-        """Note whether the palm contradicts at an epoch; return whether it did so for long, and is right."""
+        """Note whether the palm contradicts the forearm at an epoch.
+
+        Return whether it did so for long, and is right.
+        """
         if not by_palm:
             self._contrary_ns.clear()
             return False
@@ -129,7 +137,9 @@ class Forearm:
         return long and len(self._contrary_ns) >= _CONTRARY
 
     def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
-        """The palm at an instant in the IMU's own world, which needs no heading.
+        """Return the palm orientation at a time in the IMU's own world.
+
+        This needs no heading.
 
         Args:
             t_ns: The instant.
@@ -165,7 +175,7 @@ class Forearm:
 
     @staticmethod
     def _tilted(rig_world: Wxyz, z: Float) -> Wxyz:
-        """The IMU's world in the rig, tilted as is believed."""
+        """Return the IMU's world in the rig, tilted by the estimated tilt."""
         x, y = z[TILT : TILT + 2].tolist()
         angle = hypot(x, y)
         share = sin(0.5 * angle) / angle if angle > _SMALL_RAD else 0.5

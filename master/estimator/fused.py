@@ -30,7 +30,9 @@ _KEPT = 8
 
 
 class WristSide:
-    """Push machine. Holds triples that wait for an epoch, the last one, and the samples of the IMU.
+    """Push machine that holds the wrist device's pending strobe cycles.
+
+    They wait for an epoch; it also holds the last strobe cycle and the samples of the IMU.
 
     Attributes:
         forearm: Of the IMU; None: there is none, or it is not known how it is mounted or placed.
@@ -58,7 +60,10 @@ class WristSide:
         self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
 
     def push(self, message: WristDetections) -> int | None:
-        """Take a triple; return its time, or None: it is not later than the last."""
+        """Take a strobe cycle and return its time.
+
+        None: it is not later than the last.
+        """
         t_ns = message.t_ns + self._setup.late_ns
         if t_ns <= self._last_ns:
             self.counts["late"] += 1
@@ -68,7 +73,10 @@ class WristSide:
         return t_ns
 
     def rows_at(self, t_ns: int) -> WristRows | None:
-        """The rows of the newest triple that no epoch had, for one at `t_ns`; None: there is none that is fresh."""
+        """Return the rows of the newest unused strobe cycle, for an epoch at `t_ns`.
+
+        None: there is no fresh one.
+        """
         late_ns, message = self._setup.late_ns, None
         if not self._continuous:
             near = min(self._waiting, key=lambda one: abs(one.t_ns + late_ns - t_ns), default=None)
@@ -85,7 +93,10 @@ class WristSide:
         return rows
 
     def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
-        """How the IMU has the palm turned at an epoch; None: it does not say, or its heading may be any."""
+        """Return the palm orientation by the IMU at an epoch.
+
+        None: the IMU does not report it, or its heading may be any.
+        """
         if self.forearm is None:
             return None
         if self.forearm.lost:
@@ -155,7 +166,10 @@ class WristSide:
 
 
 class FusedPipeline:
-    """Push machine. Holds the marker line, whose wrist side it feeds, and when the cameras last made a pose."""
+    """Push machine that joins the marker line and its wrist side.
+
+    It holds the marker line, whose wrist side it feeds, and when the cameras last made a pose.
+    """
 
     def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
         """Join the parts.
@@ -184,7 +198,7 @@ class FusedPipeline:
         return [] if solved is None else [solved]
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU on the forearm says of its own orientation (4,)."""
+        """Take the orientation (4,) that the IMU on the forearm reports."""
         if self._side.forearm is None:
             self.counts["orientation.unplaced"] += 1
         else:

@@ -195,7 +195,10 @@ def rehearse(cameras: CameraArrays) -> None:
 
 @kernel
 def _seen_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> None:
-    """Write where camera `c` sees a point, and derivatives: what kernels call has no door from Python."""
+    """Write where camera `c` sees a point, and derivatives.
+
+    Functions that kernels call have no entry point from Python.
+    """
     project(cameras, c, point, uv, J)
 
 

@@ -56,7 +56,7 @@ class Posterior:
 
 
 class Blank(NamedTuple):
-    """Of which nothing is believed: what `_onto` needs for a fit to points alone.
+    """Empty prior, used by `_onto` for a fit to points alone.
 
     `epoch_prior`: the array that a `EpochPrior` lies in (`common.records.boxed`).
     """

@@ -1,4 +1,7 @@
-"""The quaternions of one IMU between its samples: the shorter arc, gaps, what is no rotation, clocks set back."""
+"""Orientation of one IMU between its samples.
+
+It handles the shorter arc, gaps, values that are no rotation, and clocks set back.
+"""
 
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -22,7 +25,7 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Between:
-    """An IMU's orientation at an instant.
+    """Orientation of an IMU at a time.
 
     Attributes:
         q_wxyz: Unit quaternion.
@@ -59,7 +62,9 @@ class OrientationSamples:
         return len(self._samples)
 
     def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world, q as good as -q; how far its heading has drifted.
+        """Take one sample of the IMU and how far its heading has drifted.
+
+        The quaternion (4,) is IMU axes -> its world, q as good as -q.
 
         What is no rotation is left out. A sample long before the newest means that a clock was set back, or that the
         newest came from a time that is not yet: the others are forgotten.
@@ -85,7 +90,9 @@ class OrientationSamples:
             self._samples.append(_Sample(t_ns, unit, drift_rad))
 
     def between(self, t_ns: int) -> Between | None:
-        """The orientation at an instant; None: too far from any sample.
+        """Return the orientation at a time.
+
+        None: too far from any sample.
 
         The times to both sides count as resistors in parallel do: with one side alone it is the time to that.
         """
@@ -109,7 +116,10 @@ class OrientationSamples:
 
 
 def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
-    """Unit quaternion on the shorter arc between two, at `share` 0...1 of the way (Shoemake, 1985)."""
+    """Return the unit quaternion at `share` 0...1 between two.
+
+    It lies on the shorter arc (Shoemake, 1985).
+    """
     (a, b, c, d), (w, x, y, z) = first, second
     cosine = a * w + b * x + c * y + d * z
     angle = acos(min(abs(cosine), 1.0))

@@ -85,7 +85,10 @@ class CovarianceScratch:
 
 @inner
 def surer(now: Float, past: Float, scratch: CovarianceScratch, out: Float) -> None:
-    """Write the covariance (N, N) that is in each direction that of the surer of two, both positive definite."""
+    """Write the covariance (N, N) that is the smaller of two in each direction.
+
+    Both are positive definite.
+    """
     N, L, A, V = now.shape[0], scratch.L, scratch.A, scratch.V
     if not cholesky(now, N, L):
         for i in range(N):
@@ -124,7 +127,10 @@ def surer(now: Float, past: Float, scratch: CovarianceScratch, out: Float) -> No
 
 @inner
 def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
-    """Let an epoch say no more of hidden fingers than their limits, seen from where they are believed to be."""
+    """Reduce an epoch's information on hidden fingers to their limits.
+
+    The limits are seen from where the fingers are expected.
+    """
     N = cov.shape[0]
     for f in range(5):
         if hidden.gone_s[f] <= 0.0:
@@ -138,7 +144,10 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 @inner
 def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: CovarianceScratch) -> int:
-    """Write derivatives of a joint (10, 3) and which unknowns they belong to; return how many."""
+    """Write the derivatives of a joint (10, 3) and their unknowns.
+
+    Return how many unknowns they belong to.
+    """
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
         work.point[i] = work.P[f, level, i] if f >= 0 else T[i, 3]
@@ -178,7 +187,10 @@ def _project(cov: Float, count: int, scratch: CovarianceScratch, out: Float) -> 
 def linear(
     hand: HandTables, T: Float, cov: Float, work: Scratch, scratch: CovarianceScratch, joint_cov: Float
 ) -> None:
-    """Write the covariances of the joints (26, 3, 3) [m^2], by their derivatives; `work` as `chains` left it."""
+    """Write the covariances of the joints (26, 3, 3) [m^2], by derivatives.
+
+    `work` is as `chains` left it.
+    """
     for joint in range(26):
         count = joint_jacobian(hand, joint, T, work, scratch)
         _project(cov, count, scratch, joint_cov[joint])
@@ -195,7 +207,9 @@ def tilts(
     tilt: Float,
     process_noise: Float,
 ) -> None:
-    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2], and how fast they walk (5,).
+    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2].
+
+    Write also how fast they walk (5,).
 
     `work` as `chains` left it; of the walk the trace [rad^2/s^2].
     """
@@ -223,7 +237,10 @@ def tilts(
 
 @inlined
 def _widest(C: Float) -> float:
-    """The largest eigenvalue of a symmetric matrix (3, 3), by its characteristic polynomial."""
+    """Return the largest eigenvalue of a symmetric matrix (3, 3).
+
+    It solves the characteristic polynomial.
+    """
     mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
     a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
     d, e, f = C[0, 1], C[0, 2], C[1, 2]
@@ -236,7 +253,9 @@ def _widest(C: Float) -> float:
 
 @inner
 def is_small(hand: HandTables, cov: Float, joint: int, most_m: float) -> bool:
-    """Whether the 95 % region of a joint, of covariances (26, 3, 3), reaches no farther than so far.
+    """Return whether a joint's 95 % region stays within a distance.
+
+    The covariances are (26, 3, 3).
 
     And that of its finger's PIP: a tip may be known to millimetres, and not how the finger is bent.
     """

@@ -21,7 +21,10 @@ PLACE, DIRECTION = constant(0), constant(1)
 
 
 class Scratch:
-    """Scratch for the intermediate results of kernels; holds nothing from one call to the next."""
+    """Scratch for the intermediate results of kernels.
+
+    It holds nothing from one call to the next.
+    """
 
     uv: Float  # (2,)
     J: Float  # (2, 3)
@@ -138,7 +141,9 @@ def chains(tables: HandTables, T: Float, angles: Float, R: Float, P: Float) -> N
 
 @inner
 def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, P: Float) -> None:
-    """Write joint rotations and places of finger f alone, in the frame of the palm's pose.
+    """Write joint rotations and places of finger f alone.
+
+    They are in the frame of the palm's pose.
 
     Args:
         tables: The hand.
@@ -178,7 +183,10 @@ def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, 
 
 @inlined
 def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
-    """Write the axis (3,) about which finger f abducts, in the frame of the palm's pose."""
+    """Write the axis (3,) about which finger f abducts.
+
+    It is in the frame of the palm's pose.
+    """
     for i in range(3):
         out[i] = 0.0
         for j in range(3):
@@ -187,7 +195,9 @@ def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
 
 @inner
 def twist_hand(tables: HandTables, twist: Float) -> None:
-    """Roll the hinges of each finger about its first bone by (5,) [rad]: `HandTables.swing` of the abduction.
+    """Roll the hinges of each finger about its first bone by (5,) [rad].
+
+    This changes `HandTables.swing` of the abduction.
 
     The axes of a hand file are those of a drawing, and a person's lie askew to them by a few degrees. Rodrigues.
     """
@@ -354,7 +364,10 @@ def rotate_by(step: Float, T: Float, out: Float) -> None:
 
 @inlined
 def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
-    """Write the rotation vector (3,) of A B' of rotations (>= 3, >= 3); `c`: (3, 3) scratch."""
+    """Write the rotation vector (3,) of A B' of two rotations.
+
+    The rotations are (>= 3, >= 3); `c`: (3, 3) scratch.
+    """
     for i in range(3):
         for j in range(3):
             c[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
@@ -413,7 +426,9 @@ def pose(
     rotation: Float,
     out: Float,
 ) -> None:
-    """Write joints and markers of a palm (4, 4) and all angles (20,) [rad], rig frame.
+    """Write joints and markers of a palm (4, 4) and all angles (20,) [rad].
+
+    They are in the rig frame.
 
     Args:
         boxed_hand, mounts: The hand (`common.kernels.boxed`) and its markers.

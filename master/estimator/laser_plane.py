@@ -1,4 +1,6 @@
-"""Where rays meet the laser plane, how sure that is, and coordinates in that plane.
+"""Intersections of rays with the laser plane, with their uncertainty.
+
+It also gives coordinates in that plane.
 
 A pixel is the ray r = (x, y, 1) through its undistorted point; it meets the plane n . X = c at X = c r / (n . r)
 (Digits, UIST 2012: triangulation by one camera and a plane of light). The plane is seen at a flat angle, so one pixel
@@ -31,13 +33,19 @@ class LaserPoints:
 
 
 def in_image(setup: WristSetup, uv: Float, sigma_px: Float) -> Bool:
-    """Which pixels (N, 2) can have been seen (N,): in the image, and their standard deviations (N,) not beyond it."""
+    """Return which pixels (N, 2) can have been seen (N,).
+
+    They must be in the image, and their standard deviations (N,) not beyond it.
+    """
     size = np.array([setup.optics.width_px, setup.optics.height_px])
     return ((uv >= -0.5) & (uv <= size - 0.5)).all(axis=1) & (sigma_px <= size.max())
 
 
 def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:
-    """The points on the laser plane behind pixels (N, 2) of the distorted image, of standard deviations (N,) [px]."""
+    """Return the points on the laser plane behind pixels (N, 2).
+
+    The pixels are of the distorted image, of standard deviations (N,) [px].
+    """
     rays = setup.optics.ray(uv[:, None] + _AROUND_PX)
     found = intersect_plane(np.zeros(3), rays, setup.normal, setup.offset_m)
     by_pixel = (found[:, 1::2] - found[:, 2::2]) * (sigma_px / (2.0 * _STEP_PX))[:, None, None]
@@ -48,7 +56,9 @@ def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneAxes:
-    """Two axes in the laser plane, from where its light comes: across (image right) and along (away from the camera).
+    """Two axes in the laser plane, from where its light comes.
+
+    They are across (image right) and along (away from the camera).
 
     Attributes:
         origin_m: (3,) [m], camera frame.

@@ -12,7 +12,10 @@ _SWEEPS, _NOTHING = 30, 1e-36  # of Jacobi; squares of what is beside the diagon
 
 @inner
 def cholesky(A: Float, n: int, L: Float) -> bool:
-    """Write the factor L of A = L L' (n, n), lower triangle; False: not positive definite."""
+    """Write the factor L of A = L L' (n, n), lower triangle.
+
+    False: not positive definite.
+    """
     for j in range(n):
         total = A[j, j]
         for k in range(j):
@@ -94,7 +97,9 @@ def inverse_3(A: Float, B: Float, out: Float) -> None:
 
 @inner
 def eigen(A: Float, n: int, values: Float, vectors: Float) -> None:
-    """Write eigenvalues (n,) and eigenvectors, as columns (n, n), of a symmetric matrix, which is destroyed.
+    """Write eigenvalues (n,) and eigenvectors of a symmetric matrix.
+
+    The eigenvectors are columns (n, n). The matrix is destroyed.
 
     Jacobi's cyclic rotations (Golub, Van Loan, "Matrix Computations", 8.5).
     """

@@ -1,4 +1,6 @@
-"""The palm's orientation as an IMU on it measures it: mounted, placed in the rig, and with its covariance.
+"""Orientation of the palm measured by an IMU on it.
+
+The IMU is mounted and placed in the rig; the orientation has its covariance.
 
 An IMU tells its axes in a world of its own, whose z axis is vertical:
 
@@ -56,11 +58,16 @@ class OrientationTrack:
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
 
     def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world; see `OrientationSamples.push`."""
+        """Take one sample: quaternion (4,), IMU axes -> its world.
+
+        See `OrientationSamples.push`.
+        """
         self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def at(self, t_ns: int, near: SolvedHand | None) -> OrientationMeasurement | None:
-        """The palm's orientation at an instant; None where no sample is near enough.
+        """Return the palm's orientation at a time.
+
+        None where no sample is near enough.
 
         Args:
             t_ns: The instant.
@@ -90,7 +97,10 @@ class OrientationTrack:
 
 
 def _twist_about(axis: Float, rotation: Float) -> Float:
-    """The turn (3, 3) about a unit axis (3,) that comes nearest to a rotation (3, 3): its twist."""
+    """Return the rotation (3, 3) about a unit axis (3,) nearest to a given one.
+
+    For a rotation (3, 3) this is its twist.
+    """
     w, *v = matrix_to_quaternion(rotation)
     return rotation_vector_to_matrix(2.0 * atan2(float(np.array(v) @ axis), float(w)) * axis)
 

@@ -1,4 +1,6 @@
-"""What the whole-hand fit is free to choose: the angles that no coupling fixes, and the bounds of each.
+"""Free parameters of the whole-hand fit.
+
+They are the angles that no coupling fixes, and the bounds of each.
 
 A parameter vector is the palm's rotation (3, rotation vector about the wrist, rig frame) and translation (3),
 then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it does not follow exactly) of each
@@ -59,7 +61,10 @@ class HandParameters:
 
     @classmethod
     def of(cls, model: HandModel) -> "HandParameters":
-        """The free angles of a hand: 20, or 16 where the DIPs follow exactly and no posture prior has their spread."""
+        """Return the free angles of a hand: 20, or 16 where the DIPs follow exactly.
+
+        There are 16 only if no posture prior has the spread of the DIPs.
+        """
         follows = model.dip_spread_rad == 0.0 and model.posture is None
         ratio = model.dip_per_pip if follows else None
         free = np.array([a for a in range(20) if not (ratio is not None and a >= 4 and a % 4 == 3)])
@@ -105,7 +110,10 @@ class HandParameters:
         return self.by_parameters(self.complete[:, None].copy(), x)[:, 0]
 
     def by_parameters(self, J: Float, x: Float) -> Float:
-        """Derivatives (..., P, 3, n) by the free angles as they are -> by the parameters at x (..., n); in place."""
+        """Convert derivatives (..., P, 3, n) by free angles to those by parameters.
+
+        The former are by the free angles as they are, the latter by the parameters at x (..., n); in place.
+        """
         if len(self.most):
             flexed = self._flexed(x)
             spread_derivative = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]

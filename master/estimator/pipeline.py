@@ -1,4 +1,6 @@
-"""The marker rig: centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
+"""Pipeline of the marker rig.
+
+It takes centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
 
 `MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
 and get the same poses. It is built from calibration by `master.rig`.
@@ -41,14 +43,23 @@ _NEVER_NS = -(2**62)
 
 
 class WristSideOf(Protocol):
-    """What a wrist device and its IMU say of the hand that the cameras watch (`master.estimator.fused`)."""
+    """Measurements by a wrist device and its IMU of the hand the cameras watch.
+
+    See `master.estimator.fused`.
+    """
 
     def rows_at(self, t_ns: int) -> WristRows | None:
-        """The rows of a triple that no epoch had; None: there is none."""
+        """Return the rows of a strobe cycle that no epoch had.
+
+        None: there is none.
+        """
         ...
 
     def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
-        """How the IMU has the palm turned; None: it does not say."""
+        """Return the palm orientation measured by the IMU.
+
+        None: the IMU does not report it.
+        """
         ...
 
     def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
@@ -62,14 +73,17 @@ class WristSideOf(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SolvedPose:
-    """A pose, and when the last frame that contributed to it was handed to its slave [ns]."""
+    """A pose, and when the last contributing frame was handed to its slave [ns]."""
 
     pose: HandPose
     ready_t_ns: int
 
 
 class MarkerPipeline:
-    """Push machine. Holds sync, line, estimator and filter, each with its own state, and where markers were last."""
+    """Push machine that holds sync, line, estimator and filter.
+
+    Each has its own state; it also holds where markers were last.
+    """
 
     def __init__(
         self,
@@ -139,7 +153,10 @@ class MarkerPipeline:
         return self._solved(sets)
 
     def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
-        """The pose at an epoch at which no camera saw anything, by what else watches the hand; None: it is past."""
+        """Return the pose at an epoch at which no camera saw anything.
+
+        It comes from what else watches the hand; None: the epoch is past.
+        """
         shape = (len(self._names), len(self.markers))
         unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
         missing = np.ones(len(self._names), np.bool_)
@@ -147,7 +164,10 @@ class MarkerPipeline:
         return poses[0] if poses else None
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU says of its own orientation (4,), for the epochs about `t_ns`."""
+        """Take the orientation (4,) that the IMU reports of itself.
+
+        It serves the epochs about `t_ns`.
+        """
         if self._orientation is None:
             self.counts["orientation.unplaced"] += 1
         else:
@@ -158,7 +178,10 @@ class MarkerPipeline:
         return self._solved(self._line.sync.flush())
 
     def _solved(self, sets: list[FrameSet]) -> list[SolvedPose]:
-        """Poses of epochs later than the last one; others are counted: cameras came back with old frames."""
+        """Return the poses of epochs later than the last one.
+
+        Others are counted: cameras came back with old frames.
+        """
         poses: list[SolvedPose] = []
         for frames in sets:
             if frames.t_ns <= self._last_ns:
@@ -200,7 +223,7 @@ class MarkerPipeline:
         return SolvedPose(pose, frames.ready_t_ns)
 
     def _recent(self, t_ns: int) -> SolvedHand | None:
-        """The hand that was fitted last, if it still says anything."""
+        """Return the hand that was fitted last, if it is still informative."""
         if self._estimator is None or self._last is None or not self._estimator.has_previous(t_ns):
             return None
         return self._last.solution

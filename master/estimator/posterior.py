@@ -1,4 +1,6 @@
-"""Kernels of what an epoch says: both hypotheses, their evidence, mean and covariance.
+"""Kernels of the posterior of an epoch.
+
+They compute both hypotheses, their evidence, mean and covariance.
 
 The evidence of a hypothesis is the density of the markers under it, by Laplace's approximation
 
@@ -103,7 +105,9 @@ def _solve_each(
 def _weigh(
     posture_prior: PosturePrior, settings: Settings, natural_weight: float, counts: float, scratch: Scratch
 ) -> None:
-    """Write the probability of each hypothesis, from its evidence and what it was before.
+    """Write the probability of each hypothesis.
+
+    It follows from the hypothesis's evidence and from what it was before.
 
     `natural_weight` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
     """
@@ -125,7 +129,10 @@ def _weigh(
 
 @inner
 def _least(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, scratch: Scratch) -> float:
-    """The least that habits and beliefs about single angles of this instant cost: what they contradict each other."""
+    """Return the least cost of the posture prior and the single-angle priors.
+
+    The latter are those of this epoch. The least cost is by how much they contradict each other.
+    """
     n = epoch_prior.own.shape[0]
     x = scratch.cut.weight
     for i in range(n):
@@ -149,7 +156,10 @@ def _covariance(
     numbers: float,
     scratch: Scratch,
 ) -> float:
-    """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
+    """Write the covariance (N, N) of one hypothesis; return its scale.
+
+    The covariance is by this epoch alone.
+    """
     N, A, one = scratch.middle.shape[0], scratch.A, scratch.each[h]
     for i in range(N):
         for j in range(i + 1):
@@ -195,7 +205,10 @@ def _mix(
     scratch: Scratch,
     out: Posterior,
 ) -> int:
-    """Write mean step and covariance of the hypotheses together; return the likelier one."""
+    """Write mean step and covariance of the hypotheses together.
+
+    Return the likelier one.
+    """
     n, N = out.x.shape[0], scratch.middle.shape[0]
     best = likelier(scratch)
     if scratch.each[best].share[0] > 1.0 - settings.negligible:
@@ -240,7 +253,10 @@ def _mix(
 
 @inlined
 def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
-    """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
+    """Write where the step of a hypothesis brings the markers.
+
+    They go to room.here (M, 3), as if on straight lines.
+    """
     markers_of(rig.hand, rig.mounts, one.palm, one.x, scratch.search.rows, scratch.here)
     moves = False
     for i in range(one.step.shape[0]):
@@ -269,7 +285,7 @@ def _onto(
     scratch: Scratch,
     out: Posterior,
 ) -> None:
-    """Move the likelier hand by the mean step, then to where the mean of the markers is.
+    """Move the likelier hand by the mean step, then to the mean of the markers.
 
     What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
     step, the shortest by the normal matrix, to where the mean of their markers is.

@@ -1,4 +1,6 @@
-"""What is believed of a hand before a marker is seen: habits of natural and of free hands, and curled fingers.
+"""Prior of a hand before a marker is seen.
+
+It covers the posture priors of natural and of free hands, and curled fingers.
 
 Every belief is a row of a least-squares problem that is linear in the free angles, divided by its standard deviation.
 
@@ -22,7 +24,9 @@ Row = tuple[dict[int, float], float, float]
 
 
 class PosturePrior(NamedTuple):
-    """Beliefs about the free angles x of H hypotheses: x normal x / 2 - pull x + constant, half a sum of squares.
+    """Prior on the free angles x of H hypotheses.
+
+    The cost is x normal x / 2 - pull x + constant, half a sum of squares.
 
     Attributes:
         normal: (H, n, n).
@@ -37,7 +41,10 @@ class PosturePrior(NamedTuple):
     log_density: Float
 
     def without(self, columns: Int, mean: float, sigma: float) -> "PosturePrior":
-        """The same, but the first hypothesis without its belief about each of these angles by itself."""
+        """Return the prior without single-angle rows in the first hypothesis.
+
+        The rows removed are those on each of these angles by itself.
+        """
         normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
         normal[0, columns, columns] -= 1.0 / sigma**2
         pull[0, columns] -= mean / sigma**2
@@ -55,7 +62,7 @@ def posture_prior_of(
     settings: Settings = DEFAULT,
     unlike: frozenset[int] = frozenset(),
 ) -> PosturePrior:
-    """Habits of a natural hand and of a free one.
+    """Return the posture priors of a natural hand and of a free one.
 
     Args:
         model, parameters: The hand.
@@ -81,7 +88,10 @@ def posture_prior_of(
 
 
 def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tuple[Float, Float]:
-    """Inverse variances and means (n,) of the angles of fingers (5,) that are curled out of sight."""
+    """Return the inverse variances and means (n,) of curled fingers' angles.
+
+    The fingers (5,) are curled out of sight.
+    """
     angles, sigma = np.zeros((5, 4)), np.full((5, 4), np.inf)
     s = settings
     angles[0] = (
@@ -98,7 +108,11 @@ def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tup
 
 
 def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list[Row]:
-    """Natural flexion, small abduction, neighbours alike, a loose thumb; angles by their place in the flat table."""
+    """Return the prior rows of a natural hand.
+
+    They are natural flexion, small abduction, neighbours alike, a loose thumb; angles by their place in the flat
+    table.
+    """
     if model.posture is not None:
         return _posture_rows(*model.posture, 1.0)
     thumb = (
@@ -152,7 +166,10 @@ def _free_rows(model: HandModel, s: Settings) -> list[Row]:
 
 
 def _loose_dip(model: HandModel, a: int, s: Settings) -> list[Row]:
-    """That the DIP of the finger whose angles begin at `a` follows its PIP, if it does so at all loosely."""
+    """Return the row that couples a DIP to its PIP.
+
+    The finger's angles begin at `a`. There is a row only if the DIP follows loosely.
+    """
     if model.dip_per_pip is None:
         return [({a + 3: 1.0, a + 2: -s.loose_dip_per_pip}, 0.0, s.loose_dip_rad)]
     if model.dip_spread_rad > 0.0:

@@ -1,4 +1,7 @@
-"""What a search for a hand works on: the rig, what is believed of the hand, and room."""
+"""Inputs of the search for a hand.
+
+They are the rig, the prior of the hand, and scratch arrays.
+"""
 
 from typing import NamedTuple
 
@@ -12,7 +15,10 @@ from master.estimator.wrist_device import Device, LinesOfSight
 
 
 class Rig(NamedTuple):
-    """What is the same at every epoch: the hand, its markers, the cameras, and a wrist device."""
+    """Everything that is the same at every epoch.
+
+    It is the hand, its markers, the cameras, and a wrist device.
+    """
 
     hand: HandTables
     mounts: Mounts
@@ -21,7 +27,9 @@ class Rig(NamedTuple):
 
 
 class EpochPrior:
-    """What is believed at one epoch beside habits; filled in place.
+    """Prior at one epoch beside the posture prior.
+
+    It is filled in place.
 
     Attributes:
         own_w2, own: (n,) inverse variances and means of single angles, by this instant.
@@ -62,7 +70,10 @@ class EpochPrior:
 
     @classmethod
     def none(cls, n: int, extras: int) -> "EpochPrior":
-        """Nothing is believed of a hand with n free angles and so many extra unknowns."""
+        """Return an empty prior of a hand with n free angles.
+
+        It has the given number of extra unknowns.
+        """
         return record(
             cls,
             own_w2=n,
@@ -89,7 +100,10 @@ class EpochPrior:
 
 
 class Search:
-    """Scratch for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
+    """Scratch for a search, of N = 6 + n + K unknowns.
+
+    They are the palm, n free angles and K extras.
+    """
 
     gradient: Float  # (N,)
     normal: Float  # (N, N)

@@ -1,4 +1,6 @@
-"""A hand of one epoch alone: where a search begins that has no state to go on from.
+"""Solution for a hand from one epoch alone.
+
+A search begins there when it has no state to go on from.
 
 From another hand of the epoch, if there is one that explains the markers; else from several, open to closed, each laid
 on the markers as a rigid body, of which the best goes on.
@@ -27,7 +29,10 @@ NONE = frozenset[int]()
 
 
 class PosturePriorTables:
-    """Habits of one hand while some fingers are bent unlike the others, each worked out once."""
+    """Posture priors of one hand while some fingers are flexed unlike the others.
+
+    Each is computed once.
+    """
 
     def __init__(
         self, model: HandModel, parameters: HandParameters, settings: Settings, *, natural: bool
@@ -117,7 +122,10 @@ class Reinitialiser:
             epoch_prior.own_w2[:] = 0.0
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
-        """Three hands, open to closed, each laid on the markers as a rigid body; one where the palm is known."""
+        """Return three hands, open to closed, as starts of the search.
+
+        Each is laid on the markers as a rigid body; only one where the palm is known.
+        """
         steps, measured = self._steps, self._measured_rotation(epoch)
         if epoch.place is not None and measured is not None:
             T = np.eye(4)
@@ -149,13 +157,19 @@ class Reinitialiser:
         return starts
 
     def _measured_rotation(self, at: Epoch) -> Float | None:
-        """How the palm is turned by other sensors (3, 3), with the bend that is believed; None: they do not say."""
+        """Return the palm rotation measured by other sensors (3, 3).
+
+        It includes the estimated wrist flexion; None: they do not report it.
+        """
         if at.orientation is None or at.orientation.axes is None:
             return None if at.orientation is None else at.orientation.rotation
         return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
 
     def _with_scanned(self, x: Float) -> Float:
-        """Free angles (n,) with those of fingers whose valley was searched."""
+        """Return free angles (n,) with those of the scanned fingers filled in.
+
+        These are fingers whose minimum was searched.
+        """
         known = self._steps.at.scan.known > 0.0
         if not known.any():
             return x

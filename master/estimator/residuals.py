@@ -82,7 +82,9 @@ def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: F
 def marker_rows(
     cameras: CameraArrays, observed: Observations, m: int, point: Float, work: Scratch
 ) -> tuple[float, float]:
-    """Write information and gradient of one marker by its place, to work.H (3, 3) and work.g (3,).
+    """Write information and gradient of one marker by its place.
+
+    They go to work.H (3, 3) and work.g (3,).
 
     Args:
         cameras, observed, m: What is seen of which marker.

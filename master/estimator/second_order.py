@@ -35,7 +35,9 @@ _NONE = constant(0)
 
 @inner
 def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch) -> int:
-    """Write the turns that are not straight, as columns of a pivoted Cholesky factor; return how many.
+    """Write the rotations that are not straight, and return how many.
+
+    They are columns of a pivoted Cholesky factor.
 
     One that is less sure than `rotation_most_rad` leads nowhere farther.
     """
@@ -74,7 +76,10 @@ def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch
 def _bone_rotations(
     hand: HandTables, T: Float, count: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
-    """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
+    """Write how each rotation rotates each bone (5, 4, K, 3).
+
+    It covers the palm, and the axes of the joints before the bone.
+    """
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
         for k in range(count):
@@ -119,7 +124,10 @@ def _second_derivative(one: Float, other: Float, bx: float, by: float, bz: float
 def _second_derivatives(
     rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
-    """Write the arcs of joints and markers by turns k and m: room.joint, room.marker (not yet whitened)."""
+    """Write the second derivatives of joints and markers by rotations k and m.
+
+    They go to room.joint and room.marker (not yet whitened).
+    """
     hand, mounts, w = rig.hand, rig.mounts, scratch.w
     for joint in range(26):
         if hand.finger[joint] >= 0:
@@ -175,7 +183,10 @@ def _second_derivatives(
 
 @inner
 def _whiten(information: Float, white: Float) -> None:
-    """Write W (3, 3) with W' W = information, which may be singular: the transposed factor of Cholesky."""
+    """Write W (3, 3) with W' W = information, which may be singular.
+
+    W is the transposed factor of Cholesky.
+    """
     for j in range(3):
         total = information[j, j]
         for k in range(j):
@@ -201,7 +212,10 @@ def _gain(
     work: Scratch,
     scratch: CovarianceScratch,
 ) -> int:
-    """Write the answer of the fit to moved markers (N, K), and whiten the markers' arcs; return K."""
+    """Write the response of the fit to moved markers (N, K); return K.
+
+    Also whiten the second derivatives of the markers.
+    """
     hand, mounts, N, K = rig.hand, rig.mounts, cov.shape[0], 0
     for m in range(mounts.finger.shape[0]):
         if not seen[m]:
@@ -249,7 +263,10 @@ def _gain(
 
 @inner
 def _at_most_one(N: int, K: int, scratch: CovarianceScratch) -> None:
-    """Divide the gain by what is wider than its markers, because misfit or two hypotheses made it so."""
+    """Divide the gain by whatever is wider than its markers.
+
+    It is wider because the residual or two hypotheses made it so.
+    """
     for r in range(K):
         for q in range(K):
             scratch.BL[r, q] = (1.0 if r == q else 0.0) - scratch.B[r, q]

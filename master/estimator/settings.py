@@ -1,4 +1,4 @@
-"""Every number that tunes the estimator, each with its unit, its range and where it is from."""
+"""All tuning numbers of the estimator, with unit, range and source."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

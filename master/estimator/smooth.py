@@ -48,7 +48,10 @@ from master.fabrik.one_euro import OneEuroParameters
 
 
 class HandOneEuro:
-    """Push machine. Holds what was shown last, the filter, what is left of leaps (`Smoothing`)."""
+    """Push machine that holds the last output, the filter and jump offsets.
+
+    The offsets are what is left of leaps (`Smoothing`).
+    """
 
     def __init__(
         self,

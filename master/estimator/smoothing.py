@@ -1,4 +1,7 @@
-"""The kernel of the filter of the solved hand, and its memory (`master.estimator.smooth` has the law)."""
+"""Kernel of the filter of the solved hand, and its memory.
+
+`master.estimator.smooth` has the law.
+"""
 
 from math import nan
 from typing import Any, NamedTuple
@@ -23,7 +26,10 @@ WHOLE, SIGNALS, REST = constant(0), constant(1), constant(2)
 
 
 class Pose(NamedTuple):
-    """A hand: palm (4, 4), angles (5, 4) [rad], joints (26, 3) [m], (26, 3, 3), their covariances (26, 3, 3) [m^2]."""
+    """Pose of a hand: palm, angles, joints and covariances.
+
+    They are palm (4, 4), angles (5, 4) [rad], joints (26, 3) [m], (26, 3, 3), and their covariances (26, 3, 3) [m^2].
+    """
 
     palm: Float
     angles: Float
@@ -242,7 +248,9 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
 
 @inner
 def _add_offset(hand: HandTables, state: Smoothing, solved: Pose, shown: Pose, tracked: Bool) -> None:
-    """Write the covariance of the joints with how far each is shown from where it is solved to be.
+    """Write the covariance of the joints, widened by the display offset.
+
+    The offset is how far each joint is shown from where it is solved to be.
 
     A region that is too large now is that of a joint that is not tracked.
     """

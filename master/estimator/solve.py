@@ -1,4 +1,6 @@
-"""Kernels of the fit of one epoch: normal equations, and a search downhill inside the limits.
+"""Kernels of the fit of one epoch.
+
+They build normal equations, and search downhill inside the limits.
 
 Unknowns are the palm's turn and shift and the free angles (`master.estimator.kinematics`). What is minimised is half
 the sum of squares of the rows (`master.estimator.residuals`) and of what is believed:
@@ -65,7 +67,10 @@ def past_cost(epoch_prior: EpochPrior, T: Float, x: Float, off: Float) -> float:
 
 @inlined
 def own_cost(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, x: Float) -> float:
-    """What habits of hypothesis h and beliefs about single angles of this instant cost."""
+    """Return the cost of the posture prior and of single-angle priors.
+
+    The posture prior is that of hypothesis h; the single-angle priors are those of this epoch.
+    """
     cost = posture_prior.constant[h]
     for i in range(x.shape[0]):
         total = 0.0
@@ -88,7 +93,7 @@ def _add_priors(
     normal: Float,
     search: Search,
 ) -> float:
-    """Write gradient and normal matrix of all that is believed; return its cost."""
+    """Write gradient and normal matrix of all priors; return their cost."""
     n, K = x.shape[0], z.shape[0]
     for i in range(6 + n + K):
         gradient[i] = 0.0
@@ -177,7 +182,9 @@ def linearise(
     normal: Float,
     search: Search,
 ) -> float:
-    """Write gradient (N,) and Gauss-Newton normal matrix (N, N) at a hand; return the cost.
+    """Write gradient (N,) and Gauss-Newton normal matrix (N, N) at a hand.
+
+    Return the cost.
 
     To search.surprise (M,) chi square of each marker, to search.apart (1,) half of what rays that do not meet have
     between them, and to search.information (M, 3, 3) what is known of each marker's place.
@@ -254,7 +261,9 @@ def _marker(
 
 @inner
 def _step(rig: Rig, x: Float, damping: float, gradient: Float, normal: Float, search: Search) -> float:
-    """Write the damped step (N,), without angles that stand at a limit and are pushed outwards.
+    """Write the damped step (N,).
+
+    Angles that stand at a limit and are pushed outwards are omitted.
 
     Returns:
         By how much the cost should fall; negative: there is no step.
@@ -297,7 +306,9 @@ def descend(
     normal: Float,
     search: Search,
 ) -> tuple[float, int]:
-    """Search downhill by Levenberg-Marquardt from a hand, in place; return cost and steps.
+    """Search downhill by Levenberg-Marquardt from a hand, in place.
+
+    Return cost and steps.
 
     The damping follows the gain ratio (Madsen, Nielsen, Tingleff, "Methods for Non-Linear Least Squares Problems",
     2nd edition, 2004, eq. 2.21). The last step, of which an all but undamped model hopes for no more than the

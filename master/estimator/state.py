@@ -137,7 +137,7 @@ class HandState:
 
 
 class Hidden:
-    """What is believed of fingers that nobody sees.
+    """Prediction of fingers that nobody sees.
 
     Attributes:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
@@ -164,7 +164,10 @@ class Hidden:
 
 @inlined
 def growth(settings: Settings, a: int, gone_s: float) -> float:
-    """Variance [rad^2] of angle a of 20 about where it was heading, a time after its finger was last seen."""
+    """Return the variance [rad^2] of angle a of 20 of a hidden finger.
+
+    It is about where the angle was heading, a time after its finger was last seen.
+    """
     most = settings.growth_rad
     if a < 4:
         most = settings.growth_thumb_rad
@@ -204,7 +207,10 @@ def _neighbours(settings: Settings, state: HandState, f: int, shown: Bool, hidde
 def hide(
     hand: HandTables, settings: Settings, state: HandState, t_ns: int, shown: Bool, hidden: Hidden
 ) -> None:
-    """Write where fingers without a measurement are believed to be; note when each was lost."""
+    """Write the predicted angles of fingers without a measurement.
+
+    Note when each was lost.
+    """
     for a in range(20):
         hidden.angles[a] = state.angles[a]
     for f in range(5):
@@ -242,7 +248,9 @@ def predict(
     hidden: Hidden,
     epoch_prior: EpochPrior,
 ) -> None:
-    """Write what the state says of an epoch: `EpochPrior.past`, `palm` and their weights.
+    """Write the state's prediction for an epoch.
+
+    It goes to `EpochPrior.past`, `palm` and their weights.
 
     A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand that was
     seen meanwhile is told by its marker, not by a hand that is let go for it.

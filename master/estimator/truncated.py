@@ -64,7 +64,7 @@ def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float
 
 @inner
 def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, cut: Cut, mean: Float) -> None:
-    """Write the step (N,) from the likeliest hand to the mean of those within the limits.
+    """Write the step (N,) from the most likely hand to the mean within the limits.
 
     Straight fingers are no chance: they do rest at their limit, so nothing is piled up there.
 

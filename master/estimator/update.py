@@ -1,4 +1,4 @@
-"""Kernels of one epoch: predict, fit, and take over what it says into the state."""
+"""Kernels of one epoch: predict, fit, and update the state with the result."""
 
 from math import exp
 from typing import Any, NamedTuple
@@ -75,7 +75,10 @@ class Estimate(NamedTuple):
 def chi_square(
     rig: Rig, observed: Observations, T: Float, x: Float, process_noise_m: float, search: Search
 ) -> float:
-    """Chi square of the markers on a hand that may have walked so far, in any direction, since."""
+    """Return the chi-square of the markers on a hand that may have moved meanwhile.
+
+    The hand may have moved by `process_noise_m` in any direction since.
+    """
     work, mounts = search.rows, rig.mounts
     angles_of(rig.hand, x, work.angles, work.by)
     chains(rig.hand, T, work.angles, work.R, work.P)
@@ -139,7 +142,9 @@ def _judge(
 def _depth_noise(
     settings: Settings, state: HandState, t_ns: int, ground: Ground, epoch_prior: EpochPrior, out: Estimate
 ) -> None:
-    """Add how far a hand may have drifted along the sight while one camera alone saw it.
+    """Add the possible depth drift of a hand that one camera alone saw.
+
+    The drift is along the line of sight, over the time in which that camera alone saw the hand.
 
     Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
@@ -162,7 +167,7 @@ def _depth_noise(
 
 @kernel
 def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_space: Any) -> float:
-    """Write what the state says of an epoch, and where its search begins.
+    """Write the state's prediction for an epoch, and the start of its search.
 
     Args:
         model: What is the same at every epoch.
@@ -201,7 +206,10 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
 
 @inner
 def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> None:
-    """Write the palm of the state, turned on as other sensors say, to `epoch_prior.palm`."""
+    """Write the palm of the state, rotated on by other sensors.
+
+    The result goes to `epoch_prior.palm`; the rotation is the one that other sensors report.
+    """
     by = search.J
     for i in range(3):
         for j in range(3):
@@ -224,7 +232,9 @@ def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> Non
 def fit_epoch(
     model: Model, posture_prior: PosturePrior, observed: Observations, blank: Blank, boxed_space: Any
 ) -> float:
-    """Fit an epoch: from where `predict_epoch` says, or roughly from the task's hand, in place.
+    """Fit the hand of one epoch in place.
+
+    The fit starts from the prediction of `predict_epoch`, or roughly from the task's hand.
 
     Args:
         model, habits: What is the same at every epoch.

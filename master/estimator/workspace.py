@@ -1,4 +1,7 @@
-"""What kernels of an epoch work on: what is the same at every one, the task, and room."""
+"""Workspace of the kernels of an epoch.
+
+It has what is the same at every epoch, the task, and scratch room.
+"""
 
 from typing import Any, NamedTuple
 
@@ -79,7 +82,7 @@ class Task:
 
 
 class Workspace:
-    """Scratch for all kernels of one hand, what is to be done, and what is believed at the epoch."""
+    """Scratch for all kernels of one hand, with the task and the prior of the epoch."""
 
     task: Task
     ground: Ground
@@ -111,7 +114,10 @@ class Workspace:
 
 
 class Model(NamedTuple):
-    """What is the same at every epoch; hand, settings and device in their arrays (`common.records.boxed`)."""
+    """Everything that is the same at every epoch.
+
+    Hand, settings and device are in their arrays (`common.records.boxed`).
+    """
 
     hand: Any
     settings: Any

@@ -1,4 +1,6 @@
-"""A wrist device and its hand as flat arrays, and what it saw of five fingers, for kernels.
+"""A wrist device and its hand as flat arrays for kernels.
+
+Also what the device saw of the five fingers.
 
 To the noise of what is seen comes what the model of the hand does not know: skin whose thickness is not that of this
 person, what calibration leaves of plane and palm, and the part of the line that is not seen. The centroid of a line
@@ -28,7 +30,9 @@ _AWAY_M = 0.1  # a fingertip of which no laser point tells the distance
 
 
 class Device:
-    """A wrist device before its hand; lengths in metres, camera frame unless said.
+    """Geometry of a wrist device mounted before its hand.
+
+    Lengths are in metres, in the camera frame unless stated otherwise.
 
     Attributes:
         palm: (4, 4) that of a straight wrist.
@@ -119,7 +123,9 @@ class Device:
 
 
 class LinesOfSight:
-    """What one triple shows of five fingers, as rows; x, y are those of undistorted rays (x, y, 1).
+    """What one strobe cycle shows of five fingers, as rows.
+
+    x, y are those of undistorted rays (x, y, 1).
 
     Attributes:
         lit: (5,) 1 where a laser point is a row, and `shown` (5,) where a fingertip is.
@@ -179,7 +185,7 @@ def inverse_2(a: float, b: float, c: float, out: Float) -> None:
 
 @inner
 def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
-    """Take from the information (2, 2) of two rows what the doubt of the wrist's bend makes of them.
+    """Reduce the information (2, 2) of two rows by the uncertainty of wrist flexion.
 
     Args:
         W: Changed.
@@ -201,7 +207,9 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
 def loosen_short(
     device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
 ) -> bool:
-    """Take from the information of a laser point what it does not say of a line that is hidden in part.
+    """Reduce the information of a laser point on a partly hidden line.
+
+    What the point does not constrain of a line that is hidden in part is removed from its information.
 
     Args:
         device, sights: `LinesOfSight.laser_W` is changed.
@@ -230,7 +238,10 @@ def loosen_short(
 
 @inner
 def on_plane(device: Any, x: float, y: float, out: Float, A: Float) -> bool:
-    """Write where the ray (x, y, 1) meets the laser plane (3,) [m], and derivatives (2, 2) of x, y by its axes."""
+    """Intersect the ray (x, y, 1) with the laser plane.
+
+    Writes the intersection (3,) [m], and the derivatives (2, 2) of x, y by the plane's axes.
+    """
     n = device.plane[2]
     towards = n[0] * x + n[1] * y + n[2]
     far = device.offset[0] / towards
@@ -257,7 +268,7 @@ def observe_wrist(
     tip_s: float,
     boxed_out: Any,
 ) -> None:
-    """Write the rows of a triple.
+    """Write the rows of a strobe cycle.
 
     Args:
         boxed_device: (1,) `Device`.
@@ -301,7 +312,9 @@ def observe_wrist(
 
 @inner
 def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
-    """Write the palm (4, 4) of a wrist that is bent, and the axes (2, 3) of flexion and deviation.
+    """Write the palm (4, 4) of a flexed wrist.
+
+    Also writes the axes (2, 3) of flexion and deviation.
 
     F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_joint`).
     """

@@ -1,4 +1,4 @@
-"""What the estimator knows of a wrist device and its hand before the first triple."""
+"""Prior model of a wrist device and its hand, before the first strobe cycle."""
 
 from dataclasses import dataclass, replace
 from math import radians
@@ -87,7 +87,10 @@ class WristModel:
 
 
 def loosened(model: HandModel) -> HandModel:
-    """The hand as a wrist device needs it: DIPs that follow the PIP loosely, and limits with room."""
+    """Return the hand model with the loose couplings that a wrist device needs.
+
+    The DIPs follow the PIP loosely, and the limits have room.
+    """
     limits = model.limits_rad.copy()
     limits[1:, ABDUCTION] = -_ASIDE_RAD, _ASIDE_RAD
     limits[1:, [FLEXION, PIP, DIP], 0] -= _BEYOND_RAD

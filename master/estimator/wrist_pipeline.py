@@ -1,4 +1,4 @@
-"""A wrist device alone: triples -> rows -> the estimator -> pose.
+"""Pipeline of a wrist device alone: strobe cycles -> rows -> estimator -> pose.
 
 `WristPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages and get
 the same poses. The rig's frame is the camera's, so the palm stands where calibration found it. A finger that was not
@@ -71,7 +71,10 @@ class WristPipeline:
         self._forget_ns = round(1e9 * settings.forget_s)
 
     def push(self, message: WristDetections) -> list[SolvedPose]:
-        """Take what one triple showed; return its pose. A message not later than the last is counted and dropped."""
+        """Solve one strobe cycle and return its pose.
+
+        A message that is not later than the last is counted and dropped.
+        """
         t_ns = message.t_ns + self._setup.late_ns
         if t_ns <= self._last_ns:
             self.counts["late"] += 1
@@ -95,7 +98,10 @@ class WristPipeline:
         return [SolvedPose(pose, message.ready_t_ns)]
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU says of its own orientation (4,): that of the forearm, and so of the palm, in its world."""
+        """Take the orientation (4,) that the IMU reports of itself.
+
+        It is the orientation of the forearm, and so of the palm, in the IMU's world frame.
+        """
         if self._forearm is None:
             self.counts["orientation.unplaced"] += 1
         else:

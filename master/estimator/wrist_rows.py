@@ -1,4 +1,6 @@
-"""Kernels of the rows of a wrist device: LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
+"""Kernels of the measurement rows of a wrist device.
+
+The rows are LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
 
     LASER      where the laser meets the finger's skin [x, y of the ray], minus where it was seen
     TIP        the fingertip, minus where it was seen
@@ -25,7 +27,9 @@ _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivat
 
 @inlined
 def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
-    """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
+    """Write the derivative (3, 3) of a rotation vector by a small rotation.
+
+    The rotation vector is (3,); the small rotation is applied in front of it (from the left).
 
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
@@ -43,7 +47,9 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
 
 @inner
 def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
-    """Write the palm's rotation by other sensors to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
+    """Write the palm's rotation as other sensors measure it.
+
+    The rotation goes to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
 
     By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
@@ -68,7 +74,10 @@ def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
 
 @inner
 def contrary(epoch_prior: EpochPrior, T: Float, z: Float, search: Search) -> float:
-    """Chi square of a palm against how other sensors have it turned, and of what the extras gave in to it."""
+    """Return the chi-square of a palm against its rotation by other sensors.
+
+    The chi-square of the extras' deviation from their prior, by which they accommodated the palm, is included.
+    """
     sensed_palm(epoch_prior, z, search)
     rotation_between(T, search.palm, search.J, search.q)
     total, q = 0.0, search.q
@@ -129,7 +138,10 @@ def _column(n: int, a: int) -> int:
 
 @inlined
 def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
-    """Write R (3, 3) turned in front by a rotation vector (3,) that is small: to second order."""
+    """Write R (3, 3) rotated by a small rotation vector (3,).
+
+    The rotation is applied in front (from the left), to second order.
+    """
     x, y, z = rotation[0], rotation[1], rotation[2]
     for j in range(3):
         a, b, c = R[0, j], R[1, j], R[2, j]

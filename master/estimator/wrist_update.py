@@ -1,4 +1,4 @@
-"""Kernels of one epoch for what a wrist device sees: before the fit, and after it."""
+"""Kernels of one epoch for wrist-device data: before the fit, and after it."""
 
 from math import inf
 from typing import Any
@@ -44,7 +44,10 @@ def _expected(
     scan: Scan,
     prior: Prior,
 ) -> None:
-    """Write what is believed of the fingers before a triple; bring what was seen to the epoch, by their rates."""
+    """Write the prior of the fingers before a strobe cycle.
+
+    Also brings what was seen to the epoch, by the rates of the fingers.
+    """
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
     measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
     prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
@@ -86,7 +89,9 @@ def _expected(
 
 @kernel
 def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
-    """Step the extras to an epoch, and search the valleys of the fingers that a wrist device sees.
+    """Propagate the extras to an epoch and search the minima of the fingers.
+
+    The fingers are those that a wrist device sees.
 
     What no pose explains is no row: a fingertip that is another thing, a laser point on one. The rows that are left are
     counted.
@@ -168,7 +173,10 @@ def _length_px(scan: Scan, f: int) -> float:
 
 @inner
 def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
-    """Count the rows of a wrist device; fingertips alone, without laser points, count for nothing."""
+    """Count the rows of a wrist device.
+
+    Fingertips alone, without laser points, count for nothing.
+    """
     lit, shown = 0, 0
     for f in range(5):
         shown += 1 if lines_of_sight.shown[f] > 0.0 else 0
@@ -181,7 +189,10 @@ def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
 
 @inner
 def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: Float) -> None:
-    """Write the free angles (n,) of fingers whose valley was searched, of angles (20,); `x`: (n,) room."""
+    """Write the free angles (n,) of fingers whose minimum was searched.
+
+    They are taken from angles (20,); `x` is (n,) room.
+    """
     free_of(hand, scanned, x)
     for f in range(5):
         if scan.known[f] > 0.0:
@@ -191,7 +202,9 @@ def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: F
 
 @inner
 def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> None:
-    """Move the extras to where this instant alone has them, as its covariance has it.
+    """Move the extras to their estimate from this epoch alone.
+
+    The covariance of the epoch gives the step.
 
     At the solution the pull of the past is that of the instant, reversed: a Newton step without it.
     """
@@ -215,7 +228,9 @@ def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> No
 
 @inner
 def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: Scratch) -> None:
-    """Take fingers without markers from their valleys: the median, and a covariance that holds all of it.
+    """Take fingers without markers from their searched minima.
+
+    The median is taken, and a covariance that holds all of the minimum.
 
     What the others know of the finger beside its PIP, the fit's covariance given the PIP says.
     """

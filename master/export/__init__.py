@@ -1,1 +1,4 @@
-"""Recorded hands as files of other programs: tables, motion capture, animated meshes, Rerun."""
+"""Export of recorded hands to the file formats of other programs.
+
+The formats are tables, motion capture, animated meshes and Rerun.
+"""

@@ -1,4 +1,6 @@
-"""A hand as a BVH file, which Blender, Maya, MotionBuilder and most tools of motion capture read.
+"""BVH export of a hand.
+
+Blender, Maya, MotionBuilder and most tools of motion capture read BVH files.
 
 The rest pose is that of the hand profile, in the palm frame: fingers along +z, the back of the hand up (+y). So every
 channel is zero at rest. A joint turns by its three rotation channels, about z, then its own x, then its own y:
@@ -100,7 +102,10 @@ def write_bvh(
 
 
 def _rest_offsets(skeleton: Skeleton) -> Float:
-    """From its parent to each joint at rest (26, 3) [m], palm frame; the wrist's is zero."""
+    """Return the offset of each joint from its parent at rest (26, 3) [m].
+
+    The offsets are in the palm frame; the wrist's is zero.
+    """
     out = np.zeros((26, 3))
     for joint, parent in PARENT.items():
         out[joint] = skeleton.position_m[joint] - skeleton.position_m[parent]
@@ -108,7 +113,10 @@ def _rest_offsets(skeleton: Skeleton) -> Float:
 
 
 def _channels(motion: Motion, skeleton: Skeleton) -> tuple[Float, Float]:
-    """Of each joint how it is turned from rest, as seen from its parent (T, 26, 4), and its offset (T, 26, 3) [m]."""
+    """Return the rotation and the offset of each joint relative to its parent.
+
+    The rotation (T, 26, 4) is from rest, as seen from the parent; the offset is (T, 26, 3) [m].
+    """
     from_rest = times(motion.orientation_wxyz, back(skeleton.orientation_wxyz))
     rotated, offset = from_rest.copy(), motion.position_m.copy()
     for joint, parent in PARENT.items():
@@ -121,7 +129,10 @@ def _channels(motion: Motion, skeleton: Skeleton) -> tuple[Float, Float]:
 def _hierarchy(
     joint: int, rest: Float, ends: dict[int, Float], free: tuple[int, ...], depth: int
 ) -> list[str]:
-    """The lines of a joint and of all that hangs on it; `rest` and `ends` in the unit of the file."""
+    """Return the lines of a joint and of all its descendants.
+
+    `rest` and `ends` are in the unit of the file.
+    """
     tab, inner = "\t" * depth, "\t" * (depth + 1)
     moves = joint == WRIST or joint in free
     channels = ["Xposition", "Yposition", "Zposition"] if moves else []
@@ -162,7 +173,9 @@ def _frames(
 
 
 def euler_zxy_deg(rotation: Float) -> Float:
-    """Angles (T, 3) [deg] about z, x, y with R = R_z R_x R_y, of rotations (T, 3, 3), without leaps of a whole turn.
+    """Return the Euler angles (T, 3) [deg] about z, x, y of rotations (T, 3, 3).
+
+    R = R_z R_x R_y; the angles have no jumps of a whole turn.
 
     Where x is turned by a right angle, z and y are one axis, and y is taken as zero.
     """

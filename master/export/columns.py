@@ -1,4 +1,6 @@
-"""What the columns of the tables are called, what is in them, in which unit and frame: tidy, a row for each instant.
+"""Columns of the exported tables: names, contents, units and frames.
+
+The tables are tidy: one row for each epoch.
 
 A name is what it is of, the quantity, and its unit: `index_finger_tip_x_m`. Joints are those of docs/frames.md with _
 for -. What was not observed is empty: NaN becomes no value at all.

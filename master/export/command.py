@@ -14,7 +14,10 @@ _MOTION = ("bvh", "gltf")
 
 
 def export(options: Namespace) -> None:
-    """Write what was recorded of hands for other tools: tables, motion capture, an animated model, Rerun."""
+    """Export recorded hands for other tools.
+
+    The formats are tables, motion capture, an animated model and Rerun.
+    """
     if options.compare is not None:
         for given, option in (
             (options.to, "--to"),
@@ -89,14 +92,20 @@ def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
 
 
 class _Progress:
-    """The bar of what goes on, and the lines of what is done; holds when the bar was drawn last."""
+    """Progress bar of an export, and the lines of what is done.
+
+    Holds when the bar was drawn last.
+    """
 
     def __init__(self) -> None:
         self._line = ProgressLine(sys.stderr, "export")
         self._shown_ns = now_ns()
 
     def update(self, what: str, done: int, total: int) -> None:
-        """It goes on. Where no terminal shows the bar in place it is left out: files are written in seconds."""
+        """Redraw the progress bar.
+
+        Where no terminal shows the bar in place it is omitted: files are written in seconds.
+        """
         if sys.stderr.isatty() and now_ns() - self._shown_ns > _EVERY_NS:
             self._shown_ns = now_ns()
             self._line.show(f"{bar(done / max(total, 1))} {what}, {done} of {total}")

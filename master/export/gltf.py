@@ -1,4 +1,6 @@
-"""A hand as an animated, skinned glTF 2.0 model: Blender, Unity, Unreal, Godot, three.js and model viewers read it.
+"""glTF 2.0 export of a hand as an animated, skinned model.
+
+Blender, Unity, Unreal, Godot, three.js and model viewers read it.
 
 Its skeleton is 26 nodes named and turned like the joints of OpenXR, in metres; its bind pose is the rest pose of the
 hand profile. Each pose is a key at its own time, in seconds from the first; between keys a reader goes linearly in the
@@ -82,7 +84,9 @@ class _Data:
 
 
 def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[int, ...]:
-    """Write a motion as .glb, or, by the name of the file, as .gltf with all data inside.
+    """Write a motion as .glb or .gltf, by the name of the file.
+
+    A .gltf has all data inside.
 
     Args:
         path: The file; replaced only by a complete one.
@@ -122,7 +126,10 @@ def _about(motion: Motion, skeleton: Skeleton, up: Up) -> dict[str, object]:
 
 
 def with_holds(motion: Motion) -> Motion:
-    """With a key just before the end of every gap, where the hand still is as at its beginning."""
+    """Return the motion with a hold key just before the end of every gap.
+
+    At that key the hand is still as it was at the beginning of the gap.
+    """
     gaps = np.flatnonzero(np.diff(motion.t_ns) > motion.gap_ns)
     rows = np.sort(np.concatenate([np.arange(len(motion)), gaps]))
     t_ns = motion.t_ns[rows].copy()
@@ -154,7 +161,10 @@ def _nodes(data: _Data, skeleton: Skeleton) -> None:
 
 
 def _rest(skeleton: Skeleton) -> tuple[Float, Float]:
-    """The joints at rest in the frame of their parent, the wrist in the palm's: (26, 3) [m] and (26, 4)."""
+    """Return the joints at rest in the frame of their parent: (26, 3) [m], (26, 4).
+
+    The wrist is in the palm's frame.
+    """
     at, q = skeleton.position_m.copy(), skeleton.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         there = back(skeleton.orientation_wxyz[parent])

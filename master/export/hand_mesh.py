@@ -1,4 +1,6 @@
-"""A simple skin for a skeleton: closed convex pieces over the bones, each the hull of a few spheres.
+"""Simple skin mesh for a skeleton.
+
+Closed convex pieces lie over the bones, each the hull of a few spheres.
 
 Of a finger's bone these are the spheres of its two joints, a round cone; the palm is made of the hulls over
 the wrist and neighbouring metacarpals, the ball of the thumb of one between thumb and palm. The pieces overlap,
@@ -41,7 +43,10 @@ class Skin:
 
 @dataclass(frozen=True, slots=True)
 class _Ball:
-    """A sphere of skin: centre (3,) [m], palm frame, radius [m], and the joint that it moves with."""
+    """A sphere of skin.
+
+    It has a centre (3,) [m] in the palm frame, a radius [m], and the joint that it moves with.
+    """
 
     centre_m: Float
     radius_m: float
@@ -61,7 +66,10 @@ def skin_of(skeleton: Skeleton) -> Skin:
 
 
 def _fingers(skeleton: Skeleton) -> list[list[_Ball]]:
-    """The bones of the fingers, the thumb's metacarpal among them; both ends move with the nearer joint."""
+    """Return the spheres of the finger bones.
+
+    The thumb's metacarpal is among the bones; both ends of a bone move with the nearer joint.
+    """
     bones = [
         bone
         for chain in FINGER_JOINTS
@@ -71,7 +79,10 @@ def _fingers(skeleton: Skeleton) -> list[list[_Ball]]:
 
 
 def _palm(skeleton: Skeleton) -> list[list[_Ball]]:
-    """What is rigid with the wrist, and the ball of the thumb, which is pulled between both."""
+    """Return the spheres of the palm.
+
+    They are what is rigid with the wrist, and the ball of the thumb, which is pulled between both.
+    """
     fingers = FINGER_JOINTS[1:]
     bones = [[_ball(skeleton, joint, WRIST) for joint in chain[:2]] for chain in fingers]
     wrist = _wrist(skeleton)
@@ -89,7 +100,10 @@ def _palm(skeleton: Skeleton) -> list[list[_Ball]]:
 
 
 def _wrist(skeleton: Skeleton) -> list[_Ball]:
-    """Two spheres across the wrist, as wide as its radius says and flat."""
+    """Return two spheres across the wrist.
+
+    They are as wide as the wrist's radius states, and flat.
+    """
     radius = float(skeleton.radius_m[WRIST])
     aside = np.array([(1.0 - _FLAT) * radius, 0.0, 0.0])
     return [_Ball(skeleton.position_m[WRIST] + side * aside, _FLAT * radius, WRIST) for side in (-1.0, 1.0)]
@@ -106,7 +120,10 @@ def _between(skeleton: Skeleton, a: int, b: int, joint: int) -> _Ball:
 
 
 def _hull(balls: list[_Ball]) -> Skin:
-    """The convex hull of spheres; the normals are the spheres' own, so that it looks round."""
+    """Return the convex hull of spheres.
+
+    The normals are the spheres' own, so that the hull looks round.
+    """
     directions = _directions()
     points = np.concatenate([ball.centre_m + ball.radius_m * directions for ball in balls])
     normals = np.tile(directions, (len(balls), 1))
@@ -120,7 +137,10 @@ def _hull(balls: list[_Ball]) -> Skin:
 
 
 def _convex(points: Float) -> tuple[Int, Int]:
-    """Which of the points (N, 3) are on their hull, (V,), and its triangles (F, 3) of those."""
+    """Return the convex hull of points (N, 3).
+
+    The result is the indices (V,) of the points on the hull, and its triangles (F, 3) of those.
+    """
     hull: Any = ConvexHull(points)  # scipy has no types
     used: Int = np.array(hull.vertices, np.int64)
     place = np.zeros(len(points), np.int64)
@@ -130,7 +150,10 @@ def _convex(points: Float) -> tuple[Int, Int]:
 
 
 def _directions() -> Float:
-    """Unit vectors (_ROUND, 3) all round, on a spiral from pole to pole (Fibonacci's)."""
+    """Return unit vectors (_ROUND, 3) in all directions.
+
+    They lie on a spiral from pole to pole (Fibonacci's).
+    """
     z = 1.0 - 2.0 * (np.arange(_ROUND) + 0.5) / _ROUND
     across, angle = np.sqrt(1.0 - z * z), _GOLDEN * np.arange(_ROUND)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

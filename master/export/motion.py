@@ -1,4 +1,6 @@
-"""The motion of one hand without holes: what is missing is held and counted, and any frame rate can be made of it.
+"""Motion of one hand without gaps, which can be resampled to any frame rate.
+
+Missing poses are held and counted.
 
 Formats of animation know no "not observed", every joint of every frame must be somewhere. A joint that a pose does not
 have (not valid, or NaN) stays as it last was *to its parent*, so that it goes along with what is seen of the hand;
@@ -34,7 +36,7 @@ _STRAIGHT = 1e-7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """T instants of one hand, all joints everywhere.
+    """Motion of one hand at T epochs, with all joints at every epoch.
 
     Attributes:
         t_ns: (T,) [ns], rising.
@@ -55,12 +57,14 @@ class Motion:
 
     @property
     def held_frames(self) -> int:
-        """At how many instants some joint is held."""
+        """Return the number of epochs at which some joint is held."""
         return int(self.held.any(axis=1).sum())
 
     @property
     def rate_hz(self) -> float:
-        """That of its poses where they are densest (a late one makes no file coarser), whole where it nearly is.
+        """Return the frame rate of the poses where they are densest.
+
+        A late pose thus makes no file coarser. The rate is rounded where it is nearly a whole number.
 
         60 where there is one pose alone.
         """
@@ -71,7 +75,9 @@ class Motion:
 
 
 def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
-    """All poses of a hand as a motion, in the order of time; of two at one instant the later one.
+    """Return all poses of a hand as a motion, in order of time.
+
+    Of two poses at one epoch the later one is taken.
 
     Raises:
         RecordingError: No pose has a wrist that may be used.
@@ -96,7 +102,10 @@ def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
 
 
 def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
-    """Times, places, turns and what of them may be used, in the order of time; what may not is the identity."""
+    """Return times, positions, rotations and their usable mask, in order of time.
+
+    Where a pose may not be used it is the identity.
+    """
     parts = [
         (poses.t_ns, poses.position_m, poses.orientation_wxyz, poses.valid) for poses in batches if len(poses)
     ]
@@ -114,7 +123,10 @@ def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
 
 
 def _last(good: Bool) -> Int:
-    """For each row the last good one up to it, or the first of all; (T,), at least one is good."""
+    """Return for each row the index of the last good row up to it (T,).
+
+    Where there is none yet, it is the first good one of all; at least one is good.
+    """
     rows = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))
     return np.where(rows < 0, np.argmax(good), rows)
 
@@ -122,7 +134,10 @@ def _last(good: Bool) -> Int:
 def _held(
     joint: int, usable: Bool, position: Float, orientation: Float, skeleton: Skeleton
 ) -> tuple[Float, Float]:
-    """How a joint last stood to its parent, (T, 3) and (T, 4), where both were seen; at rest if they never were."""
+    """Return the last pose of a joint relative to its parent, (T, 3) and (T, 4).
+
+    It is the last one at which both were seen, or the rest pose if they never were.
+    """
     parent = PARENT[joint]
     both = usable[:, joint] & usable[:, parent]
     if not both.any():
@@ -139,7 +154,10 @@ def _held(
 
 
 def local(motion: Motion) -> Motion:
-    """Each joint in the frame of its parent, the wrist in the rig's; turns without a leap of sign."""
+    """Return each joint in the frame of its parent.
+
+    The wrist is in the rig frame; quaternions have no jumps of sign.
+    """
     position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         q = back(motion.orientation_wxyz[:, parent])
@@ -161,7 +179,9 @@ def world(motion: Motion) -> Motion:
 
 
 def resample(motion: Motion, rate_hz: float) -> Motion:
-    """The motion at a constant rate from its first instant on, at most until its last.
+    """Resample the motion at a constant rate from its first epoch on.
+
+    It ends at most at its last epoch.
 
     A frame is held where one of the two poses beside it is, and in a gap.
 
@@ -200,7 +220,10 @@ def _between(values: Float, before: Int, after: Int, share: Float) -> Float:
 
 
 def slerp(first: Float, second: Float, share: Float) -> Float:
-    """Unit quaternions (..., 4) on the shorter arcs between two, at shares (...) of the way (Shoemake, 1985)."""
+    """Interpolate unit quaternions (..., 4) on the shorter arcs.
+
+    Shares (...) are of the way between the two (Shoemake, 1985).
+    """
     cosine = np.vecdot(first, second)
     second = np.where(cosine[..., None] < 0.0, -second, second)
     angle = np.arccos(np.minimum(np.abs(cosine), 1.0))

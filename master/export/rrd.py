@@ -1,4 +1,7 @@
-"""A source as an .rrd for the Rerun viewer, drawn as the running viewer draws it: hand, cameras, objects, plots."""
+"""Export of a source as an .rrd for the Rerun viewer.
+
+It is drawn as the running viewer draws it: hand, cameras, objects, plots.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields

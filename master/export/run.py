@@ -1,4 +1,4 @@
-"""Exports a source: which files become of it, and what a person is told of them."""
+"""Export of a source: which files are written, and the messages to the user."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -114,7 +114,9 @@ def _chosen(take: Take, only: tuple[str, ...], source: Path) -> tuple[str, ...]:
 
 
 def _refuse_path(name: str, source: Path) -> None:
-    """Names stand in file names: a file that is not ours must not say where others are read and written.
+    """Refuse a name that is a path.
+
+    Names become part of file names: a foreign file must not control where other files are read and written.
 
     Raises:
         RecordingError: It is a path.
@@ -164,7 +166,10 @@ def _tables(
     notify: Callable[[str], None],
     progress: ProgressCallback,
 ) -> tuple[Path, ...]:
-    """A table for each hand, object and pair of both, and one of gestures, where there are any."""
+    """Write a table for each hand, object and pair of both.
+
+    One table of gestures is added where there are any.
+    """
     begin, written = take.begin_t_ns, list[Path]()
 
     def write(path: Path, what: str, empty: list[Column], rows: Iterable[list[Column]]) -> None:
@@ -203,7 +208,10 @@ def _no_poses(hand: str) -> Poses:
 
 
 def _counted(take: Take, hand: str, progress: ProgressCallback) -> Iterator[Poses]:
-    """The poses of a hand, while it is told how many were read."""
+    """Yield the poses of a hand and report progress.
+
+    The progress is how many poses were read.
+    """
     done, total = 0, take.count(hand)
     for batch in take.batches(hand):
         yield batch
@@ -243,7 +251,7 @@ def _motions(
 def _motion(
     path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, progress: ProgressCallback
 ) -> str:
-    """Write one; what is to be said of it."""
+    """Write one motion file and return the message about it."""
     rate_hz = wanted.rate_hz
     if wanted.kind == "bvh":
         rate_hz = rate_hz or motion.rate_hz

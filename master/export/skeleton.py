@@ -1,4 +1,4 @@
-"""The 26 joints as one tree, at rest: what a BVH file and a glTF skeleton are built on.
+"""The 26 joints as one tree at rest, the basis of BVH files and glTF skeletons.
 
 The wrist is the root. Palm, thumb and the metacarpals hang on it, every further joint on the one before it.
 """
@@ -51,7 +51,10 @@ class Skeleton:
         )
 
     def ahead_m(self, joint: int) -> Float:
-        """From a joint to the end of its flesh, (3,) [m], palm frame: its radius along its -z."""
+        """Return the vector from a joint to the end of its flesh (3,) [m].
+
+        It is in the palm frame: the joint's radius along its -z.
+        """
         rotated = rotate(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
         return self.radius_m[joint] * rotated
 

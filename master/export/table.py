@@ -1,4 +1,6 @@
-"""Writes tables of columns as CSV or Parquet, batch by batch; the only file of ours that knows pyarrow.
+"""Writer of tables of columns as CSV or Parquet, batch by batch.
+
+This is the only file of the project that depends on pyarrow.
 
 A Parquet column carries its unit, frame and meaning as metadata, the file what it is of. A CSV has names alone.
 """

@@ -1,4 +1,7 @@
-"""What can be exported: the files of a run, or a recording of messages. Read in batches, so that an hour fits."""
+"""Sources of an export: the files of a run, or a recording of messages.
+
+They are read in batches, so that an hour fits.
+"""
 
 import tempfile
 from collections.abc import Generator, Iterator, Sequence
@@ -69,11 +72,11 @@ class Take(Protocol):
         ...
 
     def contacts(self) -> list[Contacts]:
-        """What was told of hands and objects."""
+        """Return the recorded contacts of hands and objects."""
         ...
 
     def gestures(self) -> list[Gesture]:
-        """What the hands said."""
+        """Return the recorded gestures of the hands."""
         ...
 
     def detections(self) -> dict[str, list[Detections]]:
@@ -86,12 +89,18 @@ class Take(Protocol):
         ...
 
     def tree(self, given: Path) -> AbstractContextManager[Path]:
-        """The calibration that it was made with: its own, unpacked until the end, or else the tree that is given."""
+        """Return the calibration tree with which the source was made.
+
+        It is the source's own, unpacked until the context ends, or else the tree that is given.
+        """
         ...
 
 
 class RunTake:
-    """poses.npz of a run, those of other hands beside it, and what else it told in the same folder."""
+    """Files of a run: its poses.npz and what lies beside it.
+
+    These are the poses of other hands, and everything else that the run wrote to the same folder.
+    """
 
     def __init__(self, path: Path, window: Window) -> None:
         """Read the poses.
@@ -245,7 +254,7 @@ class MessageTake:
 
     @property
     def rigs(self) -> tuple[str, ...]:
-        """As the recording says."""
+        """Return the names of the rigs, as the recording states them."""
         return recorded_rigs(self._recording)
 
     @contextmanager
@@ -289,7 +298,9 @@ def _inside(gestures: Sequence[Gesture], window: Window, begin_t_ns: int) -> lis
 
 
 def open_take(path: Path, window: Window) -> Take:
-    """Open a source: an .mcap is a recording of messages, anything else poses.npz of a run.
+    """Open a source.
+
+    An .mcap is a recording of messages, anything else is poses.npz of a run.
 
     Raises:
         RecordingError: There is no such file, or it is not ours.

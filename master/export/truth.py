@@ -1,4 +1,7 @@
-"""`phalanx export SOURCE --compare FILE`: poses of a run held against a motion capture of the same hand."""
+"""`phalanx export SOURCE --compare FILE`: poses against motion capture.
+
+The poses of a run are compared with a motion capture of the same hand.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
@@ -136,7 +139,9 @@ def _marker_names(poses: Poses, wanted: Wanted) -> tuple[str, ...]:
 
 
 def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) -> tuple[Track, Track]:
-    """Points that both have, in one order; of ours those that are sure, where these are enough.
+    """Return the points that both tracks have, in one order.
+
+    Of our poses the confident points are taken, where these are enough.
 
     Raises:
         RecordingError: None.
@@ -156,7 +161,9 @@ def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) ->
 
 
 def _own_clock(begin_t_ns: int, poses: Poses, motion: JointMotion) -> tuple[Alignment, str]:
-    """Frame as it is; the clock of the poses, or seconds from the source's beginning, whichever shares more time.
+    """Align the clocks only; the frame is used as it is.
+
+    The clock is that of the poses, or seconds from the source's beginning, whichever shares more time.
 
     Raises:
         RecordingError: They have no time in common either way.

@@ -1,4 +1,7 @@
-"""Which part of a source is exported: from and to, in seconds after its beginning."""
+"""Time window of a source that is exported.
+
+It goes from and to a time, in seconds after the source's beginning.
+"""
 
 from dataclasses import dataclass, fields, replace
 from math import isfinite

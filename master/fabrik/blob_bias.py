@@ -1,4 +1,6 @@
-"""Where the centre of a marker is in an image whose lens bends the marker's outline.
+"""Centroid bias of a marker in an image whose lens distorts its outline.
+
+It gives the image position of the marker's centre.
 
 The centroid of a blob is not the image of the marker's centre: distortion magnifies the outer part of the marker more
 (or less) than the inner one and so shifts the centroid, by the third derivative of the lens, in proportion to the
@@ -30,7 +32,10 @@ def round_outline() -> Float:
 
 
 def card_outline(width: float, height: float) -> Float:
-    """An upright rectangle of unit area around the origin with the sides' ratio `width` : `height`, (K, 2)."""
+    """Return an upright rectangle of unit area around the origin, (K, 2).
+
+    The ratio of its sides is `width` : `height`.
+    """
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     along = np.linspace(0.0, 1.0, _CORNERS // 4, endpoint=False)[:, None]  # the lens bends the sides
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
@@ -64,7 +69,9 @@ def centre_of_blob(camera: CameraModel, uv: Float, area_px2: Float, outline: Flo
 
 
 class LensShift:
-    """The shift of round blobs in all cameras of a rig, from their areas. Holds no state between calls.
+    """Centroid shift of round blobs in all cameras of a rig, from their areas.
+
+    Holds no state between calls.
 
     With g the lens (normalised point -> pixel), S its determinant |dg/dx| and a region around x of the isotropic second
     moment m per axis, the centroid of the region's image is, to second order in its size (Taylor expansion of
@@ -105,7 +112,10 @@ class LensShift:
 
 
 def _shift_per_px2(camera: CameraModel, uv: Float) -> Float:
-    """Shift of the centroid by area [px/px^2] at image places (..., 2) [px]; 0 where the lens is folded."""
+    """Return the centroid shift by area [px/px^2] at image positions (..., 2) [px].
+
+    It is 0 where the lens model is folded.
+    """
     k1, k2, p1, p2, k3 = camera.distortion.tolist()
     focal = camera.matrix[[0, 1], [0, 1]]
     xy = camera.undistort(uv)

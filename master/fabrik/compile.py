@@ -1,4 +1,7 @@
-"""Say that kernels are compiled, two minutes on a version's first start."""
+"""Notice that kernels are being compiled.
+
+This takes two minutes on a version's first start.
+"""
 
 import logging
 import threading

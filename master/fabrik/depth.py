@@ -1,4 +1,6 @@
-"""Depth from the raw disparity of a parallel pair, and the position that follows from depth and centroid.
+"""Depth from the raw disparity of a parallel pair.
+
+The position follows from depth and centroid.
 
 Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectified. Three laws:
 
@@ -80,7 +82,10 @@ class PowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class AffineDisparity:
-    """x = a / D + x0: focal length times baseline, and the disparity of an infinitely far point."""
+    """Affine disparity law x = a / D + x0.
+
+    a is focal length times baseline, x0 the disparity of an infinitely far point.
+    """
 
     a_m_px: float
     x0_px: float
@@ -155,7 +160,9 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw |
 
 
 def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
-    """How the rig's law contradicts the places of its cameras, where both are used; empty: not at all.
+    """Return how the rig's depth law contradicts its camera poses.
+
+    It is checked where both are used; empty: no contradiction.
 
     Raises:
         CalibrationError: As `depth_law`.
@@ -202,7 +209,10 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
 
 
 def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
-    """Disparity (N,) [px] of depths (N,) [m] where a law is fitted: before the middle between the first two cameras."""
+    """Return the disparity (N,) [px] at depths (N,) [m] on the fitting axis.
+
+    A law is fitted there: in front of the midpoint between the first two cameras.
+    """
     left, right = cameras[:2]
     axis = left.T_rig_camera[:3, 2]
     middle = 0.5 * (right.centre - left.centre)
@@ -212,7 +222,9 @@ def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
 
 
 def law_residual(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
-    """Largest relative difference of the law from the cameras' own geometry on the axis, and its depth [m].
+    """Return the largest relative error of the law on the axis, and its depth [m].
+
+    The error is the difference from the cameras' own geometry.
 
     Args:
         law: Of the first two cameras.
@@ -268,13 +280,18 @@ def error_budget(
 
 
 def tolerable_skew_s(share: float, baseline_m: float, speed_m_s: float) -> float:
-    """Time between the two exposures [s] that costs `share` of the depth at a sideways speed: share B / v, any D."""
+    """Return the exposure skew [s] that costs `share` of the depth.
+
+    It is the time between the two exposures at a sideways speed: share B / v, for any D.
+    """
     return share * baseline_m / speed_m_s
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResidual:
-    """What a calibration is known to leave, as its provenance says.
+    """Residual errors that a calibration is known to leave.
+
+    They are stated by its provenance.
 
     Attributes:
         rays_px: RMS reprojection error of the cameras together [px]: a bound on what lens and pose are wrong by at one
@@ -287,7 +304,10 @@ class CalibrationResidual:
 
     @classmethod
     def of(cls, rig: RigCalibration) -> "CalibrationResidual":
-        """What the rig's file states; 0 where it states nothing, as for files typed in by hand."""
+        """Return the residuals that the rig's file states.
+
+        They are 0 where it states nothing, as for files typed in by hand.
+        """
         rays = rig.provenance.get("T_rig_camera")
         law = None if rig.depth_model == "stereo" else rig.provenance.get(rig.depth_model)
         left = {} if law is None else law.residual

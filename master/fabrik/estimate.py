@@ -1,4 +1,4 @@
-"""What the line makes of one instant: marker positions, and the hand."""
+"""Result of the pipeline for one epoch: marker positions, and the hand."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from common.messages import Source
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerPositions:
-    """The M markers of a rig at one instant.
+    """Positions of the M markers of a rig at one epoch.
 
     Attributes:
         points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it,
@@ -52,7 +52,7 @@ class SolvedHand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEstimate:
-    """The hand of the line at one instant.
+    """Hand estimate of the pipeline at one epoch.
 
     Attributes:
         t_ns: The instant.

@@ -209,7 +209,9 @@ class Finger:
 def start_of(
     chain: ChainArrays, edges: Float, ratio: float, goal: Vector, warm_start: Float, angles: Float
 ) -> float:
-    """The pose from which FABRIK begins: the closed form, or the legal pose nearest to the target.
+    """Return the start pose of FABRIK.
+
+    It is the closed form, or the legal pose nearest to the target.
 
     Args:
         chain, edges, ratio, goal, near: As of `closed_form`.
@@ -234,7 +236,10 @@ def bring_onto(
     max_iterations: int,
     angles: Float,
 ) -> tuple[float, int]:
-    """As `Finger.solve`: return the distance that is left [m], NaN where nothing is seen, and the iterations."""
+    """Bring a finger onto its target, as `Finger.solve`.
+
+    Returns the distance that is left [m], NaN where nothing is seen, and the iterations.
+    """
     goal = minus((target[0], target[1], target[2]), root)
     if not isfinite(length(goal)):
         return nan, 0

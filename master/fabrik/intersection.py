@@ -1,4 +1,6 @@
-"""Intersect the rays of two or more cameras: points with covariance, and outliers.
+"""Intersection of the rays of two or more cameras.
+
+It yields points with covariance, and outliers.
 
 Minimised is the reprojection error in pixels of the distorted images, weighted by the noise of each observation, from
 the linear solution (Hartley and Zisserman, "Multiple View Geometry", 12.2) by Gauss-Newton. A point is NaN where fewer

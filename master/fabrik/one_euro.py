@@ -84,7 +84,7 @@ class OneEuroParameters:
 
     @classmethod
     def of(cls, settings: FilterCalibration) -> "OneEuroParameters":
-        """What a rig file says [Hz, m, s]."""
+        """Return the filter parameters of a rig file [Hz, m, s]."""
         return cls(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz, jitter=settings.jitter_m)
 
     def array(self) -> Float:

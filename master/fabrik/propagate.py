@@ -1,4 +1,6 @@
-"""Carry the markers of every camera from the frames around an instant to that instant.
+"""Propagation of the markers of every camera to one epoch.
+
+They are carried from the frames around the epoch to the epoch.
 
 A hand's way is known by what hands can do: about the instant it is a Taylor series whose speed, acceleration, jerk and
 snap are random, with the sizes of real hands. Given up to four frames with their noise, the best linear estimate of the
@@ -73,7 +75,7 @@ class TrackHistory(NamedTuple):
 def propagate(
     history: TrackHistory, t_ns: int, reach_ns: Reach, uv: Float, sigma: Float, area: Float, missing: Bool
 ) -> tuple[int, bool]:
-    """Write the markers and their rivals in C cameras at an instant.
+    """Write the markers and their alternatives in C cameras at an epoch.
 
     What the nearest frame does not show is not seen.
 
@@ -125,7 +127,7 @@ def propagate(
 
 @inner
 def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int) -> int:
-    """Write the slots of the frames around an instant, nearest first.
+    """Write the slots of the frames around an epoch, nearest first.
 
     Returns how many. None at all where even the nearest is too far: a track carried over two frames into the unknown
     is off by decimetres in depth, and the ray of a camera that does see is worth more. Of the frames after the instant
@@ -154,7 +156,9 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
 
 @inner
 def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, track: Float) -> bool:
-    """Write the tracks of a marker and its rival; return whether it has one.
+    """Write the tracks of a marker and its alternative.
+
+    Returns whether the marker has an alternative.
 
     `track`: (SIGHTINGS, 2, 4) u, v [px], time of the row from the instant [s], sigma [px].
     """

@@ -88,7 +88,9 @@ def _covariance(
     cov: Float,
     own: Float,
 ) -> None:
-    """Write the covariance (3, 3) of a refined point: all parts (see the module); and of them what rays do not show.
+    """Write the covariance (3, 3) of a refined point.
+
+    It has all parts (see the module); the part of them that the rays do not show is written too.
 
     `process_noise`: as of `_Hand`.
     """
@@ -209,7 +211,9 @@ def _monocular(
     rays: Rays,
     views: Views,
 ) -> None:
-    """Take the cap's bias from the centroid of a single camera, as the hand has the cap.
+    """Take the cap's bias from the centroid of a single camera.
+
+    The cap's pose is that of the hand estimate.
 
     Its uncertain tilt is that camera's own error.
     """
@@ -314,7 +318,7 @@ def correct_centres(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayPositions(MarkerPositions):
-    """Markers placed by rays, with what each ray is worth.
+    """Markers triangulated by rays, with the information of each ray.
 
     Attributes:
         uv: (C, M, 2) [px] centroids without the bias of the caps; NaN: not seen.
@@ -329,7 +333,10 @@ class RayPositions(MarkerPositions):
 
 
 class RayTriangulator:
-    """Triangulates the markers of a rig by rays. Holds room for its kernels, no state."""
+    """Triangulator of the markers of a rig by rays.
+
+    Holds room for its kernels, no state.
+    """
 
     def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
         """Triangulate these markers with these cameras.

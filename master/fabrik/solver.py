@@ -97,7 +97,7 @@ class FabrikSolver:
     def solve(
         self, frames: FrameSet, warm_start: SolvedHand | None = None, warm_start_age_s: float = 0.0
     ) -> HandEstimate:
-        """Solve one instant.
+        """Solve one epoch.
 
         Args:
             frames: What the cameras see of it.
@@ -156,7 +156,7 @@ class FabrikSolver:
         self.sync.at(0)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
-        """The last hand, if it still says anything, and how long ago it held [s]."""
+        """Return the last hand, if it is still informative, and its age [s]."""
         age_s = (t_ns - self._last_ns) * 1e-9
         if not self.continuous or self._last is None or not 0.0 < age_s <= FORGET_S:
             return None, 0.0

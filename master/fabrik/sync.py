@@ -1,4 +1,6 @@
-"""Synchronise the cameras: which frames belong together, markers at one instant.
+"""Synchronisation of the cameras.
+
+It determines which frames belong together, and the markers at one epoch.
 
 An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
 delivered a dozen frames since its last), nor slow (it delivers less than half of its frames, by what others deliver),
@@ -32,7 +34,7 @@ _REACH_M = 0.5  # where hands are, for what a camera makes of their motion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Every marker in every camera at one instant.
+    """Every marker in every camera at one epoch.
 
     Attributes:
         t_ns: The instant, master's clock.
@@ -55,7 +57,9 @@ class FrameSet:
 
 
 class FrameSync:
-    """Push machine. Holds the last few frames of each camera and the instants not yet emitted.
+    """Synchroniser of camera frames into epochs.
+
+    Push machine. Holds the last few frames of each camera and the epochs not yet emitted.
 
     Attributes:
         outdated: Instants that were left out because they waited for as long as nothing came at all.
@@ -112,7 +116,9 @@ class FrameSync:
         self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
-        """Take one camera's detections; return the instants that became complete or due, oldest first.
+        """Take one camera's detections and return the finished epochs.
+
+        These are the epochs that became complete or due, oldest first.
 
         Raises:
             ValueError: The camera or the number of markers is not of this rig (ingest lets no such message pass).
@@ -145,7 +151,7 @@ class FrameSync:
         return self._emit(flush=True)
 
     def at(self, t_ns: int) -> FrameSet:
-        """Carry what is held to an instant."""
+        """Carry the held frames to an epoch."""
         shape = len(self._came), self._markers
         uv, sigma = np.empty((2, *shape, 2)), np.empty((2, *shape))
         area, missing = np.empty(shape), np.empty(shape[0], np.bool_)
@@ -213,7 +219,7 @@ class FrameSync:
         return True
 
     def _awaits(self, c: int, t_ns: int) -> bool:
-        """Whether an instant waits for the next frame of a camera."""
+        """Check whether an epoch waits for the next frame of a camera."""
         newest = self._newest_of[c]
         if newest >= t_ns:
             # At the very start one frame is not yet a track.
@@ -221,7 +227,7 @@ class FrameSync:
         return newest + self._slack_ns[c] < t_ns and not self._silent(c)
 
     def _lonely(self, t_ns: int) -> bool:
-        """Whether a camera that is not silent had no frame for an instant.
+        """Check whether a camera that is not silent had no frame for an epoch.
 
         From half a period before it to a while after.
         """

@@ -1,4 +1,7 @@
-"""Kernels of the line's palm: where the back looks, and where fingers are to bring their markers."""
+"""Kernels of the pipeline's palm: back normal and finger targets.
+
+They give where the back faces, and where fingers are to bring their markers.
+"""
 
 from math import sqrt
 

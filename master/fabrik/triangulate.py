@@ -358,7 +358,7 @@ def triangulate(
 
 
 class Triangulate(Protocol):
-    """Triangulates the M markers of an instant by the depth model of a rig.
+    """Triangulator of the M markers of an epoch by the depth model of a rig.
 
     By its law, or by the rays of all cameras.
     """

@@ -1,1 +1,1 @@
-"""What a hand says: poses that it holds, pinches, dials, taps and pointing."""
+"""Hand gestures: held poses, pinches, dials, taps and pointing."""

@@ -1,4 +1,6 @@
-"""Which action a hand does: its shape when it begins chooses, and until it ends there is no other.
+"""Selection of the action that a hand performs.
+
+The hand's shape when the action begins decides, and until it ends there is no other.
 
     thumb and one finger meet, that finger bent out of the row      pinch
     the thumb meets a finger of four that lie side by side          tap
@@ -30,7 +32,7 @@ class ActionMonitor:
         self.tap, self.point = ThumbTapMonitor(settings.tap), PointMonitor(settings.point)
 
     def push(self, seen: HandFeatures, *, wrist_device_only: bool = False) -> list[Gesture]:
-        """What is to be told at the instant of the features.
+        """Return the messages at the epoch of the features.
 
         `wrist_device_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
         """
@@ -50,6 +52,6 @@ class ActionMonitor:
         return gestures + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:
-        """What is to be told at an instant at which there is no hand."""
+        """Return the messages at an epoch at which there is no hand."""
         self.tap.drop()
         return self.pinch.lost(t_ns) + self.dial.lost(t_ns) + self.point.lost(t_ns)

@@ -1,4 +1,4 @@
-"""`phalanx gestures`: the poses of a settings file, and what recorded hands say."""
+"""`phalanx gestures`: poses of a settings file, and gestures of recorded hands."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -104,7 +104,7 @@ def _forget(options: Namespace) -> None:
 
 
 def with_pose(settings: GestureSettings, name: str, templates: PoseTemplate, source: str) -> GestureSettings:
-    """The settings with a taught pose, and where it comes from."""
+    """Return the settings with a template pose added, and its origin."""
     made = provenance(_TOOL, (source,), templates.residual)
     return msgspec.structs.replace(
         settings,
@@ -174,7 +174,10 @@ def _settings_path(options: Namespace) -> Path:
 
 
 def _settings(path: Path) -> GestureSettings:
-    """The file, or the defaults where there is none yet; a new file is called as the path says."""
+    """Read the settings file, or return the defaults where there is none yet.
+
+    A new file is named as the path states.
+    """
     if path.exists():
         return load(path, GestureSettings)
     return msgspec.structs.replace(default_gestures(), name=path.stem)

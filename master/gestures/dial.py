@@ -1,4 +1,6 @@
-"""A dial: a grip about something round, by how much it is turned, over as many grips as it takes.
+"""A dial gesture: a grip about something round, and its rotation angle.
+
+The rotation goes on over as many grips as it takes.
 
 Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
 also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
@@ -55,7 +57,10 @@ class _Grip:
 
 
 class DialMonitor:
-    """Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one."""
+    """Detector of dial gestures.
+
+    Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one.
+    """
 
     def __init__(self, settings: DialSettings) -> None:
         self._settings = settings
@@ -75,7 +80,7 @@ class DialMonitor:
     def push(
         self, seen: HandFeatures, across_m: float, *, may_begin: bool, wrist_device_only: bool = False
     ) -> list[Gesture]:
-        """What is to be told at the instant of the features.
+        """Return the messages at the epoch of the features.
 
         Args:
             seen: The hand.
@@ -108,7 +113,7 @@ class DialMonitor:
         return [self._message(self._dial, "update", seen, tips)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
-        """What is to be told at an instant at which there is no hand."""
+        """Return the messages at an epoch at which there is no hand."""
         self._maybe.clear()
         last = self._last
         if self._dial is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:

@@ -33,7 +33,7 @@ _OWN_M = 0.012  # a marker farther from where the hand has the cap is not this f
 
 
 class HandFeatures(NamedTuple):
-    """One hand at one instant; fingers thumb ... little.
+    """Features of one hand at one epoch; fingers are thumb ... little.
 
     Attributes:
         hand: Name of the hand profile.

@@ -1,4 +1,6 @@
-"""How a grip has gone of late: how wide it was and how far turned, so that one that loosens turns nothing.
+"""Recent width and rotation of a grip.
+
+It is kept so that a grip that loosens rotates nothing.
 
 Fingers that let go of a knob go apart, and not alike: taken for a turn it is some degrees. They are quick, so that a
 grip that is suddenly wider than it was is loosening, or the instant is a bad one; a grip that slowly gets wider, as the
@@ -17,21 +19,29 @@ _HOLD_S = 0.15  # a grip that is wider for so long is just wider
 
 
 class GripHistory:
-    """Push machine. Holds width [m] and angle [rad] of the last tenth of a second, and since when the grip loosens."""
+    """Recent history of a grip.
+
+    Push machine. Holds width [m] and angle [rad] of the last tenth of a second, and since when the grip loosens.
+    """
 
     def __init__(self, quick_m: float) -> None:
-        """A grip that is wider, or narrower, by so much than it was of late is loosening [m]."""
+        """Set the change of width at which a grip counts as loosening [m].
+
+        A grip that is wider, or narrower, by so much than it recently was is loosening.
+        """
         self._quick_m = quick_m
         self._late: deque[tuple[int, float, float]] = deque()
         self._since_ns: int | None = None
 
     @property
     def loosens(self) -> bool:
-        """Whether it did at the last instant."""
+        """Return whether the grip was loosening at the last epoch."""
         return self._since_ns is not None
 
     def sound(self, t_ns: int, wide_m: float, most_m: float) -> bool:
-        """Whether the fingers turn the knob at an instant, at which they are wider by so much than when they closed.
+        """Check whether the fingers rotate the knob at an epoch.
+
+        At the epoch they are wider by `wide_m` than when they closed.
 
         `most_m`: a grip that is wider than that is loose, however long it has been so.
         """
@@ -50,14 +60,16 @@ class GripHistory:
         return good
 
     def push(self, t_ns: int, wide_m: float, angle_rad: float) -> None:
-        """Width and angle of a sound instant."""
+        """Take width and angle of a sound epoch."""
         self._late.append((t_ns, wide_m, angle_rad))
         while len(self._late) > 2 and (t_ns - self._late[0][0]) * 1e-9 > _LATE_S:
             self._late.popleft()
 
     def ahead_rad(self, t_ns: int) -> float | None:
-        """The angle at an instant after the last sound one, by those at which nothing had begun to loosen yet; None:
-        there was none."""
+        """Extrapolate the angle to an epoch after the last sound one.
+
+        The epochs at which nothing had begun to loosen yet are used; None: there was none.
+        """
         if not self._late:
             return None
         typical = median(wide for _, wide, _ in self._late)

@@ -1,4 +1,7 @@
-"""A gesture that lasts: when it began, and the messages of its beginning, its course and its end."""
+"""A gesture that lasts: its start time and its messages.
+
+The messages are those of its beginning, its course and its end.
+"""
 
 from dataclasses import dataclass
 from math import erf, isfinite, nan, sqrt
@@ -39,7 +42,7 @@ class HeldGesture:
         origin_m: Float = _NOWHERE,
         direction: Float = _NOWHERE,
     ) -> Gesture:
-        """The message of an instant."""
+        """Return the message of an epoch."""
         return Gesture(
             hand=self.hand,
             t_ns=t_ns,
@@ -57,7 +60,10 @@ class HeldGesture:
 
 
 def below(value: float, limit: float, sigma: float) -> float:
-    """Probability that what was measured as `value` with a standard deviation is below the limit; 0.5 if unknown."""
+    """Return the probability that a measured quantity is below the limit.
+
+    It was measured as `value` with a standard deviation; 0.5 if unknown.
+    """
     if not isfinite(sigma):
         return 0.5
     return 0.5 * (1.0 + erf((limit - value) / (max(sigma, 1e-6) * sqrt(2.0))))

@@ -1,4 +1,6 @@
-"""Pinches: thumb and one finger pad to pad, how far apart their skins are and how firmly they close.
+"""Pinches of the thumb and one finger, pad to pad.
+
+They have the distance of the skins and how firmly the fingers close.
 
 A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the others
 are well away from the thumb, or they are at least farther, and then the pads face each other as far as that is known
@@ -19,7 +21,10 @@ from master.gestures.touch import ThumbTouch
 
 
 class PinchMonitor:
-    """Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was."""
+    """Detector of pinches.
+
+    Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was.
+    """
 
     def __init__(self, settings: PinchSettings) -> None:
         self._settings = settings
@@ -33,7 +38,10 @@ class PinchMonitor:
         return self._pinch is not None
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
-        """What is to be told at the instant of the features; a pinch begins only where it may."""
+        """Return the messages at the epoch of the features.
+
+        A pinch begins only where it may.
+        """
         if self._pinch is None:
             finger = self._begins(seen, touch) if may_begin else None
             if finger is None:
@@ -51,7 +59,7 @@ class PinchMonitor:
         return [self._message(self._pinch, "update", seen, touch)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
-        """What is to be told at an instant at which there is no hand."""
+        """Return the messages at an epoch at which there is no hand."""
         last = self._last
         if self._pinch is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
             return []

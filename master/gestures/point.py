@@ -1,4 +1,6 @@
-"""Pointing: the index finger stretched, the three after it bent, and the ray that goes on where it points.
+"""Pointing: index finger extended, the three after it flexed, and the ray.
+
+The ray goes on where the index finger points.
 
 The ray goes from the knuckle through the tip and begins at the tip. Both ends are what a hand is fitted to best, the
 tip by its own marker and the knuckle by the palm, and they are as far apart as anything that points: the same
@@ -32,8 +34,11 @@ _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
 class PointMonitor:
-    """Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
-    sure."""
+    """Detector of pointing.
+
+    Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
+    sure.
+    """
 
     def __init__(self, settings: PointSettings) -> None:
         self._settings = settings
@@ -48,7 +53,10 @@ class PointMonitor:
         return self._point is not None
 
     def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
-        """What is to be told at the instant of the features; it begins only where it may."""
+        """Return the messages at the epoch of the features.
+
+        Pointing begins only where it may.
+        """
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
         most_rad = own.ray_sigma_rad * (1.0 if point is None else _HELD)
@@ -70,7 +78,7 @@ class PointMonitor:
         return [self._message(point, "update", seen)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
-        """What is to be told at an instant at which there is no hand."""
+        """Return the messages at an epoch at which there is no hand."""
         last = self._last
         if self._point is None or last is None or not self._over(t_ns):
             return []
@@ -79,7 +87,10 @@ class PointMonitor:
         )
 
     def _over(self, t_ns: int) -> bool:
-        """Whether the shape has been lost for long; counts from the first time it is asked."""
+        """Check whether the shape has been lost for long.
+
+        The time counts from the first call.
+        """
         if self._since_ns is None:
             self._since_ns = t_ns
         return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
@@ -89,7 +100,10 @@ class PointMonitor:
         return [message]
 
     def _shape(self, seen: HandFeatures) -> bool:
-        """Whether the index finger is stretched and the others are bent, as far as these are known."""
+        """Check whether the index finger is extended and the others are flexed.
+
+        It is checked as far as these are known.
+        """
         own, going = self._settings, self.active
         slack = own.slack_rad if going else 0.0
         sigma: list[float] = seen.sigma_m.tolist()

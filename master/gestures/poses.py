@@ -1,4 +1,6 @@
-"""Which pose the hand is held in: the six of the Digits study, and those that were taught.
+"""Recognition of the pose in which the hand is held.
+
+The poses are the six of the Digits study, and those of templates.
 
 Every pose says which quantities are to lie in which range (`common.gesture_settings`). It fits by
 
@@ -96,7 +98,10 @@ class PoseTable:
                 own.asked[at], own.low[at], own.high[at], own.soft[at] = True, span.low, span.high, span.soft
 
     def residuals(self, quantities: Quantities) -> Float:
-        """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
+        """Return the distance to each pose's ranges (P, Q), in standard deviations.
+
+        It is 0 inside, and where a pose has no range.
+        """
         return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
 
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
@@ -170,8 +175,10 @@ class FingerSpeed:
         self._past: deque[tuple[int, list[float], list[bool]]] = deque()
 
     def push(self, t_ns: int, bend_deg: list[float], known: list[bool]) -> float:
-        """Speed [deg/s], root mean square over the fingers known then and now, or over all where none is; inf where no
-        frame tells.
+        """Return the speed of the fingers [deg/s].
+
+        It is the root mean square over the fingers known then and now, or over all where none is; inf where no frame
+        gives it.
 
         Args:
             t_ns: The instant [ns].
@@ -215,7 +222,7 @@ class PoseRecogniser:
         return None if self._held is None else self._table.names[self._held]
 
     def push(self, features: HandFeatures) -> list[Gesture]:
-        """What is to be said of a hand; instants rise."""
+        """Return the messages about a hand; epochs must rise."""
         quantities = Quantities.of(features)
         fit = self._table.fit(quantities, features.known)
         bends, known = known_bends(features)
@@ -226,12 +233,15 @@ class PoseRecogniser:
         return self._go_on(features, fit)
 
     def lose(self, hand: str, t_ns: int) -> list[Gesture]:
-        """What is to be said where the hand itself is not known at `t_ns`."""
+        """Return the messages where the hand itself is not known at `t_ns`."""
         self._coming = None
         return [] if self._held is None else self._unsure(hand, t_ns, self._hold.lost_s)
 
     def _beginning(self, features: HandFeatures, fit: Fit, speed: float, known: int) -> int | None:
-        """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
+        """Return the pose that would be held now, regardless of the current one.
+
+        It is confident, for long enough, by a hand that rests.
+        """
         best, t_ns = fit.best, features.t_ns
         # Of both kinds of sensors none may see a tip just now and fingers be known all the same.
         there = features.seen.any() or features.known.any()

@@ -1,4 +1,6 @@
-"""The quantities that poses are told by (`common.gesture_settings.Quantity`), of one hand, and how sure each is.
+"""Quantities of one hand that distinguish the poses, with uncertainties.
+
+The quantities are `common.gesture_settings.Quantity`.
 
 A tip that is off by s turns the finger's last two bones about the PIP, so that a bend is off by s over their length;
 that is the lever of all bends here. What is said of the thumb's tip is off as the tip is, gaps as both tips are.
@@ -29,7 +31,9 @@ _THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _ALL, _SPREADS = 12, 13, 16, 20, 21, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """All quantities of a hand at one instant, in the order of `QUANTITIES` and in the units of their names.
+    """All quantities of a hand at one epoch.
+
+    They are in the order of `QUANTITIES` and in the units of their names.
 
     Attributes:
         value: (Q,).
@@ -153,7 +157,10 @@ def _heading(f: int, joints: Float, T: Float, side: float) -> float:
 
 
 def known_bends(features: HandFeatures) -> tuple[list[float], list[bool]]:
-    """Bends (4,) [deg] of index ... little, MCP and PIP together, and which of these fingers are known."""
+    """Return the flexions (4,) [deg] of index ... little and which are known.
+
+    A flexion is MCP and PIP together.
+    """
     bends: list[list[float]] = features.bend_rad.tolist()
     return [degrees(mcp + pip) for mcp, pip, _ in bends[1:]], features.known.tolist()[1:]
 

@@ -1,4 +1,7 @@
-"""What a recorded hand says: all gestures of its poses, and each from its begin to its end."""
+"""Gestures of a recorded hand.
+
+They are all gestures of its poses, and each from its begin to its end.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -32,14 +35,14 @@ class Spoken:
     value: str
 
     def line(self, since_ns: int) -> str:
-        """For a person; times since an instant [ns]."""
+        """Return a readable line; times are since an epoch [ns]."""
         began, ended = (1e-9 * (t_ns - since_ns) for t_ns in (self.began_t_ns, self.ended_t_ns))
         who = self.kind if self.name == self.kind else f"{self.kind} {self.name}"
         return f"{began:9.3f} s to {ended:9.3f} s  {who:24s} {self.confidence:.2f}  {self.value}".rstrip()
 
 
 def read_gestures(poses: Poses, settings: GestureSettings, model: HandModel) -> list[Gesture]:
-    """Everything that a hand says in its poses."""
+    """Return all gestures of a hand in its poses."""
     recogniser = GestureRecogniser(settings, model)
     return [gesture for k in range(len(poses)) for gesture in recogniser.push(poses.pose(k))]
 
@@ -60,7 +63,10 @@ def spans_of(gestures: Iterable[Gesture]) -> list[Spoken]:
 
 
 def lines_of(gesture: Gesture) -> str:
-    """A message as a line of JSON: arrays as lists, what is not told as null."""
+    """Return a message as a line of JSON.
+
+    Arrays are lists, missing values are null.
+    """
     fields = {name: getattr(gesture, name) for name in gesture.__struct_fields__}
     plain = {
         name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()

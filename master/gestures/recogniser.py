@@ -1,4 +1,4 @@
-"""What a hand says, pose by pose: the shapes it is held in and what it does."""
+"""Gesture recognition, pose by pose: held poses and actions of a hand."""
 
 import numpy as np
 
@@ -31,7 +31,9 @@ class GestureRecogniser:
         rehearse(seen)
 
     def push(self, pose: HandPose) -> list[Gesture]:
-        """What is to be told of a pose of that hand, in the order of capture; usually nothing or one message.
+        """Return the messages about a pose of that hand.
+
+        They are in the order of capture; usually nothing or one message.
 
         Of a pose without a hand only what has lasted too long without one ends.
         """

@@ -1,4 +1,6 @@
-"""The keys of a hand: the thumb's tip touches a segment of a finger and leaves it again.
+"""Taps of the thumb on the keys of a hand.
+
+The thumb's tip touches a segment of a finger and leaves it again.
 
 The four fingers side by side are a keypad, held so that the index finger lies on top and the tips at the left: the rows
 are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch is the thumb's that comes from
@@ -35,7 +37,7 @@ _NEVER_NS = -(2**61)
 
 
 class _Epoch(NamedTuple):
-    """The thumb at an instant of a touch.
+    """The thumb at one epoch of a touch.
 
     Attributes:
         gap_m: (4,) to index ... little.
@@ -52,8 +54,11 @@ class _Epoch(NamedTuple):
 
 @dataclass(slots=True)
 class _Touch:
-    """A touch that goes on: since when, how the fingers were bent before, its least gap, and all its instants, of which
-    there are no more than `longest_s` has."""
+    """A touch in progress.
+
+    Holds since when, the flexion of the fingers before, the least gap, and all epochs of the touch, of which there
+    are no more than `longest_s` has.
+    """
 
     began_ns: int
     bend_rad: float
@@ -62,7 +67,10 @@ class _Touch:
 
 
 class ThumbTapMonitor:
-    """Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and of the last tap."""
+    """Detector of thumb taps.
+
+    Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and the last tap.
+    """
 
     def __init__(self, settings: TapSettings) -> None:
         self._settings = settings
@@ -76,7 +84,10 @@ class ThumbTapMonitor:
         return self._touch is not None
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
-        """What is to be told at the instant of the features; a touch begins only where it may."""
+        """Return the messages at the epoch of the features.
+
+        A touch begins only where it may.
+        """
         own = self._settings
         keys: list[list[float]] = touch.key_gap_m.tolist()
         gaps = [min(one) for one in keys]
@@ -127,7 +138,10 @@ class ThumbTapMonitor:
         return apart and (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s and is_pad(seen, own)
 
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
-        """The tap of a touch that is over; nothing where two fingers may have been touched."""
+        """Return the tap of a touch that is over.
+
+        It is nothing where two fingers may have been touched.
+        """
         least = [min(one.gap_m) for one in gone.epochs]
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
         flight, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]

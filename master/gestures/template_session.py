@@ -1,4 +1,7 @@
-"""The lesson with a person: a countdown, a hold that must be still, then the hand moves, and so for each example."""
+"""Interactive recording of a pose template with a person.
+
+For each example there is a countdown, a hold that must be still, and then the hand moves.
+"""
 
 from collections.abc import Callable
 
@@ -69,7 +72,10 @@ def template_session(
 
 
 def held(poses: list[HandPose], model: HandModel) -> list[HandFeatures]:
-    """The features of poses that have a hand, in order of time, each instant once."""
+    """Return the features of poses that have a hand.
+
+    They are in order of time, each epoch once.
+    """
     extractor, out = FeatureExtractor(model), list[HandFeatures]()
     for pose in poses:
         features = extractor.of(pose)

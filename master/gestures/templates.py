@@ -1,4 +1,6 @@
-"""A pose from a few examples: ranges about what was shown, refused where it cannot be told from another.
+"""Pose template from a few examples.
+
+It has ranges about what was shown, and is refused where it cannot be distinguished from another.
 
 An example is a hold of some frames; of each quantity it has the median. Over the examples a quantity has a mean and a
 spread, which nobody repeats better than `FLOOR` another day; few examples widen it as Student's t does (the factor that
@@ -166,7 +168,9 @@ def _refuse_alike(
     others: Mapping[str, PoseShape],
     within: str | None,
 ) -> None:
-    """Refuse what another pose fits, or a taught pose whose middle fits this one.
+    """Refuse examples that another pose fits.
+
+    A template pose whose middle fits this one is refused too.
 
     Raises:
         FitError: Naming the pose, and what comes nearest to telling them apart.
@@ -190,7 +194,10 @@ def _refuse_alike(
 
 
 def _middle(shape: PoseShape) -> Example | None:
-    """The middle of a pose that was taught: all that it asks has two sides. None: it is a wider one."""
+    """Return the middle of a template pose, all of whose ranges have two sides.
+
+    None: it is a wider pose.
+    """
     value, sigma = np.zeros(len(QUANTITIES)), np.full(len(QUANTITIES), np.inf)
     for quantity, span in shape.ranges.items():
         if span.high - span.low > 4.0 * span.soft:
@@ -211,7 +218,10 @@ def _residuals(shape: PoseShape, example: Example) -> Float:
 
 
 def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> str:
-    """What tells the examples from another pose, most telling first."""
+    """Return what distinguishes the examples from another pose.
+
+    The most distinctive quantity comes first.
+    """
     residuals = np.median([_residuals(shape, example) for example in examples], axis=0)
     value = np.median([example.quantities.value for example in examples], axis=0)
     parts: list[str] = []
@@ -227,7 +237,10 @@ def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> st
 
 
 def _agreement(name: str, examples: Sequence[Example]) -> float:
-    """The worst fit of an example to what the others alone would have taught; 1 of three, which are too few for it."""
+    """Return the worst leave-one-out fit of an example.
+
+    Each example is compared with the template that the others alone would give; 1 of three, which are too few for it.
+    """
     if len(examples) <= FEWEST:
         return min(_scores(_shape(name, examples, 1.0), examples))
     out: list[float] = []

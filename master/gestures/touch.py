@@ -1,4 +1,7 @@
-"""Where the thumb is to the fingers, skin to skin, and which sides face each other: what pinches and taps are."""
+"""Position of the thumb relative to the fingers, skin to skin.
+
+It includes which sides face each other; pinches and taps are defined by it.
+"""
 
 from collections.abc import Callable
 from math import acos, hypot, sqrt
@@ -105,7 +108,10 @@ def _on(joints: Float, a: int, b: int, share: float) -> Vector:
 
 @inner
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
-    """Return where along two segments their skins are nearest, as `common.capsule_gaps`."""
+    """Return where along two segments their skins are nearest.
+
+    As `common.capsule_gaps`.
+    """
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))
     uu, vv, uv, au, bv, square = (

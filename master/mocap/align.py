@@ -1,4 +1,4 @@
-"""Where the frame of a motion capture lies in ours, and how its clock stands to ours.
+"""Alignment of a motion capture's frame and clock to ours.
 
 The offset of the clocks is found first by speeds (`speed_match.py`). Then turn R, shift s and offset
 d together by Gauss-Newton with the weights of Geman & McClure, from the rigid fit of Kabsch (1976):
@@ -91,7 +91,9 @@ def _rows(ours: Track) -> Int:
 
 
 def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, float]:
-    """The rigid motion (4, 4) of points (N, J, 3) to others, robustly, and the median distance left [m].
+    """Return the rigid motion (4, 4) between two sets of points (N, J, 3).
+
+    The registration is robust; the median distance left [m] is returned too.
 
     Raises:
         FitError: Too few points, or all on a line.
@@ -140,7 +142,10 @@ def _four(linear: Float) -> Float:
 
 @dataclass(slots=True)
 class _Fit:
-    """Turn, shift and offset together; holds the normal equations of each part of the time."""
+    """Joint fit of rotation, translation and time offset.
+
+    Holds the normal equations of each part of the time.
+    """
 
     T: Float
     offset_ns: float
@@ -174,7 +179,10 @@ class _Fit:
     def _normal(
         self, found: Float, target: Float, speed: Float, both: Bool, part: Int, middle: Float
     ) -> None:
-        """Normal equations of (turn [rad] about the middle, shift [m], offset [s]) for each part."""
+        """Write the normal equations for each part of the time.
+
+        Unknowns are (rotation [rad] about the middle, shift [m], offset [s]).
+        """
         off = np.where(both[..., None], target - found, 0.0)
         distance = np.linalg.norm(off[both], axis=1)
         self.residual_m = float(np.median(distance))
@@ -194,7 +202,10 @@ class _Fit:
             self.gradient[k] = a.T @ off[own].reshape(-1)
 
     def sigma(self) -> Float:
-        """Standard deviations (7,) of turn [rad], shift [m] and offset [s]: what leaving out one part changes."""
+        """Return the jackknife standard deviations (7,).
+
+        They are of rotation [rad], shift [m] and offset [s]: what leaving out one part changes.
+        """
         A, g = self.normal.sum(axis=0), self.gradient.sum(axis=0)
         without = [_solved(A - self.normal[k], g - self.gradient[k]) for k in range(_PARTS)]
         spread = np.array(without) - np.mean(without, axis=0)
@@ -202,5 +213,8 @@ class _Fit:
 
 
 def _solved(normal: Float, gradient: Float) -> Float:
-    """The step (7,) of normal equations; what nothing tells (the offset of a hand that rests) stays as it is."""
+    """Return the step (7,) of normal equations.
+
+    What nothing constrains (the offset of a hand that rests) stays as it is.
+    """
     return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ gradient, np.float64)

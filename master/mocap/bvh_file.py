@@ -1,4 +1,6 @@
-"""Reads BVH: a tree of joints with offsets, and the turns of every frame, into positions of all joints.
+"""Reader of BVH files.
+
+A tree of joints with offsets, and the rotations of every frame, become positions of all joints.
 
     R_joint = R_parent . product of its rotation channels, in their order      p_joint = p_parent + R_parent . offset
 

@@ -1,4 +1,7 @@
-"""Reads the labelled points of a C3D file (c3d.org), by py-c3d; the only file that knows that library."""
+"""Reader of the labelled points of a C3D file (c3d.org), by py-c3d.
+
+This is the only file that depends on that library.
+"""
 
 import struct
 import warnings

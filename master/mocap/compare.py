@@ -1,4 +1,6 @@
-"""How far poses are from a motion capture of the same hand: errors, coverage of stated regions, false TRACKED.
+"""Comparison of poses with a motion capture of the same hand.
+
+It yields errors, coverage of stated regions, false TRACKED.
 
 Angles are those between bones, from the joints of both alike, so that nobody's definition of zero matters: PIP and DIP
 between the two bones at the joint, MCP between the proximal bone and the metacarpal (the line from the wrist, where the
@@ -30,7 +32,9 @@ for _finger, _joints in enumerate(FINGER_JOINTS):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """Poses against truth, at the T instants of the poses that lie in the time of the truth.
+    """Poses against truth at T epochs.
+
+    They are the epochs of the poses that lie in the time of the truth.
 
     Attributes:
         off_m: (T, 26, 3) [m], rig frame; NaN where the truth is not known or the joint is not valid.
@@ -109,7 +113,10 @@ def compare(
 
 
 def _chi2(off_m: Float, cov_m2: Float) -> Float:
-    """Squared Mahalanobis length (T, 26) of errors; infinite where there is an error and no covariance."""
+    """Return the squared Mahalanobis length (T, 26) of errors.
+
+    It is infinite where there is an error and no covariance.
+    """
     stated = np.asarray(known(cov_m2).all(axis=2), np.bool_)
     cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + _FLOOR_M2 * np.eye(3)
     value = (off_m * np.linalg.solve(cov, off_m[..., None])[..., 0]).sum(axis=2)
@@ -130,7 +137,10 @@ def _angle_errors(found: Float, exact: Float) -> Float:
 
 
 def _angles(joints: Float, bases: Bool) -> Float:
-    """Angles (T, 5, 3) [deg] between bones of joints (T, 26, 3); `bases` (26,): metacarpals of fingers to be used."""
+    """Return the angles (T, 5, 3) [deg] between bones of joints (T, 26, 3).
+
+    `bases` (26,): metacarpals of fingers to be used.
+    """
     out = np.full((len(joints), 5, 3), np.nan)
     for finger, (first, *chain) in enumerate(FINGER_JOINTS):
         base = first if finger == 0 or bases[first] else WRIST
@@ -147,7 +157,10 @@ def _between(first: Float, second: Float) -> Float:
 
 
 def figures(compared: Compared) -> dict[str, object]:
-    """All figures by name: of the whole hand, by class of joint, by finger, by angle; None: nothing to average."""
+    """Return all metrics by name.
+
+    They are of the whole hand, by class of joint, by finger, by angle; None: nothing to average.
+    """
     every = np.ones(26, np.bool_)
     fingers = {name: _finger_figures(compared, f) for f, name in enumerate(FINGERS)}
     classes = {kind: _figures(compared, _of_class(kind)) for kind in CLASSES}

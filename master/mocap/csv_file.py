@@ -1,4 +1,6 @@
-"""Reads motion capture in text tables: a plain table with named columns, or what optical systems export.
+"""Reader of motion capture in text tables.
+
+It takes a plain table with named columns, or what optical systems export.
 
 A plain table has one line of names and one line a frame. Columns are `NAME_x`, `NAME_y`, `NAME_z`, in any order, with a
 unit behind them or not (`wrist_x_mm`), and a time: `t_ns`, `t_ms`, `t_s`, `time`, `seconds`, ... Our own tables
@@ -39,7 +41,10 @@ def read_csv(path: Path, rate_hz: float | None) -> PointTable:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Of a plain table: point -> its three columns, the column of time and its unit, the unit of length."""
+    """Columns of a plain table.
+
+    Point -> its three columns, the column of time and its unit, the unit of length.
+    """
 
     points: dict[str, list[int]]
     time: int | None

@@ -1,4 +1,6 @@
-"""What is read of a motion-capture file: joints and markers of one hand over time, in metres.
+"""Contents of a motion-capture file.
+
+Joints and markers of one hand over time, in metres.
 
 Readers of single formats give a `PointTable`, every point of the file in the file's own names and unit; `read_motion`
 (master/mocap/read.py) makes a `JointMotion` of it.
@@ -65,7 +67,10 @@ class JointMotion:
         return len(self.t_ns)
 
     def of(self, name: str) -> Float:
-        """Positions (T, 3) [m] of a joint or marker; NaN throughout where the file has none of it."""
+        """Return the positions (T, 3) [m] of a joint or marker.
+
+        NaN throughout where the file has none of it.
+        """
         if name not in self.names:
             return np.full((len(self), 3), np.nan)
         return self.position_m[:, self.names.index(name)]

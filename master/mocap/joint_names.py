@@ -1,4 +1,6 @@
-"""Which joint of ours a name of motion capture means: `mixamorig:RightHandIndex1` is the right index's MCP.
+"""Mapping of motion-capture names to our joints.
+
+`mixamorig:RightHandIndex1` is the right index's MCP.
 
 A name is cut into words at separators, digits and capitals. One word names the finger, one the joint: MCP, PIP and DIP,
 or the bone that begins there, as in WebXR. Where joints of a finger are numbered, how many there are says which is
@@ -116,7 +118,10 @@ def _finger_of(words: list[str]) -> int | None:
 
 
 def _point_of(words: list[str]) -> str | None:
-    """Wrist, palm or back of the hand; `hand` alone is the joint at which a hand begins."""
+    """Return the point of the wrist, palm or back of the hand that the words name.
+
+    `hand` alone is the joint at which a hand begins.
+    """
     if "wrist" in words and "forearm" not in words:
         return "wrist"
     plain = [word for word in words if word not in ("of", "the", "marker")]

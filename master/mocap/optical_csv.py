@@ -1,4 +1,6 @@
-"""Tables that optical systems export: OptiTrack Motive (.csv), Vicon Nexus (.csv) and Qualisys (.tsv).
+"""Reader of the tables that optical systems export.
+
+OptiTrack Motive (.csv), Vicon Nexus (.csv) and Qualisys (.tsv).
 
     Motive    `Format Version`, its key and value pairs in the first line; rows Name, (Rotation, Position), X Y Z
     Vicon     `Trajectories`, the frames a second, a row of names over `Frame, Sub Frame, X, Y, Z`, a row of units
@@ -127,7 +129,10 @@ def _table(
     unit: Unit | None,
     time_column: int | None,
 ) -> PointTable:
-    """Points by their columns; `t_s` is the column of time as it stands, or the row's number."""
+    """Return the points by their columns.
+
+    `t_s` is the column of time as it stands, or the row's number.
+    """
     if not columns:
         raise RecordingError(f"{path}: has no positions of anything")
     times = [] if time_column is None else [time_column]

@@ -1,4 +1,7 @@
-"""Reads motion capture of a hand: format by the file's name, joints by their names, length by unit or hand size."""
+"""Reader of motion capture of a hand.
+
+The format is found by the file's name, joints by their names, length by unit or hand size.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +89,9 @@ def require(motion: JointMotion, needed: tuple[str, ...], what: str) -> None:
 
 
 def unit_by_size(names: tuple[str, ...], position: Float, path: Path) -> tuple[Unit, float]:
-    """The unit in which positions (T, J, 3) are a hand's, and wrist to middle knuckle in metres.
+    """Return the length unit in which positions (T, J, 3) have the size of a hand.
+
+    Also returns the distance from wrist to middle knuckle in metres.
 
     Raises:
         RecordingError: There is no wrist or middle knuckle, or no unit makes a hand of it.

@@ -1,4 +1,7 @@
-"""What a comparison says to a person and to a program: how the two were brought together, and the figures."""
+"""Report of a comparison for a person and for a program.
+
+It states how the two were aligned, and the metrics.
+"""
 
 from collections.abc import Mapping
 from typing import cast
@@ -69,7 +72,10 @@ def table_lines(figures: Mapping[str, object]) -> list[str]:
 
 
 def alignment_json(alignment: Alignment | None) -> dict[str, object]:
-    """The same for programs; None: frame and clock were said to be ours."""
+    """Return the alignment for programs.
+
+    None: frame and clock were stated to be ours.
+    """
     if alignment is None:
         return {"aligned": True}
     alternative = alignment.alternative_s

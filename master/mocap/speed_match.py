@@ -1,4 +1,6 @@
-"""How two clocks stand to each other, by the speeds of the same points: no turn and no shift changes a speed.
+"""Time offset between two clocks, by the speeds of the same points.
+
+No rotation and no shift changes a speed.
 
 Normalised cross-correlation, samples that are missing masked (Padfield, "Masked object registration in the Fourier
 domain", IEEE Trans. Image Process. 21, 2012).
@@ -21,7 +23,9 @@ _MOST_STEPS = 400_000  # 67 minutes
 
 
 def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
-    """Our time less theirs [ns], the correlation of speeds, and how much later a rival offset is [s], NaN: none.
+    """Return our time less theirs [ns] and the correlation of speeds.
+
+    The third value is how much later an alternative offset is [s], NaN: none.
 
     Raises:
         FitError: The speeds do not agree anywhere.
@@ -54,7 +58,10 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
 
 
 def _speeds(track: Track) -> tuple[Float, int]:
-    """Mean speed of the points (K,) [m/s] at steps of 10 ms, NaN: not known; and the first instant [ns]."""
+    """Return the mean speed of the points (K,) [m/s] and the first time [ns].
+
+    Steps are 10 ms; NaN: not known.
+    """
     count = int((track.t_ns[-1] - track.t_ns[0]) // _STEP_NS) + 1 if len(track.t_ns) else 0
     if count > _MOST_STEPS:
         raise FitError(
@@ -71,7 +78,10 @@ def _speeds(track: Track) -> tuple[Float, int]:
 
 
 def _masked_correlation(a: Float, b: Float, together: float) -> Float:
-    """Correlation of `a` and shifted `b` for each lag of `scipy.signal.correlate`; -1: too little shared."""
+    """Return the correlation of `a` and shifted `b` for each lag.
+
+    Lags are those of `scipy.signal.correlate`; -1: too little shared.
+    """
     known_a, known_b = np.isfinite(a).astype(np.float64), np.isfinite(b).astype(np.float64)
     a = np.where(known_a > 0.0, a - np.nanmean(a), 0.0)
     b = np.where(known_b > 0.0, b - np.nanmean(b), 0.0)

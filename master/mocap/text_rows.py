@@ -31,7 +31,9 @@ def read_rows(path: Path) -> list[list[str]]:
 
 
 def numbers(rows: list[list[str]], first_line: int, columns: list[int], path: Path) -> Float:
-    """The cells of some columns as numbers (T, C); empty ones and those that a row does not have are NaN.
+    """Return the cells of some columns as numbers (T, C).
+
+    Empty cells and those that a row does not have are NaN.
 
     Raises:
         RecordingError: A cell is no number; with its line and column.

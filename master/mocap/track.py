@@ -1,4 +1,7 @@
-"""Points over time that two programs can both tell: resampled, and how fast they move."""
+"""Points over time that two programs both report.
+
+They are resampled, and their speeds computed.
+"""
 
 from dataclasses import dataclass
 
@@ -17,7 +20,7 @@ def known(position_m: Float) -> Bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Positions of J named points at T instants.
+    """Positions of J named points at T times.
 
     Attributes:
         t_ns: (T,) [ns], rising.
@@ -34,7 +37,9 @@ class Track:
         return int(min(max(_GAP_NS, _GAP_FRAMES * typical), _MOST_GAP_NS))
 
     def at(self, t_ns: Int) -> Float:
-        """Positions (N, J, 3) [m] at instants (N,), between two frames linearly.
+        """Interpolate positions (N, J, 3) [m] at times (N,).
+
+        Between two frames the interpolation is linear.
 
         NaN before the first frame, after the last, in a gap, and where one of the two frames does not know the point.
         """

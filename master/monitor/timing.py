@@ -1,4 +1,6 @@
-"""The residual time between cameras, measured from the tracks themselves while they run.
+"""Residual time offset between cameras.
+
+It is measured from the tracks themselves while they run.
 
 A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by exposure and
 transfer, 8 to 10 ms; and nothing that travels with the frame tells. The tracks do (`master.monitor.timing_evidence`).
@@ -30,7 +32,10 @@ _SPARE = 2  # times as many frames are kept as a block needs
 
 
 class ResidualTiming:
-    """Push machine. Holds the last second of every camera's frames, and the sums of the newest 60 moving blocks."""
+    """Estimator of the residual time offset between cameras.
+
+    Push machine. Holds the last second of every camera's frames, and the sums of the newest 60 moving blocks.
+    """
 
     def __init__(
         self,
@@ -65,7 +70,10 @@ class ResidualTiming:
         self._reference: tuple[int, Track] | None = None
 
     def push(self, message: MarkerDetections) -> None:
-        """Take one camera's detections, on the master's clock; those of other cameras are passed over."""
+        """Take one camera's detections, on the master's clock.
+
+        Those of other cameras are passed over.
+        """
         c = self._index.get(message.camera)
         if c is None:
             return
@@ -98,7 +106,10 @@ class ResidualTiming:
                 pass
 
     def offset_of(self, camera: str) -> TimeOffset | None:
-        """What the last half minute of motion says of a camera; None: not enough, or the reference itself."""
+        """Return the time offset of a camera from the last half minute of motion.
+
+        None: not enough, or the reference itself.
+        """
         c = self._index[camera]
         blocks = self._blocks[c].copy()
         return fit_offset(np.stack(blocks)) if c and blocks else None
@@ -144,7 +155,10 @@ class ResidualTiming:
             self._blocks[c].append(sums)
 
     def _track(self, c: int, begin_ns: int) -> Track:
-        """The frames of a camera about a block; times [s] since its begin. A marker with a rival is not seen."""
+        """Return the frames of a camera about a block.
+
+        Times [s] are since the block's begin. A marker with an alternative counts as not seen.
+        """
         model, margin = self._models[c], self._margin_ns
         low, high = begin_ns - margin, begin_ns + BLOCK_NS + margin
         frames = [frame for frame in self._frames[c] if low <= frame.t_ns < high]

@@ -1,4 +1,4 @@
-"""What the tracks of one pair of cameras say about the time between them.
+"""Time-offset evidence from the tracks of one pair of cameras.
 
 A frame of the second camera that was really taken `d` later than its stamp shows every marker where it was `d`
 later: x(t) = x_true(t) + d v, with v its velocity in that image. Two things that are constant in truth then change in
@@ -50,7 +50,9 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Equations `value = constant + offset * rate` (T, I), one constant per item; NaN: nothing seen.
+    """Equations `value = constant + offset * rate` (T, I).
+
+    There is one constant per item; NaN: nothing seen.
 
     Items are the M epipolar residuals [px], then distances between markers [m].
 
@@ -89,7 +91,9 @@ class CameraPair:
         return cls(T[:3, :3], T[:3, 3], float(other.matrix[0, 0]))
 
     def evidence(self, reference: Track, other: Track, rows: Int, gap_s: float) -> Evidence:
-        """Compare the frames `rows` (K,) of the reference with the other's track; both in the order of time.
+        """Compare the frames `rows` (K,) of the reference with the other's track.
+
+        Both are in the order of time.
 
         Args:
             reference: Has a frame before and after each of `rows`.
@@ -115,7 +119,10 @@ class CameraPair:
     def _equations(
         self, xy: Float, known: Float, seen: Float, velocity: Float
     ) -> tuple[Float, Float, Float, Float]:
-        """Value, rate, instrument, doubt (K, I) of points, velocities (K, M, 2) in the reference and the other."""
+        """Return value, rate, instrument and standard deviation (K, I).
+
+        They are of points, velocities (K, M, 2) in the reference and the other.
+        """
         ray = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
         a = ray @ self.rotation.T  # the ray in the other camera's frame
         line = cross(np.broadcast_to(self.translation, a.shape), a)
@@ -140,7 +147,10 @@ class CameraPair:
         return value, rate, instrument, _STEP_S * pixel_effect
 
     def _depth(self, a: Float, along: Float, place: Float) -> Float:
-        """Depths (K, M) [m] along the reference rays of places on the epipolar lines; NaN where no hand can be."""
+        """Return depths (K, M) [m] along the reference rays.
+
+        They are of places on the epipolar lines; NaN where no hand can be.
+        """
         a_along, t_along = (along * a[..., :2]).sum(-1), along @ self.translation[:2]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
@@ -148,7 +158,9 @@ class CameraPair:
 
 
 def carried(track: Track, t_s: Float, gap_s: float, jerk_s3: float) -> tuple[Float, Float]:
-    """Points and velocities (K, M, 2) of a track at times (K, 1): the cubic through the four frames around each.
+    """Interpolate points and velocities (K, M, 2) of a track at times (K, 1).
+
+    The interpolant is the cubic through the four frames around each.
 
     NaN where a frame is missing, a gap is too long, or the third derivative exceeds `jerk_s3` [1/s^3].
     """

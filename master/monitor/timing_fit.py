@@ -46,7 +46,9 @@ _THREE_SIGMA = float(ndtr(3.0))
 
 @dataclass(frozen=True, slots=True)
 class TimeOffset:
-    """How much later a camera's frames really are than its stamps say, against the reference camera.
+    """Time offset of a camera against the reference camera.
+
+    It is how much later the camera's frames really are than their stamps state.
 
     Attributes:
         offset_ns: [ns].
@@ -60,7 +62,9 @@ class TimeOffset:
 
 
 def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
-    """Sums (10, I, 8) of one block: n, s_zg, s_ze, s_zc, s_gg, s_ge, s_ee, and the unit's floor variance.
+    """Return the sums (10, I, 8) of one block.
+
+    n, s_zg, s_ze, s_zc, s_gg, s_ge, s_ee, and the unit's floor variance.
 
     Sums are of what is left of each quantity when a constant and a plane over the image are taken out of the block.
 
@@ -87,7 +91,9 @@ def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
 
 
 def _plausible(evidence: Evidence, floor: Float) -> Bool:
-    """(T, I) where nothing jumps and both cameras see the marker move alike; NaN is not.
+    """Return the mask (T, I) of plausible evidence.
+
+    Nothing jumps there and both cameras see the marker move alike; NaN is not plausible.
 
     Values are compared with the median of five in a row, which follows any smooth course; velocities of the two
     cameras with each other. Both by the median of their differences, which outliers do not move (Hampel, 1974).
@@ -102,7 +108,10 @@ def _plausible(evidence: Evidence, floor: Float) -> Bool:
 
 
 def _median(x: Float) -> Float:
-    """Medians along the first axis, of what is not NaN; the lower one of two. numpy's own is slow on small arrays."""
+    """Return medians along the first axis, ignoring NaN.
+
+    Of two middle values it is the lower one. numpy's own is slow on small arrays.
+    """
     ordered = np.sort(x, axis=0)  # NaN last
     middle = np.maximum(np.isfinite(x).sum(axis=0) - 1, 0) // 2
     return np.take_along_axis(ordered, middle[None], axis=0)[0]
@@ -114,13 +123,19 @@ def _about_mean(x: Float, good: Bool, n: Int) -> Float:
 
 
 def _without(x: Float, column: Float) -> Float:
-    """What is left of x (T, I) without its part along `column` (T, I), unless that is only noise."""
+    """Return x (T, I) without its component along `column` (T, I).
+
+    Nothing is removed where that is only noise.
+    """
     length = (column * column).sum(axis=0)
     return x - column * ((column * x).sum(axis=0) / (length + _STILL**2 * len(x)))
 
 
 def fit_offset(blocks: Float) -> TimeOffset | None:
-    """Offset from the sums (B, 10, I, 8) of blocks; None where there is too little motion to say anything."""
+    """Fit the offset from the sums (B, 10, I, 8) of blocks.
+
+    None where there is too little motion to estimate it.
+    """
     n, zg, ze, _, gg, ge, ee, _ = np.moveaxis(blocks.sum(axis=1), -1, 0)
     floor = blocks[:, 0, :, 7]
     moved = zg > 0.0
@@ -155,7 +170,10 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
 
 
 def _scatter(information: Float, residual: Float, length: int) -> tuple[float, float]:
-    """Standard deviation of the offset [s] from batches of so many tenths, and their effective number."""
+    """Return the standard deviation of the offset [s] and the effective batch count.
+
+    It is estimated from batches of so many tenths (`length`).
+    """
     starts = np.arange(0, len(information), length)
     information, residual = np.add.reduceat(information, starts), np.add.reduceat(residual, starts)
     total = information.sum()

@@ -1,1 +1,4 @@
-"""Rigid objects that the cameras see: where they are, and how near the hand is to them."""
+"""Rigid objects that the cameras see.
+
+Their poses, and how near the hand is to them.
+"""

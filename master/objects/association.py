@@ -1,4 +1,7 @@
-"""What is fitted: the sightings of a window as one list, with one place for each feature; and what starts look at."""
+"""Association of the observations of a window with features.
+
+They are one list, with one image position for each feature, for the fit; and what starts look at.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +21,10 @@ CentroidSigma = Callable[[int, Float, Float], Float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """Observations of a window with one place for each; `feature` (n,) is what each is a part of."""
+    """Observations of a window with one image position for each.
+
+    `feature` (n,) is what each is a part of.
+    """
 
     seen: Observations
     feature: Int
@@ -73,7 +79,10 @@ class Association:
         return cls(seen, features.feature[point], now, features.count, len(cameras))
 
     def used(self, fitted: Fitted) -> Bool:
-        """(C, F) which features the pose rests on in which camera, in the frames nearest to the instant."""
+        """Return (C, F) which features the pose rests on in which camera.
+
+        The frames nearest to the epoch count.
+        """
         out = np.zeros((self.cameras, self.features), np.bool_)
         associated = fitted.used & self.now
         out[self.seen.camera[associated], self.feature[associated]] = True
@@ -83,7 +92,10 @@ class Association:
 def _nearer(
     line: list[ImageObservation], point: Int, features: Features, camera: CameraModel, T: Float | None
 ) -> tuple[Float, Float]:
-    """Places (K, 2) of the points (K,) of sightings, rivals taken where a pose has the point nearer to them; sigmas."""
+    """Return positions (K, 2) of the points (K,) of observations; sigmas.
+
+    The alternative is taken where a pose has the point nearer to it.
+    """
     uv, sigma = np.concatenate([one.uv for one in line]), np.concatenate([one.sigma_px for one in line])
     alternative = np.concatenate([one.alt_uv for one in line])
     if T is None or np.isnan(alternative).all():
@@ -94,7 +106,10 @@ def _nearer(
 
 
 def sighted_now(window: Window, features: Features) -> list[Sighted]:
-    """What each camera sees now of each feature, brought to the instant along a line."""
+    """Return what each camera sees now of each feature.
+
+    The observations are brought to the epoch along a line.
+    """
     out: list[Sighted] = []
     at_ns = window.t_ns - window.origin_ns
     for c, both in enumerate(window.views):
@@ -114,7 +129,10 @@ def sighted_now(window: Window, features: Features) -> list[Sighted]:
 
 
 def _brought(points: Int, line: tuple[ImageObservation, ...], at_ns: int) -> Float:
-    """Points (n, 2) of the nearest sighting, moved on as from the next one that has them all."""
+    """Extrapolate points (n, 2) of the nearest observation to a time.
+
+    They move on as from the next observation that has them all.
+    """
     found: list[tuple[Float, Float]] = []
     for observation in line:
         rows = [

@@ -1,4 +1,6 @@
-"""All cameras of a rig laid out by observation: where each sees its point, and how that changes with the point.
+"""All cameras of a rig laid out by observation.
+
+They give where each sees its point, and how that changes with the point.
 
 What a fit asks for in each of its rounds with the same cameras is looked up once (`Views`).
 """
@@ -32,7 +34,9 @@ class Views:
     radius_2: Float
 
     def see(self, points: Float) -> tuple[Float, Float, Float]:
-        """Where the cameras see points (n, 3) [m], or the middles of balls' outlines about them.
+        """Project points (n, 3) [m] into the cameras.
+
+        For balls about the points it is the middles of their outlines.
 
         An ellipse, the outline of a ball of radius r at (x, y, z), has its middle at (x, y) z / (z^2 - r^2).
 

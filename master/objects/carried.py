@@ -1,4 +1,6 @@
-"""Whether a hand carries an object, by how both move: told also of a hand whose fingers nobody sees.
+"""Detection of a hand that carries an object, by how both move.
+
+It works also for a hand whose fingers nobody sees.
 
 Whoever holds a thing hides from the cameras the fingers that hold it. But what is held moves as the palm does. Over
 some tenths of a second an object's motion foretells where the palm gets to if it is fixed to it; if that is a way long
@@ -27,7 +29,10 @@ _GAP_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moment:
-    """An instant [ns], `T_rig_object` (4, 4), the palm (3,) [m], rig frame."""
+    """An object and the palm at one time.
+
+    A time [ns], `T_rig_object` (4, 4), the palm (3,) [m], rig frame.
+    """
 
     t_ns: int
     T: Float
@@ -35,7 +40,10 @@ class _Moment:
 
 
 class Carried:
-    """Push machine of one hand and one object. Holds their last places, and where the palm is on what it carries."""
+    """Detector of one hand that carries one object.
+
+    Push machine. Holds their last places, and where the palm is on what it carries.
+    """
 
     def __init__(self) -> None:
         """Begin with a hand that carries nothing."""

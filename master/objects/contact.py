@@ -57,14 +57,20 @@ _FREE = 2.5  # standard deviations of a distance beyond which a finger surely do
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PointEstimate:
-    """An object at an instant: `T_rig_object` (4, 4) and covariance (6, 6)."""
+    """Pose estimate of an object at an epoch.
+
+    `T_rig_object` (4, 4) and covariance (6, 6).
+    """
 
     T: Float
     cov: Float
 
 
 class ContactMonitor:
-    """Push machine of one hand. Holds the last poses of each object, and which finger touches which."""
+    """Detector of contacts of one hand.
+
+    Push machine. Holds the last poses of each object, and which finger touches which.
+    """
 
     def __init__(self, model: HandModel, objects: Sequence[ObjectProfile]) -> None:
         """Take the hand and the objects near it; those without a shape have no contact."""
@@ -75,7 +81,10 @@ class ContactMonitor:
         self._carried = {name: Carried() for name in self._surfaces}
 
     def push_object(self, pose: ObjectPose) -> None:
-        """Take a pose of an object; of one that is not watched, or not after the last, nothing is kept."""
+        """Take a pose of an object.
+
+        Of an object that is not watched, or a pose not after the last, nothing is kept.
+        """
         poses = self._poses.get(pose.object)
         if poses is None or (poses and pose.t_ns <= poses[-1].t_ns):
             return
@@ -123,12 +132,18 @@ class ContactMonitor:
 
 
 def _away(distance: Float, sigma: Float) -> bool:
-    """Whether fingers (5,) surely hold nothing: all are away but the thumb, which alone holds nothing. NaN: open."""
+    """Check whether fingers (5,) surely hold nothing.
+
+    All are away but the thumb, which alone holds nothing. NaN: open.
+    """
     return bool((np.nan_to_num(distance - _FREE * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
-    """(N,) what touches, by distances and standard deviations (N,) [m] and what touched before; NaN: not known."""
+    """Return (N,) what touches.
+
+    Given are distances and standard deviations (N,) [m] and what touched before; NaN: not known.
+    """
     sure = sigma < _SURE_M
     begins = distance < NEAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M)
     stay_near = before & (distance < FAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M))
@@ -136,7 +151,10 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
 
 
 def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nearest, Float]:
-    """Distances of all bones (19,), object frame, and their standard deviations; NaN where a joint is not valid."""
+    """Return distances of all bones (19,) and their standard deviations.
+
+    They are in the object frame; NaN where a joint is not valid.
+    """
     points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
     capsules = Capsules(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
@@ -160,7 +178,10 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
 
 
 def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
-    """Where an object was at an instant, by its last poses; None: nobody knows."""
+    """Return the pose of an object at a time, from its last poses.
+
+    None: it is not known.
+    """
     if not poses or t_ns - poses[-1].t_ns > LED_S * 1e9 or poses[0].t_ns - t_ns > LED_S * 1e9:
         return None
     if len(poses) == 1:

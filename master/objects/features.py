@@ -1,5 +1,6 @@
-"""What can be seen of an object: its beads and the corners of its tags as one list of points, and which of them face a
-camera.
+"""Visible features of an object.
+
+Its beads and the corners of its tags are one list of points; it states which of them face a camera.
 
 A camera is *expected* to see a feature that lies in its image, is turned to it, is large enough and is not behind the
 object itself. Some are at the edge of that, and a slave may find them or not: that these are missing tells nothing.
@@ -108,7 +109,9 @@ class Features:
         return self.beads + 4 * tag + np.arange(4)
 
     def expected(self, T_rig_object: Float, camera: CameraModel, ease: float = 1.0) -> Bool:
-        """(F,) which a camera sees of the object at a pose (4, 4), with nothing before it.
+        """Return (F,) which features a camera sees of the object at a pose (4, 4).
+
+        Nothing is in front of the object.
 
         Args:
             T_rig_object: The pose.
@@ -127,7 +130,10 @@ class Features:
         return shows
 
     def _tags_show(self, eye: Float, uv: Float, ease: float) -> Bool:
-        """(N,) tags that are turned to an eye (3,) [m], object frame, and large in its image (P, 2) [px]."""
+        """Return (N,) which tags face an eye and are large in its image.
+
+        The eye is (3,) [m], object frame; the image is (P, 2) [px].
+        """
         count = len(self.tag_ids)
         if not count:
             return np.zeros(0, np.bool_)
@@ -149,7 +155,10 @@ class Features:
         )
 
     def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
-        """(B,) beads that are large enough for an eye (3,) [m], object frame, and not behind the object."""
+        """Return (B,) which beads an eye sees.
+
+        They are large enough for an eye (3,) [m], object frame, and not behind the object.
+        """
         if not self.beads:
             return np.zeros(0, np.bool_)
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]

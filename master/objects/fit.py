@@ -1,4 +1,6 @@
-"""The pose of a rigid object at an instant, from what all cameras saw of it around that.
+"""Pose of a rigid object at an epoch, from the observations of all cameras.
+
+The observations are those around the epoch.
 
 Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
 object's motion about the instant is a Taylor series of its place and of its turn (`master.objects.motion`), to the
@@ -42,7 +44,7 @@ _REPORTED = np.eye(_N)[:, :12]  # place, turn and their speeds
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A pose at an instant.
+    """A fitted pose at an epoch.
 
     Attributes:
         motion: Pose and derivatives.
@@ -130,7 +132,10 @@ class PoseFit:
         return None if problem is None else self._mixed(problem, motion)
 
     def _mixed(self, problem: "_Problem", motion: Motion) -> Fitted | None:
-        """The mean over all degrees of vigour, from the problem linearised at their solution for the most."""
+        """Return the mean over all degrees of vigour.
+
+        It is from the problem linearised at their solution for the most vigour.
+        """
         # Unknowns are now the derivatives themselves: their priors are about 0.
         pull = problem.gradient + self._priors[-1] @ problem.rates + problem.normal @ problem.rates
         normal = problem.normal + self._priors
@@ -158,7 +163,10 @@ class PoseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """One linearised problem: normal matrix (30, 30) and gradient (30,) and what comes with them."""
+    """One linearised problem.
+
+    Normal matrix (30, 30) and gradient (30,) and what comes with them.
+    """
 
     normal: Float
     gradient: Float
@@ -216,7 +224,10 @@ class _Task:
         return _Problem(normal, gradient - self.prior @ now, cost, now, weight, chi2, residual)
 
     def _rows(self, by_place: Float, by_rotation: Float, rotation: Float, theta: Float, miss: Float) -> Float:
-        """(n, 2, 31) derivatives by all unknowns, of each order place and turn; then what is missed."""
+        """Return (n, 2, 31) derivatives by all unknowns, and the residual.
+
+        The unknowns are position and rotation of each order; then comes the residual.
+        """
         rows = np.empty((len(miss), 2, _N + 1))
         rows[..., _N] = miss
         rows[..., :3] = by_place

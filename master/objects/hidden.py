@@ -1,4 +1,6 @@
-"""Which features of an object something hides: what each camera should see of it, against what it sees.
+"""Occluded features of an object.
+
+What each camera should see of it is compared with what it sees.
 
 A feature that a camera should see and does not is hidden, and so is a bead that shows much less of its disc than it has
 shown: how much of a ball counts as painted depends on light and colour, so each bead in each camera is compared with
@@ -21,7 +23,10 @@ _LEARN, _FORGET = 0.06, 0.004  # towards more, towards less, from frame to frame
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """How many features are seen, how many should be, and whether something hides a part."""
+    """Count of seen and of expected features.
+
+    Also whether something hides a part.
+    """
 
     seen: int
     expected: int
@@ -29,7 +34,10 @@ class Seen:
 
 
 class Hidden:
-    """Push machine. Holds how much of its disc each bead shows in each camera when it is whole."""
+    """Detector of occluded features.
+
+    Push machine. Holds how much of its disc each bead shows in each camera when it is whole.
+    """
 
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...]) -> None:
         """Set up."""
@@ -37,7 +45,7 @@ class Hidden:
         self._whole = np.full((len(cameras), features.beads), np.nan)
 
     def look(self, window: Window, T_rig_object: Float, used: Bool) -> Seen:
-        """Judge an instant.
+        """Judge the occlusion at an epoch.
 
         Args:
             window: What was looked for.
@@ -60,7 +68,9 @@ class Hidden:
         return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
 
     def centroid_sigma_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
-        """By how much the centroids of beads (..., B) in camera `c` may be off, as something hides a part of them [px].
+        """Return the centroid error [px] of beads (..., B) in camera `c` by occlusion.
+
+        It is by how much the centroids may be off, as something hides a part of the beads.
 
         Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.
         """
@@ -69,7 +79,10 @@ class Hidden:
         return np.where(missing > 0.0, np.minimum(missing, 1.0) * radius_px, 0.0)  # NaN: not known, 0
 
     def _share(self, c: int, T: Float, area_px2: Float) -> tuple[Float, Float]:
-        """What share of their discs (..., B) beads of these areas [px^2] show, and the radii (B,) of the discs [px]."""
+        """Return the share of their discs that beads show, and the disc radii (B,) [px].
+
+        The shares (..., B) are of beads of these areas [px^2].
+        """
         rows = slice(0, self._features.beads)
         camera = self._cameras[c]
         line_of_sight = self._features.points[rows] @ T[:3, :3].T + (T[:3, 3] - camera.centre)

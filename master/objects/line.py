@@ -1,4 +1,6 @@
-"""The line of one object: detections of markers and tags in, its pose at every frame of the leading camera out.
+"""Pipeline of one object.
+
+Detections of markers and tags go in, its pose at every frame of the leading camera comes out.
 
 `ObjectLine` is a push machine without clock, socket or thread. For each instant (`master.objects.window`) the pose is
 fitted (`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most of
@@ -53,14 +55,20 @@ _MAX_AGE_PERIODS = 2.25  # an observation older than this is not now
 
 @dataclass(frozen=True, slots=True)
 class SolvedObject:
-    """A pose of an object, and when the last frame that contributed to it was handed to its slave [ns]."""
+    """A pose of an object, with its latest input time.
+
+    That is when the last frame that contributed to it was handed to its slave [ns].
+    """
 
     pose: ObjectPose
     ready_t_ns: int
 
 
 class ObjectLine:
-    """Push machine. Holds the sightings that wait, where the object went, the filter, and how sure a tag's pose is."""
+    """Pipeline of one object from observations to poses.
+
+    Push machine. Holds the observations that wait, where the object went, the filter, and how sure a tag's pose is.
+    """
 
     def __init__(
         self, profile: ObjectProfile, rig: RigCalibration, models: Mapping[str, CameraModel]
@@ -151,7 +159,10 @@ class ObjectLine:
         return ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
 
     def _found(self, window: Window, seen: Association, predicted: Motion | None) -> Fitted | None:
-        """The pose at the instant; None: what is seen is not it, or does not tell."""
+        """Return the pose at the epoch.
+
+        None: what is seen is not the object, or does not constrain its pose.
+        """
         if predicted is not None:
             led = self._fitted(seen, predicted, window.t_ns, led=True)
             if led is not None and self._holds(seen, led):
@@ -179,7 +190,9 @@ class ObjectLine:
         return Association.of(window, self._features, self._cameras, T, self._hidden.centroid_sigma_px)
 
     def _fitted(self, seen: Association, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
-        """The fit; of one that was led there with the past, where the present does not tell enough.
+        """Fit the pose, with the past as prior where the present is too weak.
+
+        The past is used only for a pose that was predicted (`led`), where the present does not constrain enough.
 
         How it may have moved since is then in it.
         """
@@ -218,7 +231,7 @@ class ObjectLine:
         return poses
 
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:
-        """The pose while nothing tells: led on, or none."""
+        """Return the pose while nothing constrains it: predicted, or none."""
         cov = self._trajectory.held_cov(window.t_ns)
         if predicted is None or cov is None:
             return self._none(window)

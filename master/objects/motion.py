@@ -1,4 +1,6 @@
-"""How a rigid object moves about an instant: a Taylor series of its place and of its turn.
+"""Motion of a rigid object about an epoch.
+
+It is a Taylor series of its position and of its rotation.
 
 X = R(theta(t)) R0 q + p(t),   p(t) = sum_k p_k t^k / k!,   theta(t) = sum_{k>0} theta_k t^k / k!
 """
@@ -16,7 +18,10 @@ _POWERS = np.arange(ORDERS)
 
 
 def basis_at(tau_s: Float) -> Float:
-    """Weights (..., ORDERS) of the derivatives at times (...) from the instant [s]."""
+    """Return weights (..., ORDERS) of the derivatives at times (...).
+
+    The times are from the epoch [s].
+    """
     return tau_s[..., None] ** _POWERS / _FACTORIAL
 
 
@@ -61,7 +66,10 @@ def _stepped(T: Float, step: Float) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Past:
-    """What earlier frames say of place, turn and speeds at the instant: where, and its information (12, 12)."""
+    """Prior from earlier frames at the epoch.
+
+    It is of position, rotation and speeds: the estimate, and its information (12, 12).
+    """
 
     motion: Motion
     precision: Float

@@ -1,4 +1,6 @@
-"""All parts of one kind that an object's surface has, as arrays: distances to them, feet on them, ways through them.
+"""All parts of one kind of an object's surface, as arrays.
+
+They give distances to them, nearest points on them, and intersections of rays with them.
 
 Each part is about its own origin, along its own axes. Coordinates come first in `own` (K, D, N), so that sums over them
 are sums of rows: a hand asks for hundreds of points at once, and most of what that costs is the number of calls.
@@ -24,11 +26,16 @@ class Parts(Protocol):
         ...
 
     def feet(self, part: Int, own: Float) -> Float:
-        """Nearest points (N, 3) of the surfaces of parts (N,) to points (N, 3), each in the frame of its part."""
+        """Return nearest points (N, 3) on the surfaces of parts (N,) to points (N, 3).
+
+        Each is in the frame of its part.
+        """
         ...
 
     def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """From where to where on ways (K, 3, N) from starts (K, 3) sights are inside a part, a little below its skin.
+        """Return from where to where rays are inside a part.
+
+        The rays are ways (K, 3, N) from starts (K, 3); inside is a little below the part's skin.
 
         Both (K, N) are shares of the way; where the second is not above the first, the sight passes by.
         """
@@ -118,7 +125,10 @@ def by_kind(shapes: Sequence[Shape]) -> list[tuple[list[Shape], Parts]]:
 
 
 def _feet_of_box(half: Float, points: Float) -> Float:
-    """Nearest points (N, D) of the surfaces of boxes with these halves of their sides (N, D), of any dimension."""
+    """Return nearest points (N, D) on the surfaces of boxes.
+
+    The boxes have these halves of their sides (N, D), of any dimension.
+    """
     foot = np.minimum(np.maximum(points, -half), half)
     inside = np.flatnonzero((foot == points).all(axis=1))
     if len(inside):
@@ -130,7 +140,10 @@ def _feet_of_box(half: Float, points: Float) -> Float:
 
 
 def _through_slabs(half: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """As of `Parts.through`, between planes at plus and minus `half` (K, D) along each axis."""
+    """Intersect rays with slabs, as `Parts.through`.
+
+    The slabs are between planes at plus and minus `half` (K, D) along each axis.
+    """
     by = np.where(np.abs(way) > _TINY, way, _TINY)
     one, other = (-half - start)[:, :, None] / by, (half - start)[:, :, None] / by
     return np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)

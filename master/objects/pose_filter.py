@@ -1,4 +1,6 @@
-"""Smooths the pose of an object as it arrives, so that one at rest does not tremble.
+"""Filter that smooths the pose of an object as it arrives.
+
+An object at rest thus does not tremble.
 
 The 1 € filter of its rig, as of the hand (`master.estimator.smooth`), with position and rotation as its groups and the
 noise as it is measured. The position is that of the middle of the features, about which the rotation is unsure; at the
@@ -19,7 +21,10 @@ _INDEPENDENT_SHARE = 0.15  # of the variance of a pose, new in each frame: most 
 
 
 class PoseFilter:
-    """Push machine. Holds the filter, the measured noise, and the pose that it showed last."""
+    """1 € filter of an object's pose.
+
+    Push machine. Holds the filter, the measured noise, and the pose that it output last.
+    """
 
     def __init__(self, middle_m: Float, parameters: OneEuroParameters) -> None:
         """Set up.

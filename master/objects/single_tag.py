@@ -1,4 +1,6 @@
-"""The two poses of the only tag that is seen: which of them to believe, and how sure that is.
+"""Two-pose ambiguity of a single visible tag.
+
+Chooses which of its two poses to use, and how certain that choice is.
 
 A flat tag has two poses that nearly explain it, tilted one way or the other. Both are fitted; the one that was believed
 stays unless the other is clearly better over several frames, and as far as the other is possible the covariance reaches
@@ -36,7 +38,10 @@ _UNLOOKED = (
 
 @dataclass(slots=True)
 class _Clear:
-    """A tag whose other pose is out of the question: who saw it, how much better the other is, and for how long yet."""
+    """A tag whose other pose is ruled out.
+
+    Which cameras saw it, how much better the other pose is, and for how many more frames this holds.
+    """
 
     seen_by: tuple[int, ...]
     better: float
@@ -44,10 +49,16 @@ class _Clear:
 
 
 class SingleTag:
-    """Push machine. Holds how much better the other pose has been of late, and what was clear when it was fitted."""
+    """Resolver of the two-pose ambiguity of a single tag.
+
+    Push machine. Holds how much better the other pose has been of late, and what was ruled out when it was fitted.
+    """
 
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...], fit: PoseFit) -> None:
-        """Set up for an object's features, the rig's cameras and what fits the one in the other."""
+        """Set up for an object's features, the rig's cameras and the pose fit.
+
+        `fit` fits the features to what the cameras saw.
+        """
         self._features, self._cameras, self._fit = features, cameras, fit
         self._log_odds = 0.0
         self._clear: _Clear | None = None
@@ -57,7 +68,9 @@ class SingleTag:
         self._log_odds, self._clear = 0.0, None
 
     def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
-        """The pose to believe, its covariance grown by the other; the fit itself where more than a tag is seen.
+        """Return the pose to use, its covariance widened by the alternative pose.
+
+        The fit is returned unchanged where more than one tag is seen.
 
         Args:
             window: The sightings.
@@ -114,7 +127,10 @@ class SingleTag:
 
 
 def _reaching(fitted: Fitted, other: Fitted, better: float) -> Fitted:
-    """A fit whose covariance reaches over to another as far as that is possible, by how much better it is."""
+    """Widen the covariance of a fit towards the alternative pose.
+
+    The covariance reaches over to the other pose as far as that is possible, by how much better it is.
+    """
     share = 1.0 / (1.0 + np.exp(np.clip(-better, -50.0, 50.0)))
     off = np.concatenate(
         [

@@ -1,4 +1,6 @@
-"""Poses of an object from nothing but what is seen now: what a fit starts from while there is no past.
+"""Initial poses of an object from current observations alone.
+
+A fit starts from these while there is no past.
 
 Tags: each tag in each camera has two poses that show it nearly alike, tilted one way or the other (Collins, Bartoli,
 "Infinitesimal Plane-Based Pose Estimation", 2014); both are named. Beads: those that two cameras see are points, and
@@ -29,7 +31,9 @@ _SIGMA_PX = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighted:
-    """One feature in one camera, at the instant as well as two frames tell.
+    """One feature in one camera, interpolated to the epoch from two frames.
+
+    As well as two frames determine it.
 
     Attributes:
         camera: Which.
@@ -45,7 +49,10 @@ class Sighted:
 def poses_of_tags(
     sighted: Sequence[Sighted], features: Features, cameras: tuple[CameraModel, ...]
 ) -> list[Float]:
-    """Poses `T_rig_object` (4, 4), two for each tag in each camera, the likelier first."""
+    """Return two poses `T_rig_object` (4, 4) for each tag in each camera.
+
+    The likelier first.
+    """
     poses: list[tuple[float, Float]] = []
     for seen in sighted:
         if seen.feature >= features.beads:
@@ -59,7 +66,9 @@ def poses_of_tags(
 
 
 def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
-    """How a tag seen at normalised points (4, 2) may lie: misfit of the corners and `T_camera_object` of each way.
+    """Return the two possible poses of a tag seen at normalised points (4, 2).
+
+    For each, the residual of the corners and `T_camera_object`.
 
     The derivative J of the homography at the tag's middle, seen from a view turned to it, is a rotation's upper left
     2x2 times a scale; its third row is known but for the sign (ibid., 4.1). OpenCV 5 has this wrong for tags near the
@@ -105,7 +114,10 @@ def _ways(A: Float, rotation: Float, corners: Float, flat: Float, xy: Float) -> 
 
 
 def _homography(plane: Float, xy: Float) -> Float | None:
-    """The map (3, 3), 1 in its corner, from a plane's points (4, 2) to their images (4, 2); None: three in one line."""
+    """Return the homography (3, 3) from a plane's points to their images.
+
+    Points (4, 2) and images (4, 2); its last element is 1. None: three of the points are collinear.
+    """
     rows = np.zeros((8, 8))
     rows[::2, :2], rows[::2, 2] = plane, 1.0
     rows[1::2, 3:5], rows[1::2, 5] = plane, 1.0
@@ -117,14 +129,20 @@ def _homography(plane: Float, xy: Float) -> Float | None:
 
 
 def _rotation_to(line_of_sight: Float) -> Float:
-    """The least rotation (3, 3) that takes the z axis to the direction of a vector (3,) before the camera."""
+    """Return the smallest rotation (3, 3) from the z axis to a line of sight.
+
+    The line of sight is the direction of a vector (3,) in front of the camera.
+    """
     x, y, z = line_of_sight / np.linalg.norm(line_of_sight)
     cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
 
 def _shift(rotated: Float, xy: Float) -> Float:
-    """Where the origin (3,) of turned points (N, 3) is, which are seen at (N, 2): linear least squares."""
+    """Solve for the origin (3,) of rotated points by linear least squares.
+
+    The rotated points (N, 3) are seen at (N, 2).
+    """
     rows = np.zeros((2 * len(xy), 3))
     rows[::2, 0] = rows[1::2, 1] = 1.0
     rows[:, 2] = -xy.ravel()
@@ -134,7 +152,10 @@ def _shift(rotated: Float, xy: Float) -> Float:
 
 
 def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: CameraArrays) -> list[Float]:
-    """Poses `T_rig_object` (4, 4) of three beads or more whose distances are right, the best first."""
+    """Return poses `T_rig_object` (4, 4) from three or more beads.
+
+    Only beads whose mutual distances match the object; the best pose first.
+    """
     places = [_points(sighted, bead, cameras) for bead in range(features.beads)]
     seen = [bead for bead, found in enumerate(places) if len(found)]
     poses: list[tuple[float, Float]] = []
@@ -153,7 +174,10 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
 
 
 def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Float:
-    """Where a bead may be (K, 3) [m], rig frame: of all choices of its places, those whose rays meet."""
+    """Return the possible positions (K, 3) [m] of a bead in the rig frame.
+
+    Of all choices of its image positions, those whose rays meet.
+    """
     views = [seen for seen in sighted if seen.feature == bead]
     if len(views) < 2:
         return np.empty((0, 3))
@@ -171,7 +195,10 @@ def _sides(points: Float) -> Float:
 
 
 def reach(taus: Float) -> Int:
-    """Which two of the times (n,) from an instant [s] a place is brought there by, the nearest first; or which one."""
+    """Select the two times that carry an image position to the epoch.
+
+    `taus` (n,) are times from an epoch [s]; the nearest is first. Returns one index where only one is usable.
+    """
     order: Int = np.argsort(np.abs(taus))
     if len(order) < 2 or abs(float(taus[order[1]])) > 4 * _NEAR_S:
         return order[:1]

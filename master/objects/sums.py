@@ -1,4 +1,6 @@
-"""What was seen of an object as weighted sums: errors that stay from frame to frame are taken out of them exactly.
+"""Observations of an object as weighted sums.
+
+Errors that stay from frame to frame are eliminated from them exactly.
 
 An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each frame. The
 first is an unknown of its own, eliminated by its Schur complement, so that four sightings of one bead at rest are not
@@ -21,7 +23,7 @@ _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts hal
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """What was seen of one object around an instant, n points.
+    """Observations of one object around an epoch, n points.
 
     Attributes:
         camera: (n,) which camera.
@@ -52,7 +54,10 @@ class Observations:
 
 
 class Sums:
-    """Adds observations up: which belong together, and their variances. Holds no state between calls."""
+    """Weighted sums of observations.
+
+    Determines which observations belong together, and their variances. Holds no state between calls.
+    """
 
     def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
         """Set up for observations.
@@ -82,7 +87,9 @@ class Sums:
         self._numbers = 2.0 * np.bincount(self._whole[first])
 
     def weigh(self, miss: Float, lag_2: Float) -> tuple[Float, Float, float]:
-        """Chi square per number measured of the feature of each observation (n,), its weight (n,), and the cost.
+        """Return the chi-square and weight (n,) of each observation, and the cost.
+
+        The chi-square (n,) is per measured number of the feature that the observation belongs to.
 
         The weight forgives what a bad calibration leaves (`RaySettings.rig_px`), the cost only what this one is
         known to leave.

@@ -1,4 +1,6 @@
-"""The surface of an object: how far points are from it, and what it hides from an eye.
+"""Surface of an object: distances of points, and occlusion.
+
+How far points are from it, and what it hides from an eye.
 
 An object is a union of boxes, closed cylinders and balls, each convex. Outside of all the distance to the union is the
 least of theirs, exactly; inside of two at once it is that of the one whose surface is farther, which is a bound.
@@ -52,7 +54,10 @@ class _PosedSurface:
         return self._R @ points.T + self._t[:, :, None]
 
     def feet(self, part: Int, points: Float) -> Float:
-        """Nearest points (N, 3) of the surfaces of some of the parts (N,) to points (N, 3), all in the object frame."""
+        """Return the nearest surface points (N, 3) to points (N, 3).
+
+        On the surfaces of some of the parts (N,), all in the object frame.
+        """
         R, t = self._R[part], self._t[part]
         foot = self.parts.feet(part, (R @ points[..., None])[..., 0] + t)
         return ((foot - t)[:, None] @ R)[:, 0]
@@ -77,7 +82,10 @@ class Surface:
         return bool(self._kinds)
 
     def nearest(self, points: Float) -> tuple[Float, Float]:
-        """Distances (N,) [m] of points (N, 3) [m], negative inside, and the points of the surface (N, 3) there."""
+        """Return the distances (N,) [m] and nearest surface points of points (N, 3).
+
+        Points in [m]; distances are negative inside; the surface points are (N, 3).
+        """
         best, at = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
         for kind in self._kinds:
             each = kind.parts.distances(kind.own(points))
@@ -102,7 +110,10 @@ class Surface:
         along, scale_up = capsules.stop_m - capsules.start_m, capsules.stop_radius_m - capsules.start_radius_m
 
         def least(share: Float) -> tuple[Int, Float]:
-            """Which of the balls at places (N, S) on the bones is the nearest, and how near (N,)."""
+            """Return which ball on each bone is nearest to the surface, and its gap (N,).
+
+            The balls are at positions (N, S) along the bones.
+            """
             middle = capsules.start_m[:, None] + share[..., None] * along[:, None]
             radius = capsules.start_radius_m[:, None] + share * scale_up[:, None]
             gap = self.distances(middle.reshape(-1, 3)).reshape(share.shape) - radius
@@ -117,7 +128,10 @@ class Surface:
         return Nearest(gap, self.nearest(capsules.start_m + associated[:, None] * along)[1], associated)
 
     def hides(self, eye: Float, points: Float) -> Bool:
-        """(...) whether the object itself is between an eye (3,) [m] and points (..., 3) [m], object frame."""
+        """Return a mask (...) of the points that the object hides from an eye.
+
+        Eye (3,) [m] and points (..., 3) [m] in the object frame; True where the object itself is between them.
+        """
         flat = points.reshape(-1, 3)
         hidden = np.zeros(len(flat), np.bool_)
         if len(flat):

@@ -1,4 +1,6 @@
-"""The line of one object's tracker: poses of a device that tracks itself in, the object's pose in the rig out.
+"""Tracker line of one object: device poses in, object pose in the rig out.
+
+The device is one that tracks itself.
 
     T_rig_object(t) = T_rig_tracking T_tracking_device(t) inv(T_object_tracker)
 
@@ -43,7 +45,9 @@ def registered(profile: ObjectProfile, rig: RigCalibration) -> bool:
 
 
 class TrackerLine:
-    """Push machine. Holds the last pose, since when there is none, and a leap that is doubted.
+    """Converter of one tracker's device poses to object poses.
+
+    Push machine. Holds the last pose, since when there is none, and a leap that is not accepted yet.
 
     Attributes:
         counts: Poses that were `lost`, and those passed over as a `leap`, or because they were `late` or broken.
@@ -77,7 +81,9 @@ class TrackerLine:
         self.counts: Counter[str] = Counter()
 
     def push(self, message: TrackerPose) -> list[SolvedObject]:
-        """Take one pose of the device, on the master's clock; return that of the object, or none if it came too late.
+        """Take one device pose on the master's clock; return the object's pose.
+
+        Returns none if it came too late.
 
         Raises:
             ValueError: It is of another device.
@@ -99,7 +105,10 @@ class TrackerLine:
         return []
 
     def _measured(self, t_ns: int, message: TrackerPose) -> ObjectPose | None:
-        """The object's pose; None: the device has lost itself, or what it says cannot be."""
+        """Return the object's pose from a device pose, or None.
+
+        None: the device has lost tracking, or what it reports is impossible.
+        """
         place, quaternion = message.position_m, message.orientation_wxyz
         if np.isnan(place).any() or np.isnan(quaternion).any():
             self.counts["lost"] += 1
@@ -130,7 +139,10 @@ class TrackerLine:
         return pose
 
     def _leaps(self, t_ns: int, place_m: Float) -> bool:
-        """Whether no hand could have carried it there since the last pose; for a while, then it is believed."""
+        """Check for a leap that no hand could make since the last pose.
+
+        A leap is refused for a while; after that the new position is accepted.
+        """
         if self._last is None:
             return False
         way = _distance(place_m, self._last.position_m)
@@ -175,7 +187,10 @@ def _distance(one_m: Float, other_m: Float) -> float:
 
 
 def covariance_of(profile: ObjectProfile) -> Float:
-    """Covariance (6, 6) of an object's pose by its tracker, of place and small turn, by its registration's figures."""
+    """Return the covariance (6, 6) of an object's pose from its tracker.
+
+    Of position and small rotation, by the figures of its registration.
+    """
     how = profile.provenance.get("T_object_tracker")
     residual = {} if how is None else how.residual
     place_m = np.hypot(residual.get("position_mm", 0.0), residual.get("position_sigma_mm", 0.0)) * 1e-3

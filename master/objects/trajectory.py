@@ -30,7 +30,10 @@ class _Known:
 
 
 class Trajectory:
-    """Push machine. Holds the last poses, sixteen at most, and when one was told by what was seen alone."""
+    """Recent fitted poses of an object, sixteen at most.
+
+    Push machine. Also holds when a pose was last fully constrained by the observations alone.
+    """
 
     def __init__(self) -> None:
         self._known: deque[_Known] = deque(maxlen=_POSES)
@@ -41,7 +44,10 @@ class Trajectory:
         return bool(self._known)
 
     def push(self, t_ns: int, fitted: Fitted) -> bool:
-        """Take the pose of an instant; False: nothing has told all of it for too long, and all is forgotten."""
+        """Add the pose of an epoch.
+
+        False: the pose has not been fully constrained for too long, and all poses are forgotten.
+        """
         self._known.append(_Known(t_ns, fitted))
         if fitted.measured_only:
             self._sure_ns = t_ns
@@ -55,7 +61,7 @@ class Trajectory:
         self._known.clear()
 
     def unsure_s(self, t_ns: int) -> float:
-        """For how long nothing has told all of its pose [s]."""
+        """Return the time [s] since the pose was last fully constrained."""
         return (t_ns - self._sure_ns) * 1e-9
 
     def predicted(self, t_ns: int) -> Motion | None:
@@ -70,7 +76,10 @@ class Trajectory:
         return last.fitted.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
 
     def past(self, t_ns: int, oldest_ns: int) -> Past:
-        """What is known at an instant from before all that is seen around it, the oldest of it at `oldest_ns`."""
+        """Return the prior at an epoch from before all that is seen around it.
+
+        The oldest of these observations is at `oldest_ns`.
+        """
         known = next((k for k in reversed(self._known) if k.t_ns <= oldest_ns), self._known[0])
         dt = max((t_ns - known.t_ns) * 1e-9, 1e-3)
         step = np.eye(12)
@@ -80,7 +89,10 @@ class Trajectory:
         return Past(known.fitted.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
 
     def held_cov(self, t_ns: int) -> Float | None:
-        """Covariance (6, 6) of the pose it is led to while nothing tells; None: it is to be held no longer."""
+        """Return the covariance (6, 6) of the pose predicted without observations.
+
+        None: the pose is no longer to be held.
+        """
         if not self._known or self.unsure_s(t_ns) > HELD_S:
             return None
         known = self._known[-1]
@@ -93,7 +105,9 @@ class Trajectory:
 
 
 def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
-    """A fit with what may have happened in directions that what is seen alone does not tell, for so long [s].
+    """Grow a fit's covariance in the directions the observations do not constrain.
+
+    By what may have happened in these directions for so long [s].
 
     A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
     rest on: its doubt grows as that of a thing that nobody sees.

@@ -1,4 +1,6 @@
-"""What the cameras of a rig saw of one object around an instant, and when an instant has all it will get.
+"""Observations of one object around an epoch, from all cameras of a rig.
+
+Also when an epoch has all the observations that it will get.
 
 An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
 `master.fabrik.sync`. It is complete when every other camera has delivered a frame at or after it, its tags included
@@ -28,7 +30,9 @@ _DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservation:
-    """What one camera saw of the object in one frame, by markers or by tags; K points that it looked for.
+    """One camera's observation of the object in one frame.
+
+    By markers or by tags; K points that it looked for.
 
     Attributes:
         centre_ns: When its centre row was exposed.
@@ -54,7 +58,7 @@ class ImageObservation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """All sightings around an instant.
+    """All observations around an epoch.
 
     Attributes:
         t_ns: The instant, master's clock.
@@ -71,7 +75,10 @@ class Window:
     period_ns: int
 
     def near(self, camera: int, kind: int) -> ImageObservation | None:
-        """The sighting that tells what a camera sees at the instant; None: it did not look."""
+        """Return the observation that shows what a camera sees at the epoch.
+
+        None: the camera did not look.
+        """
         views = self.views[camera][kind]
         if not views or abs(views[0].centre_ns - self.t_ns) > _DEADLINE * self.period_ns:
             return None
@@ -79,7 +86,10 @@ class Window:
 
 
 class Windows:
-    """Push machine. Holds the last sightings of each camera and the instants that wait."""
+    """Collector of observations into epochs.
+
+    Push machine. Holds the last observations of each camera and the epochs that wait.
+    """
 
     def __init__(
         self,
@@ -110,7 +120,9 @@ class Windows:
         self._newest_ns = self._emitted_ns = -(2**63)
 
     def push(self, message: MarkerDetections | TagDetections) -> list[Window]:
-        """Take what one camera found; return the instants that became complete or due, oldest first.
+        """Take one camera's detections; return the epochs now complete or due.
+
+        Oldest first.
 
         Raises:
             ValueError: The camera is not of this rig.
@@ -136,7 +148,7 @@ class Windows:
         return self._emit(flush=True)
 
     def _frame(self, c: int, centre_ns: int, tags: bool) -> None:
-        """Keep the books of what each camera has delivered, and note a new instant."""
+        """Record what a camera has delivered, and note a new epoch."""
         self._newest_ns = max(self._newest_ns, centre_ns)
         if not tags:
             self._frames[c].append(centre_ns)
@@ -192,7 +204,10 @@ class Windows:
         )
 
     def _corners(self, message: TagDetections) -> tuple[Int, Float, Float]:
-        """Points (4 N), their places (4 N, 2) and sigmas of the object's tags that a frame shows."""
+        """Return the tag corners of the object that a frame shows.
+
+        Point indices (4 N), their image positions (4 N, 2) and sigmas.
+        """
         found = [
             (
                 self._features.corners_of(self._features.tag_ids.index(number)),
@@ -222,7 +237,7 @@ class Windows:
         return out
 
     def _complete(self, c: int, t_ns: int, tagged: bool) -> bool:
-        """Whether a camera has told all it knows of an instant, or is silent."""
+        """Check whether a camera has delivered all of an epoch, or is silent."""
         if self._silent(c):
             return True
         slack_ns = self._period_ns[c] // 2 if self._predict else 0
@@ -249,7 +264,10 @@ def _line() -> deque[ImageObservation]:
 
 
 def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[ImageObservation, ...]:
-    """Up to four sightings about an instant, the nearest first; of those after it one, or two where none is before."""
+    """Return up to four observations around an epoch, the nearest first.
+
+    At most one of them is later than the epoch, or two where none is before it.
+    """
     known = list(line)
     before = sum(s.centre_ns < t_ns for s in known)
     associated = known[max(before - OBSERVATIONS, 0) : max(before + 1, 2)]

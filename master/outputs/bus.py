@@ -1,4 +1,7 @@
-"""Publishes hands, objects, contact and gestures on the bus, for the viewer and for any program of the user."""
+"""Bus output of hands, objects, contact and gestures.
+
+For the viewer and for any program of the user.
+"""
 
 from common.bus import Bus
 from common.messages import Contact, Gesture, HandPose, ResultMessage
@@ -7,7 +10,9 @@ _STREAM = {HandPose: "hand", Contact: "contact", Gesture: "gesture"}
 
 
 class BusSink:
-    """A `Sink` that publishes each message on the stream of its type, under the name of its hand or object.
+    """A `Sink` that publishes each message on the bus.
+
+    On the stream of its type, under the name of its hand or object.
 
     The bus belongs to the caller.
     """

@@ -1,4 +1,6 @@
-"""Where a wrist device is in the rig of markers: on the forearm, which the solved palm and the wrist's bend place.
+"""Pose of a wrist device in the frame of a marker rig.
+
+The device is on the forearm, which the solved palm and the wrist's flexion place.
 
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
@@ -24,7 +26,9 @@ _SIGMAS = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DevicePlace:
-    """The forearm at T instants; NaN where the pose is not valid.
+    """Forearm poses at T times.
+
+    NaN where the pose is not valid.
 
     Attributes:
         wrist_m: (T, 3) the wrist [m], rig frame.
@@ -51,7 +55,10 @@ class DevicePlace:
         return cls(wrist_m, R, forearm, poses.wrist_angles_rad, poses.wrist_angles_sigma_rad)
 
     def cameras(self, T_camera_palm: Float) -> Float:
-        """Poses (T, 4, 4) of the device's camera, camera -> rig, from its file's T_camera_palm (4, 4)."""
+        """Return the poses (T, 4, 4) of the device's camera, camera -> rig.
+
+        From T_camera_palm (4, 4) of the device's file.
+        """
         T_palm_camera = invert(T_camera_palm)
         out = np.tile(np.eye(4), (len(self.wrist_m), 1, 1))
         out[:, :3, :3] = self.R_rig_forearm @ T_palm_camera[:3, :3]
@@ -63,7 +70,10 @@ class DevicePlace:
         return np.stack([self.wrist_m, self.wrist_m + length_m * (self.R_rig_forearm @ _ELBOW)], axis=1)
 
     def uncertainty_m(self, length_m: float) -> Float:
-        """Rings (T, K, 3) [m] about the ends of `arm_m`: where these are at 2 sigma of the bend; NaN: not known."""
+        """Return 2 sigma rings (T, K, 3) [m] about the ends of `arm_m`.
+
+        Where these ends are at 2 sigma of the wrist's flexion; NaN: not known.
+        """
         angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
         around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         wrist_angles = self.wrist_angles_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around

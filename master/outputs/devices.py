@@ -1,4 +1,6 @@
-"""Publishes what trackers say, on the master's clock, for who registers one: `phalanx calibrate tracker --live`.
+"""Publisher of tracker poses on the master's clock.
+
+For registering a tracker: `phalanx calibrate tracker --live`.
 
 A tracker's poses come as datagrams, to the master alone, and mean nothing in the rig until it is registered. So that
 the registration can see them beside the objects' poses without being a master itself, they go on the bus as they came.
@@ -22,7 +24,10 @@ class Taking(Protocol[TakenT_co]):
 
 
 class DevicePoses(Generic[ReceivedT]):
-    """A source of messages that publishes poses of trackers as they pass. The bus belongs to the caller."""
+    """Message source that publishes tracker poses as they pass.
+
+    The bus belongs to the caller.
+    """
 
     def __init__(self, source: Taking[ReceivedT], bus: Bus) -> None:
         """Stand between a source and who reads it."""

@@ -1,4 +1,6 @@
-"""Writes and reads poses.npz, the record of a run that anybody can open with numpy; and all files of a run at once.
+"""Writer and reader of poses.npz, the record of a run readable with numpy.
+
+Also writes and reads all files of a run at once.
 
 Each appears under its name complete or not at all, and identical poses make identical bytes (`table_file`).
 """
@@ -56,7 +58,9 @@ class PosesFile:
 
 
 class RunFiles:
-    """A `Sink` that becomes the files of a run: a poses.npz for each hand, and beside it what else was told.
+    """A `Sink` that writes the files of a run.
+
+    A poses.npz for each hand, and beside it the other results.
 
     The first hand's poses stand at the path itself, those of others beside it under their names; objects, contact and
     gestures in the same folder (`told_files`).
@@ -113,7 +117,9 @@ class RunFiles:
             self._contacts[message.hand, message.object].write(message)
 
     def close(self) -> None:
-        """Write each file; one that cannot be completed keeps no other from being written.
+        """Write each file.
+
+        A file that cannot be completed does not keep any other from being written.
 
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.
@@ -125,7 +131,10 @@ class RunFiles:
 
 
 def path_of_hand(path: Path, hand: str) -> Path:
-    """Where the poses of another hand than the first stand: poses.npz -> poses-HAND.npz."""
+    """Return the poses file of a hand other than the first.
+
+    poses.npz -> poses-HAND.npz.
+    """
     return path.with_name(f"{path.stem}-{hand}{path.suffix}")
 
 

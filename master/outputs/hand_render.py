@@ -1,4 +1,6 @@
-"""A shaded hand as an image: spheres swept along the bones and the palm, drawn into a depth buffer.
+"""Shaded image of a hand.
+
+Spheres swept along the bones and the palm, drawn into a depth buffer.
 
 Orthographic view; the view frame is OpenCV's (x right, y down, z away from the eye), pixels follow it.
 """
@@ -39,7 +41,10 @@ class View:
     height_px: int
 
     def project(self, points_m: Float) -> Float:
-        """Pixels and depth (..., 3) [px] of points (..., 3) [m] in the rig frame; NaN stays NaN."""
+        """Project points (..., 3) [m] of the rig frame to pixels and depth [px].
+
+        Returns (..., 3) [px]; NaN stays NaN.
+        """
         view = (points_m - self.centre_m) @ self.rotation.T * self.scale_px_m
         return view + np.array([self.width_px / 2, self.height_px / 2, 0.0])
 

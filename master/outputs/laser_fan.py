@@ -1,4 +1,7 @@
-"""The light of a wrist device's laser as lines that can be drawn: rays of its fan, and arcs across them."""
+"""Drawable lines of a wrist device's laser light.
+
+Rays of its fan, and arcs across them.
+"""
 
 import numpy as np
 
@@ -14,7 +17,9 @@ _REACH_M = (0.06, 0.12, 0.18)  # arcs; the fingers of a large hand end within th
 
 
 def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
-    """Unit directions (K, 3) of the laser's light, evenly over its fan, in the frame of the camera.
+    """Return unit directions (K, 3) of the laser fan in the camera frame.
+
+    Evenly spaced over the fan.
 
     Where the rig does not say where its middle goes, that is the camera's view, as far as it lies in the plane.
     """
@@ -29,6 +34,9 @@ def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
 
 
 def fan(laser_m: Float, rays: Float) -> list[Float]:
-    """Line strips (n, 3) [m] of a fan from `laser_m` (3,) along `rays` (K, 3): the rays, and arcs across them."""
+    """Return the line strips (n, 3) [m] of a laser fan: rays, and arcs across.
+
+    From `laser_m` (3,) along `rays` (K, 3).
+    """
     outline = [np.stack([laser_m, laser_m + _REACH_M[-1] * ray]) for ray in rays]
     return outline + [laser_m + reach * rays for reach in _REACH_M]

@@ -1,4 +1,7 @@
-"""How well the place of an object is known, in one word: what the viewer and the picture of a run colour it by."""
+"""How well an object's position is known, in one word.
+
+The viewer and the picture of a run colour the object by it.
+"""
 
 from enum import Enum
 

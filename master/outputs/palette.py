@@ -1,4 +1,7 @@
-"""The colours of a hand, the same in the viewer and in the picture (Okabe & Ito, 2008: safe for colour-blind eyes)."""
+"""Colours of a hand, the same in the viewer and in the picture.
+
+Okabe & Ito, 2008: safe for colour-blind eyes.
+"""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,4 +1,6 @@
-"""One picture of a run (1600 x 900): the hand as solved, the rig around it, and how good the run was.
+"""Picture of a run (1600 x 900).
+
+The hand as solved, the rig around it, and how good the run was.
 
 The rig frame is that of a camera that looks along +z at the back of the hand, y down; the hand is shown
 as that camera sees it, turned a little to the side, so it stands upright. All axes of the hand and of
@@ -109,7 +111,9 @@ def draw_summary(
 
 
 def best_row(poses: Poses, results: ResultPicture | None = None) -> int | None:
-    """The row to show: all joints valid if possible, an object held or known, most joints tracked, fingers spread.
+    """Choose the row to show in the picture.
+
+    Preferred: all joints valid if possible, an object held or known, most joints tracked, fingers spread.
 
     None: none is valid. `results` has the objects.
     """

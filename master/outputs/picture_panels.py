@@ -1,4 +1,7 @@
-"""The plots beside the hand in the picture of a run: angles, latency or marker noise, error or what was seen."""
+"""Plots beside the hand in the picture of a run.
+
+Angles, latency or marker noise, error or what was seen.
+"""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,7 +41,10 @@ def style(axes: Axes, title: str) -> None:
 
 
 def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
-    """Three panels down the right side; a thin line marks the row that is shown as a hand."""
+    """Draw three panels down the right side.
+
+    A thin line marks the row that is shown as a hand.
+    """
     boxes = [figure.add_axes((_LEFT, bottom, _WIDTH, _HEIGHT)) for bottom in _BOTTOMS]
     seconds = (poses.t_ns - poses.t_ns[0]).astype(np.float64) * 1e-9
     _angles(boxes[0], poses, seconds, model)

@@ -1,4 +1,7 @@
-"""What objects and gestures add to the picture of a run: the object in the hand, and a strip of what the hand said."""
+"""Objects and gestures in the picture of a run.
+
+The object in the hand, and a strip of the gestures of the hand.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,7 +50,10 @@ class ResultPicture:
     gestures: Sequence[Gesture] = ()
 
     def interest(self, t_ns: Int) -> Float:
-        """How much the instants (T,) show of the objects: 2 held, 1 known, 0 nothing."""
+        """Rate how much the times (T,) show of the objects.
+
+        2 held, 1 known, 0 nothing.
+        """
         known = np.zeros(len(t_ns))
         for poses in self.objects:
             if len(poses):
@@ -59,7 +65,10 @@ class ResultPicture:
         return known
 
     def points_m(self, t_ns: int) -> Float:
-        """Outline (N, 3) [m] of the objects at an instant, which must be in the picture."""
+        """Return the outline (N, 3) [m] of the objects at a time.
+
+        The outline must be in the picture.
+        """
         found = [
             transform(T, np.concatenate([_outline(part) for part in profile.shape]))
             for profile, T, _ in self._placed(t_ns)
@@ -68,7 +77,7 @@ class ResultPicture:
         return np.concatenate(found) if found else np.empty((0, 3))
 
     def draw(self, axes: Axes, view: View, t_ns: int) -> list[Line2D]:
-        """The objects at an instant; return the entries of the legend."""
+        """Draw the objects at a time; return the legend entries."""
         entries: list[Line2D] = []
         for profile, T, look in self._placed(t_ns):
             colour = unit(OBJECT_RGB[look])
@@ -100,7 +109,10 @@ class ResultPicture:
         return entries
 
     def draw_strip(self, figure: Figure, t_ns: Int, row: int) -> None:
-        """What the hand said over the run, a lane for each kind that it said anything of."""
+        """Draw the gestures of the hand over the run.
+
+        A lane for each kind of gesture that occurred.
+        """
         axes = figure.add_axes(STRIP_BOX)
         style(axes, "What the hand said")
         first, span = int(t_ns[0]), max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-3)
@@ -138,7 +150,10 @@ class ResultPicture:
         axes.axvline((int(t_ns[row]) - first) * 1e-9, color=INK, lw=1.0, alpha=0.7)
 
     def _placed(self, t_ns: int) -> list[tuple[ObjectProfile, Float, ObjectAppearance]]:
-        """Objects whose place is known at an instant: file, pose (4, 4), how well."""
+        """Return the objects whose position is known at a time.
+
+        For each: file, pose (4, 4), how well it is known.
+        """
         profiles: Mapping[str, ObjectProfile] = {one.name: one for one in self.profiles}
         found: list[tuple[ObjectProfile, Float, ObjectAppearance]] = []
         for poses in self.objects:
@@ -158,7 +173,10 @@ class ResultPicture:
 
 
 def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str, int, int]]:
-    """Name, begin and end [ns] of every gesture of a kind, in the order of their beginnings; of a tap its key."""
+    """Return name, begin and end [ns] of every gesture of a kind.
+
+    In the order of their beginnings; for a tap the name is its key.
+    """
     found: dict[tuple[str, int], int] = {}
     ended: set[tuple[str, int]] = set()
     for one in gestures:
@@ -173,7 +191,10 @@ def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str
 
 
 def _words(name: str, letters: int) -> str:
-    """A name, each of its lines cut to so many letters; empty where that says nothing."""
+    """Cut each line of a name to a number of letters.
+
+    Empty where the shortened name would be meaningless.
+    """
     lines = name.split("\n")
     if letters < min(max(map(len, lines)), _LETTERS_LEAST):
         return ""

@@ -1,4 +1,7 @@
-"""The small view of the whole rig in the picture of a run: cameras, rays to the caps, hand, the volume it states."""
+"""Small view of the whole rig in the picture of a run.
+
+Cameras, rays to the caps, hand, and the volume that the rig's file states.
+"""
 
 import numpy as np
 from matplotlib.axes import Axes

@@ -1,4 +1,6 @@
-"""What a wrist device adds to the picture of a run: its laser's fan about the hand, and what its camera sees.
+"""Wrist device in the picture of a run.
+
+Its laser's fan about the hand, and what its camera sees.
 
 Beside marker cameras it stands in their rig where palm and bend place it (`device_place`), and the forearm is drawn.
 """
@@ -60,20 +62,29 @@ class WristPicture:
         return cls(setup.wrist_rig.name, setup.has_markers, setup.wrist, setup.wrist.optics, rays, frame)
 
     def pose(self, poses: Poses, row: int) -> Float:
-        """Pose (4, 4) of its camera in the frame of the poses at that row; NaN: not known."""
+        """Return the camera's pose (4, 4) in the frame of the poses at a row.
+
+        NaN: not known.
+        """
         if not self.in_rig:
             return np.eye(4)
         place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
         return place.cameras(self.setup.T_camera_palm)[0]
 
     def reach_m(self, poses: Poses, row: int) -> Float:
-        """What of it (N, 3) [m] must be in the picture of the hand at that row: its camera, or the forearm's end."""
+        """Return points (N, 3) [m] that must be in the hand's picture at a row.
+
+        The device's camera, or the end of the forearm.
+        """
         if not self.in_rig:
             return np.zeros((1, 3))
         return DevicePlace.of(poses.rows(row, row + 1), self.setup.model).arm_m(_FOREARM_M)[0]
 
     def draw_laser(self, axes: Axes, view: View, poses: Poses, row: int) -> list[Line2D]:
-        """Fan and points about the hand, and the forearm beside marker cameras; return the entries of the legend."""
+        """Draw the laser fan and points about the hand; return the legend entries.
+
+        Beside marker cameras also the forearm.
+        """
         T = self.pose(poses, row)
         for line in fan(self.setup.laser_m, self.rays):
             pixels = view.project(transform(T, line))
@@ -90,7 +101,10 @@ class WristPicture:
         ]  # fmt: skip
 
     def _draw_forearm(self, axes: Axes, view: View, poses: Poses, row: int) -> Line2D:
-        """From the wrist towards the elbow, and where that end is at 2 sigma; return the entry of the legend."""
+        """Draw the forearm from the wrist towards the elbow; return its legend entry.
+
+        Also where that end is at 2 sigma.
+        """
         place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
         colour = unit(SOURCE_RGB[Source.WRIST])
         arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.uncertainty_m(_FOREARM_M)[0])
@@ -105,7 +119,10 @@ class WristPicture:
         return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {wrist_angles}")
 
     def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
-        """The camera's view, lower left: its frame, the hand and the laser points as it should see them."""
+        """Draw the camera's view at the lower left.
+
+        Its frame, the hand and the laser points as the camera should see them.
+        """
         axes = figure.add_axes(_BOX)
         style(axes, "Camera, with the hand as solved")
         axes.set_xticks([])

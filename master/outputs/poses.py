@@ -1,4 +1,7 @@
-"""Many poses as arrays: what poses.npz holds, and what pictures, viewers and scores read."""
+"""Many poses as arrays.
+
+What poses.npz holds, and what pictures, viewers and scores read.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -113,7 +116,10 @@ class Poses:
 
 
 def record(marker_count: int) -> np.dtype[np.void]:
-    """One row of poses.npz as a structured type: the one place that fixes names, types and shapes."""
+    """Return one row of poses.npz as a structured type.
+
+    The only place that fixes names, types and shapes.
+    """
     j, m = JOINT_COUNT, marker_count
     return np.dtype(
         [

@@ -16,7 +16,10 @@ _log = logging.getLogger(__name__)
 
 
 class PictureAsker:
-    """Asks each camera by a thread of its own: one that is not there keeps no other waiting. Holds the threads."""
+    """Requester of camera pictures, one thread per camera.
+
+    A camera that is not there keeps no other waiting. Holds the threads.
+    """
 
     def __init__(
         self,
@@ -45,7 +48,10 @@ class PictureAsker:
             thread.start()
 
     def close(self) -> None:
-        """Ask no more; waits for an unanswered question, at most a second. Safe to call twice."""
+        """Stop asking.
+
+        Waits for an unanswered request, at most a second. Safe to call twice.
+        """
         self._closing.set()
         for thread in self._threads:
             thread.join()

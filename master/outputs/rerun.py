@@ -1,4 +1,6 @@
-"""The viewer, in a process of its own: reads what a master tells from the bus and never slows the tracking.
+"""Viewer in a process of its own.
+
+Reads what a master publishes from the bus and never slows the tracking.
 
 It subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses pictures,
 not poses; the only thing it says is "preview" to the cameras, which then show themselves for three seconds.
@@ -160,7 +162,10 @@ def write_rrd(
 def _pump(
     scene: RerunScene, recording: rr.RecordingStream, subscribers: _Subscribers, go_on: Callable[[], bool]
 ) -> int:
-    """Move messages from the bus to the scene while `go_on`, and the last ones after it."""
+    """Move messages from the bus to the scene while `go_on`.
+
+    Also the last ones after it.
+    """
     shown, flush_ns, going = 0, now_ns(), True
     at_ns: int | None = None  # newest time of the master, on whose clock the timeline is
     while going:

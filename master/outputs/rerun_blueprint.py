@@ -1,4 +1,7 @@
-"""How the viewer is laid out when it opens: the scene on the left, cameras below it, plots on the right."""
+"""Initial layout of the viewer.
+
+The scene on the left, cameras below it, plots on the right.
+"""
 
 from collections.abc import Sequence
 
@@ -45,7 +48,9 @@ def camera_path(camera: str) -> str:
 
 
 def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rrb.Blueprint:
-    """The saved layout; plots follow the last 10 s of a live run and show all of a recorded one.
+    """Return the saved layout.
+
+    Plots follow the last 10 s of a live run and show all of a recorded one.
 
     Args:
         setups: What watches each hand.
@@ -121,7 +126,10 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
 
 
 def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
-    """Where the scene is looked at from [m], so that every camera that stands still is in the picture."""
+    """Return the viewpoint [m] of the scene.
+
+    Chosen so that every static camera is in the picture.
+    """
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
     models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
     reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
@@ -132,7 +140,7 @@ def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
 
 
 def legend() -> str:
-    """Markdown text that says what the colours of the scene mean."""
+    """Return Markdown text that explains the colours of the scene."""
     names = {source: f"rgb{SOURCE_RGB[source]}" for source in Source}
     lines = [f"- **{s.name.lower()}** {names[s]}: {SOURCE_MEANING[s]}" for s in Source]
     return (

@@ -1,4 +1,7 @@
-"""Rows of entities as columns, a batch at a time: a live viewer (2 or 3 poses a batch) and a file go the same way."""
+"""Rows of entities as columns, a batch at a time.
+
+A live viewer (2 or 3 poses a batch) and a file go the same way.
+"""
 
 from typing import cast
 
@@ -14,13 +17,19 @@ PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its 
 
 
 class Columns:
-    """Sends rows, each at its `t_ns` on the timeline, to a recording that belongs to the caller."""
+    """Sender of rows to a recording, each at its `t_ns` on the timeline.
+
+    The recording belongs to the caller.
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
 
     def send(self, path: str, t_ns: Int, columns: rr.ComponentColumnList, lengths: Int | None) -> None:
-        """Send rows at `t_ns`; `lengths` (T,) instances each (0 clears the last row), None: one each."""
+        """Send rows at `t_ns`.
+
+        `lengths` (T,) instances each (0 clears the last row), None: one each.
+        """
         index = rr.TimeColumn(TIMELINE, duration=cast("list[np.timedelta64]", t_ns.astype("timedelta64[ns]")))
         parts = columns if lengths is None else columns.partition(lengths)
         self._rec.send_columns(path, [index], parts)
@@ -42,7 +51,10 @@ class Columns:
     def pixels(
         self, path: str, t_ns: Int, uv: Float, colours: npt.NDArray[np.uint32], radius_px: float
     ) -> None:
-        """Those of the pixels (T, N, 2), (0, 0) = centre of the first, that are not NaN, in colours (T, N)."""
+        """Send those of the pixels (T, N, 2) that are not NaN, in colours (T, N).
+
+        (0, 0) = centre of the first pixel.
+        """
         shown = seen(uv)
         columns = rr.Points2D.columns(
             positions=uv[shown] + PIXEL_CENTRE,
@@ -71,7 +83,10 @@ class Columns:
         self.send(path, t_ns, columns, np.asarray(shown, np.int64))
 
     def scalars(self, path: str, t_ns: Int, values: Float) -> None:
-        """One number a row; NaN is sent as such: the viewer breaks the line there, and would bridge a missing row."""
+        """Send one number per row.
+
+        NaN is sent as such: the viewer breaks the line there, and would bridge a missing row.
+        """
         self.send(path, t_ns, rr.Scalars.columns(scalars=values), None)
 
     def name(self, path: str, name: str, rgb: Rgb) -> None:

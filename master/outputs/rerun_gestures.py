@@ -1,4 +1,6 @@
-"""What gestures add to the viewer's scene: what the hand says, where it says it, and lanes of it over time.
+"""Gestures in the viewer's scene.
+
+Which gesture the hand makes, where it makes it, and lanes of gestures over time.
 
 world/gestures/HAND/pose             the name of the pose beside the palm
 world/gestures/HAND/pinch            thumb to finger, brighter as it closes, with the distance of their skins
@@ -29,7 +31,10 @@ _LABEL_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
 
 
 class GesturesLayer:
-    """Logs gestures to a recording that belongs to the caller; holds which key each hand tapped last, and when."""
+    """Logger of gestures to a recording that belongs to the caller.
+
+    Holds which key each hand tapped last, and when.
+    """
 
     def __init__(self, recording: rr.RecordingStream, states: States) -> None:
         self._rec, self._states = recording, states
@@ -118,7 +123,10 @@ class GesturesLayer:
 
 
 def arc(axis: Float, angle_rad: float) -> Float:
-    """Points (N, 3) of a unit circle about an axis (3,), from its top (the side of -y) on, by an angle about it."""
+    """Return points (N, 3) of a unit circle arc about an axis (3,).
+
+    From its top (the side of -y) on, by an angle about the axis.
+    """
     first = np.array([0.0, -1.0, 0.0]) - axis * -axis[1]
     if np.linalg.norm(first) < 1e-3:
         first = np.array([1.0, 0.0, 0.0])

@@ -1,4 +1,7 @@
-"""The cameras' pictures in the viewer: few enough, and at the size in which all centroids are."""
+"""Camera pictures in the viewer.
+
+Few enough, and at the size in which all centroids are.
+"""
 
 from collections.abc import Mapping
 
@@ -17,7 +20,10 @@ _JPEG_QUALITY = 80
 
 
 class CameraImages:
-    """Logs images to `recording`, which belongs to the caller. Holds time and size of each camera's last one."""
+    """Logger of images to `recording`, which belongs to the caller.
+
+    Holds time and size of each camera's last image.
+    """
 
     def __init__(self, recording: rr.RecordingStream, models: Mapping[str, CameraModel]) -> None:
         """Take the cameras of the rig by name."""

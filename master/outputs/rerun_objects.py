@@ -1,4 +1,6 @@
-"""What objects add to the viewer's scene: where each is and how well that is known, and where fingers touch it.
+"""Objects in the viewer's scene.
+
+Where each is and how well that is known, and where fingers touch it.
 
 world/objects/OBJECT                 its place; nothing below it while nobody knows where it is
 world/objects/OBJECT/shape/...       boxes, cylinders, balls of its file, coloured by `object_appearance`
@@ -44,7 +46,10 @@ class _Shown:
 
 
 class ObjectsLayer:
-    """Logs objects and contact to a recording that belongs to the caller; holds how each object is shown."""
+    """Logger of objects and contact to a recording that belongs to the caller.
+
+    Holds how each object is shown.
+    """
 
     def __init__(
         self, recording: rr.RecordingStream, states: States, profiles: Sequence[ObjectProfile]

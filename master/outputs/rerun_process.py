@@ -1,4 +1,6 @@
-"""Starts Rerun's own viewer as a child that listens on 127.0.0.1 only, and ends it again.
+"""Launcher of Rerun's own viewer as a child process.
+
+The viewer listens on 127.0.0.1 only; the launcher also ends it.
 
 The SDK's `spawn` and `serve_*` listen on every interface; the same program started by hand can be bound.
 Its usage statistics are switched off in a private settings folder, the user's own settings stay untouched.
@@ -29,7 +31,10 @@ _FIX = "without a display use --web or --save FILE.rrd; a busy port needs anothe
 
 
 class ViewerProcess:
-    """A running viewer: a window, or a web page when `web_port` is given. Ends with the `with` block."""
+    """A running viewer: a window, or a web page when `web_port` is given.
+
+    Ends with the `with` block.
+    """
 
     def __init__(self, web_port: int | None) -> None:
         """Start it and wait until it listens.
@@ -86,7 +91,7 @@ class ViewerProcess:
 
     @property
     def address(self) -> str:
-        """What to tell the user."""
+        """Return the address to show to the user."""
         if self._web_port is None:
             return "viewer window opened"
         return f"http://{LOOPBACK}:{self._web_port}?url={quote(self.url, safe='')}"

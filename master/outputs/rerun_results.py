@@ -1,4 +1,7 @@
-"""Everything but hands that a master tells, into one Rerun recording: objects, contact and gestures."""
+"""Results of a master other than hands, in one Rerun recording.
+
+Objects, contact and gestures.
+"""
 
 from collections.abc import Sequence
 
@@ -19,7 +22,9 @@ _REMEMBERED = 1024  # poses
 
 
 class ResultLayer:
-    """Logs to a recording that belongs to the caller; holds tips and palm of the last poses.
+    """Logger of results to a recording that belongs to the caller.
+
+    Holds tips and palm of the last poses.
 
     Contact and gestures are drawn at the joints of their own instant.
     """
@@ -31,7 +36,7 @@ class ResultLayer:
         self._joints: dict[tuple[str, int], Float] = {}
 
     def remember(self, poses: Poses) -> None:
-        """Take the poses of a hand, before what is told of them."""
+        """Take the poses of a hand, before the results that refer to them."""
         at = np.where(poses.valid[..., None], poses.position_m, np.nan)[:, _NAMED]
         self._joints |= {(poses.hand, t): row for t, row in zip(poses.t_ns.tolist(), at, strict=True)}
         for old in list(self._joints)[: -max(_REMEMBERED, len(poses))]:

@@ -1,4 +1,6 @@
-"""What the viewer shows: poses, detections, images and health as entities of one Rerun recording.
+"""Contents of the viewer's scene as entities of one Rerun recording.
+
+Poses, detections, images and health.
 
 Poses are logged as columns (`rerun_columns`). Every row stands on the timeline "capture" at its `t_ns`.
 The scene holds the times of the last second (rate), the images' state, and which entities have got their
@@ -62,7 +64,10 @@ _FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0004, 0.01
 
 
 class RerunScene:
-    """Logs what watches each hand, and the hands, to `recording`, which belongs to the caller."""
+    """Logger of the hands and their sensors to `recording`.
+
+    Logs what observes each hand, and the hands. The recording belongs to the caller.
+    """
 
     def __init__(self, recording: rr.RecordingStream, setups: Sequence[RigSetup]) -> None:
         """Log what never changes: frames, frusta, names and colours of plots.
@@ -112,7 +117,10 @@ class RerunScene:
         return int(self._recent_ns[-1]) if len(self._recent_ns) else None
 
     def log_poses(self, poses: Poses, truth: PosesTruth | None = None) -> None:
-        """Log a batch of poses of one hand, in the order of time, and their truth row by row."""
+        """Log a batch of poses of one hand and their truth row by row.
+
+        In the order of time.
+        """
         if not len(poses):
             return
         setup = self._setups.get(poses.hand, self._first)
@@ -127,7 +135,10 @@ class RerunScene:
         self._results.remember(poses)
 
     def log_results(self, results: Sequence[ResultMessage]) -> None:
-        """Log objects, contact and gestures, each in the order of time; after the poses of the hands they are of."""
+        """Log objects, contact and gestures, each in the order of time.
+
+        After the poses of the hands that they belong to.
+        """
         self._results.log(results)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
@@ -150,7 +161,7 @@ class RerunScene:
         return self._images.log(camera, image, t_ns, shown_ns)
 
     def log_health(self, health: Health, t_ns: int) -> None:
-        """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""
+        """Plot every count and metric of a process at `t_ns` [ns] of the timeline."""
         for name, value in [*health.counts.items(), *health.metrics.items()]:
             path = rr.new_entity_path(["plots", "health", health.source, name])
             self._rows.scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
@@ -282,7 +293,10 @@ class RerunScene:
             self._rows.scalars(path, t, mean_known(error) * 1e3)
 
     def _rate_hz(self, t_ns: Int) -> Float:
-        """Poses per second (T,) over the second that ends at each row; NaN for the very first."""
+        """Return poses per second (T,) over the second that ends at each row.
+
+        NaN for the very first.
+        """
         times = np.concatenate([self._recent_ns, t_ns])
         rows = np.arange(len(self._recent_ns), len(times))
         first = np.searchsorted(times, times[rows] - 1_000_000_000)
@@ -296,7 +310,10 @@ def _marker_colours(count: int) -> npt.NDArray[np.uint32]:
 
 
 def _at_limit(angles_rad: Float, hand: HandModel) -> Bool:
-    """Joints (T, 26) one of whose angles has reached its limit; a fixed angle does not count."""
+    """Return a mask (T, 26) of the joints with an angle at its limit.
+
+    A fixed angle does not count.
+    """
     low, high = hand.limits_at(angles_rad[..., FLEXION])
     reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
     reached &= high - low > 2 * _AT_LIMIT_RAD
@@ -307,6 +324,9 @@ def _at_limit(angles_rad: Float, hand: HandModel) -> Bool:
 
 
 def _strips(at: Float, shown: Bool) -> list[Float]:
-    """Line strips of joints (T, 26, 3), for every (row, strip) shown (T, 6), in that order."""
+    """Return the line strips of joints (T, 26, 3) that are shown (T, 6).
+
+    One for every (row, strip) shown, in that order.
+    """
     rows, strips = np.nonzero(shown)
     return [at[i, list(_STRIPS[k])] for i, k in zip(rows.tolist(), strips.tolist(), strict=True)]

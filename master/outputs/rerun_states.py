@@ -1,4 +1,7 @@
-"""What lasts in the viewer: lanes of states over time, such as a pose of the hand or a held object."""
+"""Lanes of lasting states over time in the viewer.
+
+Such as a pose of the hand or a held object.
+"""
 
 import numpy as np
 import rerun as rr
@@ -7,14 +10,20 @@ from master.outputs.rerun_blueprint import STATES, TIMELINE
 
 
 class States:
-    """Logs changes of state to a recording that belongs to the caller; holds the last state of each lane."""
+    """Logger of state changes to a recording that belongs to the caller.
+
+    Holds the last state of each lane.
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
         self._last: dict[str, str | None] = {}
 
     def log(self, lane: str, t_ns: int, state: str | None) -> None:
-        """The state of a lane (a path of names) at a time; None: none. The same again costs nothing."""
+        """Log the state of a lane (a path of names) at a time.
+
+        None: no state. Logging the same state again costs nothing.
+        """
         if self._last.get(lane) == state:
             return
         self._last[lane] = state

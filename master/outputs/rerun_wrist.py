@@ -1,4 +1,6 @@
-"""What a wrist device adds to the viewer's scene: the fan of its laser, where that meets each finger, and its sights.
+"""Wrist device in the viewer's scene.
+
+The fan of its laser, where that meets each finger, and what the device saw.
 
 world                                a device alone: all of it, turned as the forearm is held, up is up; where an IMU
                                      tells it
@@ -43,7 +45,10 @@ _FINGER_RGB = [series_rgb(finger) for finger in range(FINGER_COUNT)]
 
 
 class WristLayer:
-    """Logs one wrist device to a recording that belongs to the caller; holds which way the first pose looked."""
+    """Logger of one wrist device to a recording that belongs to the caller.
+
+    Holds the viewing direction of the first pose.
+    """
 
     def __init__(
         self,
@@ -126,7 +131,10 @@ class WristLayer:
             )
 
     def _log_held(self, poses: Poses) -> None:
-        """Turn the scene: down, y, is down; what the camera looked along at first, z, stays ahead."""
+        """Rotate the scene so that y points down along gravity.
+
+        What the camera first looked along, z, stays ahead.
+        """
         known = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
         if not len(known):
             return
@@ -140,7 +148,10 @@ class WristLayer:
         self._rows.send(WORLD, poses.t_ns[known], columns, None)
 
     def log_detections(self, frames: Sequence[WristDetections]) -> None:
-        """Log what the camera saw of laser and fingertips, in its image; frames in the order of time."""
+        """Log the laser and fingertips that the camera saw, in its image.
+
+        Frames in the order of time.
+        """
         t = np.array([frame.t_ns for frame in frames], np.int64)
         colours = np.broadcast_to(pack(_FINGER_RGB), (len(frames), FINGER_COUNT))
         path = f"{camera_path(self._camera)}/detections"
@@ -152,7 +163,10 @@ class WristLayer:
 
 
 def _level(world_camera: Float) -> Float:
-    """The IMU's world -> x right, y down, z ahead: where the camera looks, or its image's top where it looks up."""
+    """Return the rotation from the IMU's world to x right, y down, z ahead.
+
+    Ahead is where the camera looks, or its image's top where it looks up.
+    """
     up = np.array([0.0, 0.0, 1.0])
     along = world_camera[:, 2] if abs(world_camera[2, 2]) < _UPRIGHT else -world_camera[:, 1]
     ahead = along - (along @ up) * up

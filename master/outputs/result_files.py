@@ -1,4 +1,6 @@
-"""Writes and reads what a run told beside the hands: object_<name>.npz, contact_<hand>_<object>.npz, gestures.jsonl.
+"""Writer and reader of the results of a run beside the hands.
+
+object_<name>.npz, contact_<hand>_<object>.npz, gestures.jsonl.
 
 They stand in the folder of poses.npz. A gesture is a line of JSON with the fields of the message; NaN is null.
 """
@@ -70,7 +72,9 @@ class ObjectPoses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contacts:
-    """How near one hand was to one object at T instants; fields as in `Contact`.
+    """Distances of one hand to one object at T times.
+
+    Fields as in `Contact`.
 
     Attributes:
         hand, object: Their names.
@@ -199,7 +203,9 @@ class GesturesFile:
             raise cannot_write(self._path, error) from error
 
     def close(self) -> None:
-        """Write the file; an older one is replaced only by a complete one. Safe to call twice.
+        """Write the file.
+
+        An older file is replaced only by a complete one. Safe to call twice.
 
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.

@@ -1,4 +1,7 @@
-"""The seam through which hands, objects, contact and gestures leave the master: a file, the bus, what comes next."""
+"""Output interface of the master for hands, objects, contact and gestures.
+
+Behind it are a file, the bus, and any later output.
+"""
 
 from typing import Protocol
 
@@ -6,7 +9,10 @@ from common.messages import ResultMessage
 
 
 class Sink(Protocol):
-    """Takes what the master tells, of each hand and object in the order of its time. Opened by its constructor."""
+    """Output that takes the results of the master.
+
+    Those of each hand and object come in the order of their time. Opened by its constructor.
+    """
 
     def write(self, message: ResultMessage) -> None:
         """Take one message. What a sink is not for, it leaves alone.
@@ -17,7 +23,9 @@ class Sink(Protocol):
         ...
 
     def close(self) -> None:
-        """Finish: what was written is complete and readable from here on. Safe to call twice.
+        """Finish writing.
+
+        What was written is complete and readable from here on. Safe to call twice.
 
         Raises:
             PhalanxError: The result could not be completed; nothing half written is left.

@@ -1,4 +1,6 @@
-"""Rows of a table of fixed type that become an .npz when the run ends: in constant memory, complete or not at all.
+"""Table of fixed row type that becomes an .npz when the run ends.
+
+In constant memory; the file is complete or not written at all.
 
 Rows are spooled to a nameless file beside the target, so a run may have any length and a full disk shows while
 tracking, not at the end. `close` turns the spool into the .npz: uncompressed, with fixed time stamps, hence
@@ -63,7 +65,9 @@ class TableFile:
         self._rows += 1
 
     def close(self) -> None:
-        """Write the .npz; an older file of that name is replaced only by a complete one. Safe to call twice.
+        """Write the .npz.
+
+        An older file of that name is replaced only by a complete one. Safe to call twice.
 
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.
@@ -95,6 +99,6 @@ class TableFile:
 
 
 def cannot_write(path: Path, error: OSError) -> RecordingError:
-    """What is said when a file of a run cannot be written."""
+    """Return the error for a file of a run that cannot be written."""
     fix = "free the disk or choose another folder"
     return RecordingError(f"{path}: cannot write: {error.strerror or error}; {fix}")

@@ -1,4 +1,7 @@
-"""What the hand really did, row by row beside the poses, where a simulation or a recording knows it."""
+"""True motion of the hand, row by row beside the poses.
+
+Where a simulation or a recording knows it.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,9 @@ from master.outputs.poses import Poses
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosesTruth:
-    """True joints and caps at the instants of T poses. NaN: unknown there.
+    """True joints and caps at the times of T poses.
+
+    NaN: unknown there.
 
     Attributes:
         joints_m: (T, 26, 3) [m], rig frame.
@@ -25,7 +30,10 @@ class PosesTruth:
 
     @classmethod
     def of_webxr(cls, joints_m: Float, markers_m: Float, laser_m: Float | None = None) -> "PosesTruth":
-        """From the 25 WebXR joints (T, 25, 3) of a rendered recording; the palm is derived."""
+        """Build the truth from the 25 WebXR joints (T, 25, 3) of a rendered recording.
+
+        The palm is derived.
+        """
         palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
         return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m, laser_m)
 
@@ -35,14 +43,20 @@ class PosesTruth:
         return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop], laser_m)
 
     def errors_m(self, poses: Poses) -> dict[str, Float]:
-        """What is measured -> its distances (T, K) [m] from the truth; NaN where one of both is not known."""
+        """Return the distances (T, K) [m] from the truth for each measured quantity.
+
+        A mapping from quantity to distances; NaN where either of the two is not known.
+        """
         joints = {"joints": self.joint_error_m(poses)}
         if self.laser_m is None:
             return joints | {"markers": self.marker_error_m(poses)}
         return joints | {"laser": distance_m(poses.laser_m, self.laser_m)}
 
     def joint_error_m(self, poses: Poses) -> Float:
-        """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""
+        """Return the distance (T, 25) [m] of every joint but the palm from the truth.
+
+        NaN where the pose is not valid or there is no truth.
+        """
         error = distance_m(poses.position_m, self.joints_m)
         return np.where(poses.valid, error, np.nan)[:, 1:]
 
@@ -57,7 +71,10 @@ def distance_m(a: Float, b: Float) -> Float:
 
 
 def mean_known(values: Float) -> Float:
-    """Mean (T,) over the second axis of (T, K), NaN values left out; NaN where none is known."""
+    """Return the mean (T,) over the second axis of (T, K), ignoring NaN values.
+
+    NaN where no value is known.
+    """
     known = ~np.isnan(values)
     count = known.sum(axis=1)
     total = np.where(known, values, 0.0).sum(axis=1)

@@ -1,1 +1,4 @@
-"""Recordings of messages: what a master took and told, kept in one file, and played again."""
+"""Recordings of messages.
+
+What a master received and published, kept in one file, and played again.
+"""

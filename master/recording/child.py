@@ -1,4 +1,6 @@
-"""The recorder that `phalanx run --record FILE` starts: a process of its own, with an end of its own.
+"""Recorder process that `phalanx run --record FILE` starts.
+
+A process of its own, with an end of its own.
 
 It is there before the first message is taken, so that a replay is what was told live from the first pose on. Its
 standard input is a pipe from this process: when that closes, because we end it or because we died, it ends its file. It
@@ -23,7 +25,10 @@ _STEP_S = 0.05
 
 
 class RecorderProcess:
-    """A running recorder. Holds the process and the thread that passes on what it says."""
+    """A running recorder.
+
+    Holds the process and the thread that forwards its output.
+    """
 
     def __init__(
         self,
@@ -57,7 +62,7 @@ class RecorderProcess:
         self._thread.start()
 
     def wait_ready(self, bus: Bus, timeout_s: float = READY_S) -> None:
-        """Wait until it hears all that is published from here on.
+        """Wait until the recorder receives all that is published from here on.
 
         Raises:
             RecordingError: It ended, or does not come in time.
@@ -75,7 +80,10 @@ class RecorderProcess:
             time.sleep(_STEP_S)
 
     def close(self) -> None:
-        """Let it write what is on its way and end its file; the bus must be open still. Safe to call twice."""
+        """Let the recorder write pending messages and end its file.
+
+        The bus must be open still. Safe to call twice.
+        """
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:

@@ -1,11 +1,15 @@
-"""Where in a recording the player is: a clock that can be paused, moved, and run at any speed.
+"""Playback clock of a recording.
+
+Where in the recording the player is; it can be paused, moved, and run at any speed.
 
 It reads no clock itself: it is told the time.
 """
 
 
 class ReplayClock:
-    """Maps time here to time in the recording. Holds a pair of both that belong together, the speed and the pause.
+    """Map from local time to time in the recording.
+
+    Holds a pair of both that belong together, the speed and the pause.
 
     At speed 0 there is no such map: everything is due at once.
     """

@@ -1,4 +1,6 @@
-"""What a run told, as one number: SHA-256 over all poses in their order; and over objects, contact and gestures.
+"""Digest of a run: SHA-256 over all poses in their order.
+
+Another is over objects, contact and gestures.
 
 Each message counts as it is encoded for the wire, with `latency_ns` set to 0: how long the machine took is no part of
 the result.

@@ -1,4 +1,7 @@
-"""The files of calibration that a recording carries, and the setups that are made of them again."""
+"""Calibration files that a recording carries.
+
+Also the setups that are rebuilt from them.
+"""
 
 import json
 import tempfile
@@ -37,7 +40,10 @@ def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, byte
 
 
 def rigs_text(rigs: Sequence[str]) -> str:
-    """The names of the rigs as a recording keeps them: their order says which hand is the first."""
+    """Return the names of the rigs as a recording stores them.
+
+    Their order determines which hand is the first.
+    """
     return json.dumps(list(rigs))
 
 

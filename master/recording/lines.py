@@ -1,4 +1,7 @@
-"""What a person reads of a recording: the line of progress, and the table of what is in a file."""
+"""Text output about a recording.
+
+The progress line, and the table of what is in a file.
+"""
 
 from typing import TextIO
 
@@ -14,7 +17,9 @@ PLAIN_EVERY = 5  # calls, where no terminal shows the line in place
 
 
 class ProgressLine:
-    """Shows progress on a stream: on a terminal in place at every call, elsewhere a line at every fifth.
+    """Progress display on a stream.
+
+    On a terminal in place at every call, elsewhere a line at every fifth.
 
     Holds how often it was called.
     """
@@ -66,7 +71,10 @@ def bar(done: float, length: int = 24) -> str:
 
 
 def table(recording: MessageRecording, events: list[str]) -> list[str]:
-    """The streams of a recording with their rates, its length and files, and what has to be known of it."""
+    """Return a table of a recording's streams and their rates.
+
+    Also its length and files, and what has to be known of it.
+    """
     seconds = (recording.end_t_ns - recording.begin_t_ns) * 1e-9
     megabytes = recording.path.stat().st_size * 1e-6
     ended = "cut: it was not ended" if recording.cut else "whole"
@@ -92,7 +100,10 @@ def table(recording: MessageRecording, events: list[str]) -> list[str]:
 
 
 def raw_lines(recording: MessageRecording) -> list[str]:
-    """What raw frames the slaves kept beside it, as far as they told; nothing where nobody asked them."""
+    """List the raw frames that the slaves kept beside a recording.
+
+    As far as the slaves reported them; nothing where nobody asked for them.
+    """
     try:
         folders = RAW_FOLDERS.decode(recording.about.get("raw", "{}"))
     except (msgspec.DecodeError, RecursionError):
@@ -114,13 +125,19 @@ def raw_lines(recording: MessageRecording) -> list[str]:
 
 
 def events_of(recording: MessageRecording) -> list[str]:
-    """What happened while it was recorded that a replay cannot repeat, or that is missing from it."""
+    """List the events that a replay cannot repeat, or that are missing from it.
+
+    Events that happened during recording.
+    """
     watch = EventMonitor(recording.begin_t_ns)
     return [line for one in recording.read(["health"]) for line in watch.push(one.t_ns, one.message)]
 
 
 class EventMonitor:
-    """Tells from the reports of master and recorder what happened. Holds what they said last."""
+    """Monitor of events, from the reports of master and recorder.
+
+    Holds their last reports.
+    """
 
     def __init__(self, begin_t_ns: int) -> None:
         self._begin_ns = begin_t_ns
@@ -129,7 +146,10 @@ class EventMonitor:
         self.restarted = self.changed = False
 
     def push(self, t_ns: int, message: object) -> list[str]:
-        """Take a report; lines for what is new in it. `restarted`: it is the first of a new master."""
+        """Take a report; return lines for what is new in it.
+
+        `restarted`: it is the first of a new master.
+        """
         self.restarted = False
         if not isinstance(message, Health):
             return []

@@ -1,4 +1,6 @@
-"""The player as a process: on the bus as the master whose messages it plays, with commands of its own.
+"""Player as a process.
+
+On the bus it acts as the master whose messages it plays, with commands of its own.
 
 Whatever listens to a live master (viewer, console, outputs) sees the recording as if it were live, with the times of
 then.
@@ -125,7 +127,9 @@ def run_play(
 
 
 def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable[[str], None]) -> None:
-    """Refuse what cannot be played, and say what has to be known of what can.
+    """Refuse recordings that cannot be played, and print notices on the others.
+
+    The notices are what has to be known of what can be played.
 
     Raises:
         RecordingError: There is nothing to play.
@@ -148,7 +152,10 @@ def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable
 
 
 class _Host:
-    """Answers for the player and reports on it. Holds its id and the thread that reports."""
+    """Command responder and health reporter of the player.
+
+    Holds its id and the thread that reports.
+    """
 
     def __init__(
         self,
@@ -181,7 +188,10 @@ class _Host:
         return (self._player.at_ns - self._begin_ns) * 1e-9
 
     def health(self) -> Health:
-        """How it is, as the master's report: also play.position_s, .length_s, .speed and .paused (0, 1)."""
+        """Return the player's health, in the form of the master's report.
+
+        Also play.position_s, .length_s, .speed and .paused (0, 1).
+        """
         metrics = {
             "play.position_s": round(self.position_s, 3),
             "play.length_s": round(self.length_s, 3),
@@ -193,7 +203,9 @@ class _Host:
         return Health(MASTER, self._session, now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
-        """Obey "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".
+        """Obey a command to the player.
+
+        "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".
 
         Raises:
             ValueError: Another verb, or a body that does not fit; the asker reads what does.

@@ -1,4 +1,6 @@
-"""Plays a recording: what the master took goes through the very same `Dispatcher` again, at any speed, from any moment.
+"""Player of a recording.
+
+What the master received goes through the very same `Dispatcher` again, at any speed, from any time.
 
 What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
 same, bit for bit, however fast; a `Backlog` among them says what the live master left out, and so does the player. To
@@ -56,7 +58,9 @@ class Passed:
 
 
 def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatcher:
-    """The world as a live master builds it, which leaves out instants as `load_shedding` says.
+    """Build the dispatcher as a live master does.
+
+    It drops epochs as `load_shedding` states.
 
     Raises:
         CalibrationError: The files do not fit together.
@@ -68,7 +72,9 @@ def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatc
 
 
 class Player:
-    """Plays one recording. Holds the clock, the world of the present pass, and where a jump is to go.
+    """Player of one recording.
+
+    Holds the clock, the dispatcher of the present pass, and the target of a jump.
 
     `run` belongs to one thread; the other methods are called on any.
     """
@@ -234,7 +240,10 @@ class Player:
             return False
 
     def _results_of(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[ResultMessage]:
-        """What a message tells: the world makes it, or it was told live."""
+        """Return the results of a recorded message.
+
+        The dispatcher computes them, or they were published live.
+        """
         if one.stream in SOLVED:
             return (cast(ResultMessage, one.message),)
         if one.stream != "taken" or dispatcher is None or isinstance(one.message, Backlog):

@@ -1,4 +1,6 @@
-"""Shows what the master is told, in the order in which it is told, while somebody records.
+"""Publisher of the master's input messages while somebody records.
+
+In the order in which the master receives them.
 
 A message goes on the bus (stream `taken`) once all that it tells is out, with those of the same fifth of a second,
 on a thread of its own: no pose waits for it. That thread may wait for a reader, so that none is lost on the way; where
@@ -51,20 +53,29 @@ class Probe:
 
     @property
     def counts(self) -> dict[str, int]:
-        """`probe.shown`, and of those `probe.dropped`, once there were any: what a recorder never received."""
+        """Return `probe.shown`, and of those `probe.dropped`, once there were any.
+
+        What a recorder never received.
+        """
         # What waits to be published can be nobody's loss yet.
         return (
             {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
         )
 
     def lease(self) -> None:
-        """Show everything for three seconds from now, and again how far behind the master is."""
+        """Show everything for three seconds from now.
+
+        Also shows again how far behind the master is.
+        """
         self._again = True
         self._until_ns = self._clock.now_ns() + LEASE_NS
         self._start()
 
     def show(self, message: Message, reject: int = 0) -> None:
-        """Publish it soon, if somebody taps; and before it that so many instants are left out, if that is news."""
+        """Queue a message for publishing, if somebody taps.
+
+        Before it publishes the number of dropped epochs, if that has changed.
+        """
         if not self._always:
             if self._until_ns == 0:
                 return
@@ -85,7 +96,10 @@ class Probe:
             self._queue.append(message)  # nobody is woken: the thread looks by itself
 
     def end_always(self) -> None:
-        """Show nothing any more but to who taps: the recorder that wanted everything is gone."""
+        """Stop showing messages, except to those who tap.
+
+        The recorder that wanted everything is gone.
+        """
         self._always = False
 
     def drain(self) -> None:
@@ -113,7 +127,10 @@ class Probe:
                 self._thread.start()
 
     def _work(self) -> None:
-        """Publish what there is, all at once, so that it travels together; end when nobody taps any more."""
+        """Publish all pending messages at once, so that they travel together.
+
+        Ends when nobody taps any more.
+        """
         while True:
             while self._queue and not self._closed:
                 self._busy = True
@@ -131,12 +148,17 @@ class Probe:
 
 
 def came_ns(message: Message, now_ns: int) -> int:
-    """When a message was there: a frame, when its slave got it; what a device measured, when it did; else `now_ns`."""
+    """Return the time at which a message was available.
+
+    A frame: when its slave got it. A device's measurement: when it was measured. Else `now_ns`.
+    """
     return getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
 
 
 class Tapped(Generic[ReceivedT]):
-    """A source of messages that shows each when the next is asked for: what reads it has made of it all it can by then.
+    """Message source that shows each message when the next is requested.
+
+    By then its reader has processed the message as far as it can.
 
     With each message it sees how far behind the master is, which holds until the next. Holds the last message.
     """

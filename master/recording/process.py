@@ -1,4 +1,6 @@
-"""The recorder as a process of its own: on the bus as "recorder", fed from it, never in the way of the tracking.
+"""Recorder as a process of its own.
+
+On the bus as "recorder", fed from it, never in the way of the tracking.
 
 It waits for the master, goes on when that was started again, answers `report` and `stop`, and ends its file whatever
 ends it.
@@ -117,7 +119,10 @@ def run_recorder(
 
 
 class _Run:
-    """One recording over all its connections. Holds its id, and what was lost on connections that are gone."""
+    """One recording over all its connections.
+
+    Holds its id, and what was lost on connections that are gone.
+    """
 
     def __init__(
         self,
@@ -180,8 +185,10 @@ class _Run:
             self._keep(bus, self._lease)
 
     def health(self) -> Health:
-        """How it is: gauges recorder.seconds, .megabytes, .megabytes_per_s, .free_gb; messages by stream, `dropped`
-        (no room in our queues) and `lost` (shown by the master, never came).
+        """Return the recorder's health.
+
+        Metrics recorder.seconds, .megabytes, .megabytes_per_s, .free_gb; messages by stream, `dropped` (no room in
+        our queues) and `lost` (shown by the master, never came).
         """
         now = self._recorder.progress()
         counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
@@ -227,7 +234,10 @@ class _Run:
             self._notify("the master is gone; waiting for it")
 
     def _look(self, health: Health) -> None:
-        """Say what the player of this file has to know, and keep in the file where a master was started anew."""
+        """Print notices for the later player, and record restarts of the master.
+
+        Prints what the player of this file has to know, and keeps in the file where a master was started again.
+        """
         if health.session != self._master:
             self._recorder.offer("health", health, self._clock.now_ns())
             if self._master is None:

@@ -1,4 +1,6 @@
-"""Has every camera's slave keep its raw frames beside a recording of messages: begun, kept going, ended.
+"""Raw frames kept by every camera's slave beside a recording of messages.
+
+Begun, kept going, and ended here.
 
 A thread for each camera asks again and again: a slave goes on for as long as it is asked, so that a recorder that was
 killed, or lost its master, leaves ended recordings behind. A camera that refuses is told of, and asked no more; the
@@ -35,7 +37,10 @@ class _Camera:
 
 
 class RawAsker:
-    """The raw frames of all cameras of one recording, over all its connections. Holds how each camera is."""
+    """Requester of the raw frames of all cameras of one recording.
+
+    Over all its connections. Holds the state of each camera.
+    """
 
     def __init__(
         self,
@@ -78,14 +83,20 @@ class RawAsker:
             thread.start()
 
     def detach(self) -> None:
-        """Ask no more; what goes on ends by itself, unless another connection asks. Safe to call twice."""
+        """Stop asking.
+
+        Raw recordings that are running end by themselves, unless another connection asks. Safe to call twice.
+        """
         self._closing.set()
         for thread in self._threads:
             thread.join()
         self._threads = []
 
     def end(self, bus: Bus) -> None:
-        """End the recordings of all cameras that are there, at the same time, and say how they are."""
+        """End the raw recordings of all present cameras and print their state.
+
+        All at the same time.
+        """
         self.detach()
         there = [camera for camera in self._cameras if camera.begun and camera.here]
         threads = [threading.Thread(target=self._end, args=(camera, bus), daemon=True) for camera in there]
@@ -122,7 +133,10 @@ class RawAsker:
             self._keep(answer)
 
     def _refused(self, camera: _Camera, bus: Bus, error: BusError) -> None:
-        """Begin anew where the camera was away, and what it had recorded is ended; else that was it."""
+        """Restart a camera's raw recording where it was away, or give up.
+
+        Restarts where the camera was away and its recording has ended; else the refusal is final.
+        """
         if camera.begun and self._was_away(camera, bus):
             camera.begun, camera.number = False, camera.number + 1
             self._ask(camera, bus)
@@ -154,5 +168,8 @@ class RawAsker:
 
 
 def raw_text(stem: str, cameras: Sequence[str]) -> str:
-    """The folders of the cameras as a recording of messages keeps them: a map of camera to name."""
+    """Return the cameras' raw folders as a recording of messages stores them.
+
+    A map of camera to name.
+    """
     return json.dumps({camera: raw_name(stem, camera) for camera in cameras})

@@ -16,7 +16,10 @@ from master.stopping import stop_on_signals
 
 
 def record(options: Namespace) -> None:
-    """Record what a running master takes and tells, in one MCAP file with the rig's calibration."""
+    """Record what a running master receives and publishes.
+
+    In one MCAP file with the rig's calibration.
+    """
     settings = RecordSettings(
         options.file,
         RigFiles(options.calibration, tuple(rigs_of(options)), options.hand),
@@ -45,7 +48,10 @@ def record(options: Namespace) -> None:
 
 
 def _master_bus(endpoint: str, stop: threading.Event) -> Bus | None:
-    """The bus as the master sees it, once one listens there; None when stopped before."""
+    """Return the bus as the master sees it, once one listens there.
+
+    None when stopped before.
+    """
     return bus_of_master(
         endpoint, stop, lambda _error: _recorder_status(f"waiting for a master at {endpoint}")
     )

@@ -1,4 +1,6 @@
-"""Keeps what it is offered: a bounded queue, and one thread that writes it and looks at the disk.
+"""Message recorder with a bounded queue.
+
+One thread writes what is offered and monitors the disk.
 
     threads of the bus ── offer ──▶ bounded queue ──▶ writer ──▶ file
                             └ queue full: dropped, and counted by stream
@@ -51,7 +53,10 @@ class Progress:
 
 
 class MessageRecorder:
-    """Writes what it is offered. Holds the queue, its thread, and the counts, each written by one thread alone."""
+    """Writer of offered messages.
+
+    Holds the queue, its thread, and the counts, each written by one thread alone.
+    """
 
     def __init__(
         self,
@@ -84,7 +89,10 @@ class MessageRecorder:
         self._thread.start()
 
     def offer(self, stream: str, message: Message, t_ns: int) -> None:
-        """Take a message that came at `t_ns`, or count it as dropped; never waits. Any thread may call it."""
+        """Take a message that came at `t_ns`, or count it as dropped.
+
+        Never waits. Any thread may call it.
+        """
         pictures = isinstance(message, Preview | Still) and self._waiting.qsize() >= PICTURES
         if self.failure is None and not self._closing.is_set() and not pictures:
             try:
@@ -124,7 +132,10 @@ class MessageRecorder:
             )
 
     def close(self) -> None:
-        """Write what waits and end the file; `failure` says if that failed. Safe to call twice."""
+        """Write what waits and end the file.
+
+        `failure` states if that failed. Safe to call twice.
+        """
         self._closing.set()
         self._thread.join()
 

@@ -1,4 +1,7 @@
-"""What comes from the bus into a recording: a thread for each stream, and the master's clock as seen from here."""
+"""Bus subscriptions of a recording.
+
+A thread for each stream, and the master's clock as seen from here.
+"""
 
 import threading
 from collections import deque
@@ -19,14 +22,20 @@ _LONG_NS = 1_000_000_000
 
 
 class MasterClock:
-    """How far the master's clock is ahead of this machine's; 0 on the same machine. Holds the best look at it."""
+    """Offset of the master's clock ahead of this machine's.
+
+    0 on the same machine. Holds the best measurement of it.
+    """
 
     def __init__(self) -> None:
         self.ahead_ns = 0
         self._half_trip_ns: int | None = None
 
     def push(self, asked_ns: int, answered_ns: int, remote_ns: int) -> None:
-        """Take one answer: it was told somewhere between the question and its arrival."""
+        """Take one answer.
+
+        It was sent somewhere between the question and its arrival.
+        """
         half_trip_ns = (answered_ns - asked_ns) // 2
         if self._half_trip_ns is None or half_trip_ns < self._half_trip_ns:
             ahead = remote_ns - (asked_ns + answered_ns) // 2
@@ -41,7 +50,10 @@ class MasterClock:
 
 
 class StreamSubscriber:
-    """Subscriptions of one connection, and their threads, which offer all that comes to a recorder."""
+    """Subscriptions of one connection, and their threads.
+
+    The threads offer all that comes to a recorder.
+    """
 
     def __init__(
         self, bus: Bus, streams: Sequence[str], recorder: MessageRecorder, clock: MasterClock
@@ -65,7 +77,10 @@ class StreamSubscriber:
         return {stream: inbox.dropped for stream, inbox in self._inboxes.items() if inbox.dropped}
 
     def close(self, wait_s: float) -> None:
-        """Take what is on its way, but for no longer than `wait_s`: somebody may go on. Safe to call twice."""
+        """Take pending messages, waiting no longer than `wait_s`.
+
+        The limit is there because the sender may go on. Safe to call twice.
+        """
         self._end_ns = now_ns() + round(wait_s * 1e9)
         self._closing.set()
         for thread in self._threads:
@@ -86,7 +101,9 @@ class StreamSubscriber:
                 return
 
     def _taken_ns(self, message: Message, now_ns: int) -> int:
-        """When a message was there: the master shows several at once, and a replay at the speed of then wants to know.
+        """Return the time at which a message was available.
+
+        The master shows several messages at once, and a replay at the original speed needs their own times.
 
         None before the one before.
         """
@@ -98,7 +115,9 @@ class StreamSubscriber:
 
 
 class ProbeLease:
-    """Asks the master to show what it takes, again and again, and tells from its answers what never came.
+    """Repeated request to the master to show what it takes.
+
+    Determines from its answers what never came.
 
     Holds the clock, the session of the master, and by how much we were behind it at the last answers.
     """

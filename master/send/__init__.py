@@ -1,1 +1,4 @@
-"""Live outputs to other people's programs: one process beside the master, fed from the bus, which never slows it."""
+"""Live outputs to other people's programs.
+
+One process beside the master, fed from the bus, which never slows it.
+"""

@@ -11,7 +11,10 @@ from master.stopping import stop_on_signals
 
 
 def send(options: Namespace) -> None:
-    """Send hands, objects, contact and gestures to other programs: OSC, VMC, ROS 2, LSL, WebSocket."""
+    """Send hands, objects, contact and gestures to other programs.
+
+    OSC, VMC, ROS 2, LSL, WebSocket.
+    """
     path = options.calibration / "outputs" / f"{options.outputs}.json"
     settings = settings_of(path)
     names = [] if options.only is None else [name.strip() for name in options.only.split(",") if name.strip()]

@@ -1,4 +1,6 @@
-"""Sockets of a library that listens on every network, and has no setting to do otherwise: kept to this machine.
+"""Confinement of a library's sockets to this machine.
+
+The library listens on every network, and has no setting to do otherwise.
 
 Linux gives a socket that is bound to a device only what comes through that device. The loopback device carries all that
 a machine says to itself, under each of its addresses, and nothing else.
@@ -18,8 +20,11 @@ Socket = tuple[int, str]
 
 
 def sockets() -> frozenset[Socket]:
-    """Descriptors of all sockets of this process, each with its own name in the kernel, as another one may have the
-    number later; none where the system does not tell."""
+    """Return the descriptors of all sockets of this process.
+
+    Each with its own name in the kernel, as another one may have the number later; none where the system does not
+    report them.
+    """
     found: set[Socket] = set()
     if _FOLDER.is_dir():
         for entry in _FOLDER.iterdir():
@@ -30,7 +35,9 @@ def sockets() -> frozenset[Socket]:
 
 
 def keep_here(before: Collection[Socket], ports: range) -> bool:
-    """Bind to the loopback device what listens everywhere at one of the ports, and was not there before.
+    """Bind new sockets that listen everywhere to the loopback device.
+
+    Those at one of the ports that were not there before.
 
     Args:
         before: `sockets` before the library opened its own.

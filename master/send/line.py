@@ -1,4 +1,6 @@
-"""One live output as it runs: its queue and its thread, so that it can be slow, fail or hang by itself.
+"""One live output as it runs.
+
+Its queue and its thread, so that it can be slow, fail or hang by itself.
 
 States: *closed* (not made yet, or it failed; it is made again after a while, for ever) and *open*. What comes while it
 is closed, or while its queue is full, is lost to this output alone, and counted.
@@ -19,7 +21,9 @@ _JOIN_S = 3.0  # an output that hangs is left to the end of the process
 
 
 class Counters:
-    """What one output did since the process began; outlives the output's being switched off.
+    """Counts of one output since the process began.
+
+    They outlive the output's being switched off.
 
     Attributes:
         sent: Messages that it took.
@@ -47,7 +51,10 @@ class OutputLine:
         notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
-        """Begin at once; `make` opens the sink and is called on the line's own thread, again after each failure."""
+        """Start at once.
+
+        `make` opens the sink and is called on the line's own thread, again after each failure.
+        """
         self._name, self._make, self._counters, self._notify = name, make, counters, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._queue: deque[ResultMessage] = deque()
@@ -69,7 +76,10 @@ class OutputLine:
         return len(self._queue)
 
     def offer(self, message: ResultMessage) -> None:
-        """Queue one message; never waits. The oldest makes room, or the message is lost while the output is closed."""
+        """Queue one message without waiting.
+
+        The oldest makes room, or the message is lost while the output is closed.
+        """
         with self._changed:
             if self._sink is None:
                 self._counters.dropped += 1
@@ -112,7 +122,7 @@ class OutputLine:
         self._counters.trouble, self._wait_s = "", FIRST_RETRY_S
 
     def _pause(self) -> None:
-        """Wait until it is worth another try."""
+        """Wait until the next retry."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing, self._wait_s)
         self._wait_s = min(2.0 * self._wait_s, LAST_RETRY_S)
@@ -148,7 +158,10 @@ class OutputLine:
             self._notify(f"{self._name}: closing: {error}")
 
     def _failed(self, error: Exception) -> None:
-        """Count it, and say it once: the same trouble again is not news."""
+        """Count a failure, and report it once.
+
+        The same trouble again is not reported.
+        """
         self._counters.failed += 1
         text = str(error)
         if text != self._counters.trouble:

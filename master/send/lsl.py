@@ -1,4 +1,6 @@
-"""Hands as streams of the Lab Streaming Layer, to be recorded beside EEG, EMG, eye trackers and markers.
+"""Hands as streams of the Lab Streaming Layer.
+
+To be recorded beside EEG, EMG, eye trackers and markers.
 
 One outlet a hand, opened with its first pose; a sample a pose, at the instant at which the pose holds. The clock of LSL
 is this machine's, so a recording aligns hands with whatever other machines measure.
@@ -28,7 +30,10 @@ _COMPARE_NS = 1_000_000_000  # how often LSL's clock is compared with ours
 
 
 def channels() -> tuple[tuple[str, str, str], ...]:
-    """Label, type and unit of every channel: 20 angles, 26 times x y z, whether each joint is observed."""
+    """Return label, type and unit of every channel.
+
+    20 angles, 26 times x y z, whether each joint is observed.
+    """
     angles = [
         (f"{finger}.{angle}", "Angle", "radians")
         for finger in FINGERS

@@ -1,4 +1,6 @@
-"""What Phalanx uses of pylsl: its interface as types, and the one place that imports it.
+"""Parts of pylsl that Phalanx uses.
+
+Its interface as types, and the one place that imports it.
 
 It needs liblsl, a C++ library that its wheels bring for the usual machines only, so it is imported when the output is
 switched on. Names and meanings were read in pylsl 1.18 (info.py, outlet.py, util.py, lib/__init__.py).
@@ -48,7 +50,10 @@ class Info(Protocol):
 
 
 class Outlet(Protocol):
-    """`pylsl.StreamOutlet`: a stream that this process offers, until nothing holds it any more."""
+    """`pylsl.StreamOutlet`: a stream that this process offers.
+
+    It is offered until nothing holds it any more.
+    """
 
     def push_sample(self, x: Sequence[float], timestamp: float) -> None:
         """Offer one sample of all channels; `timestamp` [s] on `local_clock`."""
@@ -72,7 +77,10 @@ class Library(Protocol):
     ) -> Info: ...
 
     def StreamOutlet(self, info: Info, chunk_size: int, max_buffered: int) -> Outlet:
-        """Offer a stream; for a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`."""
+        """Offer a stream.
+
+        For a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`.
+        """
         ...
 
     def local_clock(self) -> float:
@@ -80,12 +88,15 @@ class Library(Protocol):
         ...
 
     def set_config_content(self, content: str) -> None:
-        """Configure liblsl, once, before anything else. Raises `NotImplementedError` before liblsl 1.17.7."""
+        """Configure liblsl, once, before anything else.
+
+        Raises `NotImplementedError` before liblsl 1.17.7.
+        """
         ...
 
 
 def load_library(scope: str, bound_scope: str | None) -> Library:
-    """Import the module and say who is to find its streams.
+    """Import the module and set who can find its streams.
 
     Args:
         scope: "machine" or "network".

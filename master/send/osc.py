@@ -1,4 +1,6 @@
-"""Hands, objects, contact and gestures as Open Sound Control, for sound and light, patches and sketches.
+"""Hands, objects, contact and gestures as Open Sound Control.
+
+For sound and light, patches and sketches.
 
 Each message of the master is one bundle whose time tag is the instant it speaks of, in one datagram (addresses:
 docs/outputs.md). What is not known has no message in its bundle. All is in the rig's frame, in metres and radians.
@@ -22,7 +24,10 @@ _MOST_BLANKS = 256  # kinds of messages that are remembered: names come from the
 
 
 class OscSink:
-    """A `Sink` that sends each message as one OSC bundle. Holds the socket, the blanks, and a count of poses."""
+    """A `Sink` that sends each message as one OSC bundle.
+
+    Holds the socket, the blanks, and a count of poses.
+    """
 
     def __init__(self, settings: OscOutput, times: Times) -> None:
         """Open the socket.
@@ -128,7 +133,10 @@ class OscSink:
 
 
 def hand_blanks(hand: str, side: Side) -> list[Blank]:
-    """The messages of a hand: its number and latency, every joint, the angles of every finger."""
+    """Return the messages of a hand.
+
+    Its number and latency, every joint, the angles of every finger.
+    """
     top = f"/phalanx/hand/{side}"
     return [
         Blank(f"{top}/frame", (hand,), "if"),

@@ -1,4 +1,6 @@
-"""OSC bundles whose numbers are filled in: python-osc writes a message once, after that only its numbers change.
+"""OSC bundles whose numbers are filled in.
+
+python-osc writes a message once, after that only its numbers change.
 
 Encoding some 300 arguments afresh for every pose would cost a millisecond; filling them in costs some microseconds.
 (Open Sound Control 1.0: everything is big-endian and a multiple of four bytes, arguments come last, in their order;
@@ -36,7 +38,10 @@ class Blank:
     numbers: str
 
     def element(self) -> bytes:
-        """The message as an element of a bundle: its size, then itself, with zeros for numbers."""
+        """Return the message as an element of a bundle.
+
+        Its size, then itself, with zeros for numbers.
+        """
         builder = OscMessageBuilder(self.address)
         for text in self.texts:
             builder.add_arg(text, OscMessageBuilder.ARG_TYPE_STRING)
@@ -47,7 +52,10 @@ class Blank:
 
 
 class BlankBundle:
-    """A bundle of messages of which only time and numbers change. Holds it as words of 32 bits, with zeros."""
+    """A bundle of messages of which only time and numbers change.
+
+    Holds it as words of 32 bits, with zeros.
+    """
 
     def __init__(self, blanks: Sequence[Blank]) -> None:
         elements = [np.frombuffer(blank.element(), _BIG) for blank in blanks]

@@ -1,4 +1,6 @@
-"""The live outputs by name: what each takes, where it sends to, and how it is made.
+"""Live outputs by name.
+
+What each takes, where it sends to, and how it is made.
 
 An output is a `Sink`. Its file is imported when it is switched on: what its library is, nobody else needs.
 """
@@ -84,7 +86,9 @@ OUTPUTS: dict[str, Output] = {
 
 
 def who_reads(name: str, settings: OutputSettings) -> str | None:
-    """Who else can read an output that leaves this machine, and what he can do; None where it does not leave it.
+    """State who else can read an output that leaves this machine.
+
+    Also what they can do; None where the output does not leave it.
 
     These protocols have no encryption and no login: that they leave the machine is the choice of who wrote the file.
     """

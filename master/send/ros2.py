@@ -1,4 +1,7 @@
-"""ROS 2 as a live output: hands and objects on standard topics, by rmw_zenoh's own network, without ROS."""
+"""ROS 2 as a live output.
+
+Hands and objects on standard topics, by rmw_zenoh's own network, without ROS.
+"""
 
 from common.errors import BusError
 from common.messages import HandPose, ObjectPose, ResultMessage

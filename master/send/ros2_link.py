@@ -1,4 +1,6 @@
-"""Publishers of ROS 2 on a zenoh session of their own, which joins the router of rmw_zenoh; no ROS is installed.
+"""Publishers of ROS 2 on a zenoh session of their own.
+
+The session joins the router of rmw_zenoh; no ROS is installed.
 
 The other file that knows zenoh: this session belongs to ROS's network, not to the bus.
 """
@@ -18,10 +20,15 @@ _RETRY = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor"
 
 
 class RosPublishers:
-    """A node and its publishers. Holds the session, and of each topic its publisher, token and number of messages."""
+    """A ROS 2 node and its publishers.
+
+    Holds the session, and for each topic its publisher, token and number of messages.
+    """
 
     def __init__(self, router: str, domain: int, namespace: str, name: str) -> None:
-        """Join the router at `router`, for example tcp/127.0.0.1:7447; a router that is not there is tried again.
+        """Join the router at `router`, for example tcp/127.0.0.1:7447.
+
+        A router that is not there is tried again.
 
         Raises:
             BusError: The endpoint is malformed.
@@ -52,7 +59,9 @@ class RosPublishers:
         return len(self._session.info.routers_zid()) > 0
 
     def publish(self, topic: Topic, payload: bytes | memoryview) -> None:
-        """Send one message, CDR with its header of four bytes; the first of a topic declares its publisher.
+        """Send one message, CDR with its header of four bytes.
+
+        The first message of a topic declares its publisher.
 
         Raises:
             BusError: The session is gone.

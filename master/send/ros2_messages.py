@@ -1,4 +1,6 @@
-"""Hands and objects as ROS 2's standard messages, in CDR; types, serialization and hashes of types are rosbags'.
+"""Hands and objects as ROS 2's standard messages, in CDR.
+
+Types, serialization and hashes of types are rosbags'.
 
 Everything stands in the frame `FRAME`: the rig frame, x right, y down, z away from the reference camera, which ROS
 calls an optical frame (REP 103). Metres, radians, quaternions xyzw; stamps are the wall clock's.
@@ -83,7 +85,10 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
 
 
 def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryview]]:
-    """/phalanx/object/NAME/pose, with its covariance, and its frame on /tf; nothing while nobody knows where it is."""
+    """Return the ROS 2 messages of an object.
+
+    /phalanx/object/NAME/pose, with its covariance, and its frame on /tf; nothing while its pose is unknown.
+    """
     if not (np.isfinite(pose.position_m).all() and np.isfinite(pose.orientation_wxyz).all()):
         return []
     name, header = ros_name(pose.object), _header(wall_ns)

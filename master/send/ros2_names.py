@@ -1,4 +1,6 @@
-"""How ROS 2 names things on zenoh: keys of topics, liveliness tokens of nodes and publishers, gids, attachments.
+"""Names that ROS 2 uses on zenoh.
+
+Keys of topics, liveliness tokens of nodes and publishers, gids, attachments.
 
 ROS 2's middleware rmw_zenoh finds publishers by tokens that say everything about them, and reads each topic at a key
 that holds domain, topic, type and the hash of the type's description. Written from its public description
@@ -73,17 +75,26 @@ class Node:
 
 
 def gid_of(token: str) -> bytes:
-    """Id (16 bytes) of the entity with this token: its XXH3 hash of 128 bits, lower half first, little-endian."""
+    """Return the id (16 bytes) of the entity with this token.
+
+    Its XXH3 hash of 128 bits, lower half first, little-endian.
+    """
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
 def attachment(number: int, t_ns: int, gid: bytes) -> bytes:
-    """What goes with a message: its number, when it was sent [ns since 1970], and the publisher's gid."""
+    """Return the attachment of a message.
+
+    Its number, when it was sent [ns since 1970], and the publisher's gid.
+    """
     return struct.pack("<qqB", number, t_ns, GID_BYTES) + gid
 
 
 def ros_name(name: str) -> str:
-    """`name` as a part of a ROS name: letters, digits and underscores, no digit first."""
+    """Return `name` as a valid part of a ROS name.
+
+    Letters, digits and underscores, no digit first.
+    """
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return f"_{plain}" if plain[:1].isdigit() else plain
 

@@ -1,4 +1,6 @@
-"""Feeds the live outputs from the bus: follows their settings file, obeys commands, reports.
+"""Sender that feeds the live outputs from the bus.
+
+Follows their settings file, obeys commands, reports.
 
 On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file says
 otherwise; `report` says how it is; `stop` ends it.
@@ -49,7 +51,10 @@ def settings_of(path: Path) -> OutputSettings:
 
 
 class Sender:
-    """Holds the settings, which outputs are on, a line for each of those, and what each did."""
+    """Set of live outputs.
+
+    Holds the settings, which outputs are on, a line for each of those, and the counts of each.
+    """
 
     def __init__(
         self,
@@ -58,7 +63,9 @@ class Sender:
         notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
-        """Switch on what the settings have on, or, whatever they say, exactly what `only` names.
+        """Switch on what the settings have on, or exactly what `only` names.
+
+        `only` overrides the settings.
 
         Raises:
             PhalanxError: `only` names an output that there is not.
@@ -113,7 +120,9 @@ class Sender:
             self.counters_by_name[name].trouble = ""
 
     def use(self, settings: OutputSettings) -> None:
-        """Other settings from now on: what is on and is set otherwise is made anew; a changed `on` switches.
+        """Apply other settings from now on.
+
+        An output that is on and is set otherwise is recreated; a changed `on` switches.
 
         Outputs that were chosen by name (`only`) stay chosen, whatever the file says.
         """
@@ -138,7 +147,10 @@ class Sender:
                     line.offer(message)
 
     def health(self, lost: int = 0) -> Health:
-        """The report of this moment; `lost`: messages that this process was too slow to take from the bus."""
+        """Return the present health report.
+
+        `lost`: messages that this process was too slow to take from the bus.
+        """
         counts = {"received": self._received, "lost": lost}
         metrics: dict[str, float] = {}
         with self._lock:
@@ -152,7 +164,7 @@ class Sender:
         return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def obey(self, command: Command) -> None:
-        """Do what a command says, but for `stop`.
+        """Obey a command, except `stop`.
 
         Raises:
             PhalanxError: Unknown verb or output, or a body that is none. The text lists what there is.
@@ -178,7 +190,9 @@ class Sender:
 
 
 class Housekeeping:
-    """What goes on beside the sending, on a thread of its own: file, report, echoes of the master's clock.
+    """Background tasks of the sender, on a thread of its own.
+
+    File, report, echoes of the master's clock.
 
     Holds the bus and the file, which belong to the caller.
     """
@@ -190,7 +204,9 @@ class Housekeeping:
         self._clock = SystemClock()
 
     def step(self, notify: Callable[[str], None]) -> None:
-        """Once: use the file if it changed, ask the master for its time, publish the report.
+        """Run one step of the background tasks.
+
+        Use the file if it changed, ask the master for its time, publish the report.
 
         Raises:
             BusError: The bus is closed.
@@ -224,7 +240,9 @@ def run_sender(
     stop: threading.Event,
     notify: Callable[[str], None],
 ) -> None:
-    """Send until `stop` is set or the command `stop` comes. The bus belongs to the caller.
+    """Send until `stop` is set or the command `stop` comes.
+
+    The bus belongs to the caller.
 
     Raises:
         BusError: The bus is closed.
@@ -270,7 +288,10 @@ def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Cal
 
 
 def _drain(subscribers: list[Subscription], sender: Sender) -> None:
-    """Hand on all that has come; wait for a hand, which the others come with, if there is nothing."""
+    """Forward all pending messages.
+
+    If there are none, wait for a hand, since the other messages come with hands.
+    """
     hands, *others = subscribers
     message = hands.get(_POLL_S)
     while message is not None:

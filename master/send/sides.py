@@ -1,4 +1,7 @@
-"""Left or right: what other programs call a hand. A pose tells it by its shape, so no hand file is needed."""
+"""Left or right side of a hand, as other programs name it.
+
+A pose determines it by its shape, so no hand file is needed.
+"""
 
 from math import isfinite
 from typing import Literal

@@ -1,5 +1,6 @@
-"""When something was, on the clocks that other programs go by: the master's time on this machine's clock, and on the
-wall's.
+"""Conversion of times to the clocks that other programs use.
+
+The master's time on this machine's clock, and on the wall's.
 
 Messages of a master are stamped with its monotonic clock. Beside it, on one machine, that is our own; on another
 machine it is offset, which the echoes of its reports tell (`common.clock_offset`). A recording that is played has the
@@ -31,13 +32,18 @@ class Times(Protocol):
         ...
 
     def wall_ns(self, t_ns: int) -> int:
-        """Nanoseconds since 1970 (UTC, by this machine's clock) at the master's time `t_ns`."""
+        """Return nanoseconds since 1970 at the master's time `t_ns`.
+
+        UTC, by this machine's clock.
+        """
         ...
 
 
 class MasterTimes:
-    """Holds how the master's clock runs against ours, as its echoes tell, how the wall clock does, and by how much the
-    times of a recording that is played are shifted.
+    """Estimates of the master's clock and the wall clock against ours.
+
+    Holds how the master's clock runs against ours, as its echoes measure, how the wall clock does, and by how much
+    the times of a recording that is played are shifted.
 
     Echoes come from one thread, times are asked for on any.
     """
@@ -52,12 +58,18 @@ class MasterTimes:
         self._played_ns = 0
 
     def push(self, asked_ns: int, master_ns: int, answered_ns: int) -> None:
-        """Take an echo: our clock when the master was asked and when its answer came, its clock in between [ns]."""
+        """Take an echo of the master's clock.
+
+        Our clock when the master was asked and when its answer came, its clock in between [ns].
+        """
         self._echoes.push(asked_ns, master_ns, master_ns, answered_ns)
 
     @property
     def offset_ns(self) -> int:
-        """The master's clock minus ours [ns]; 0 where no echo speaks against one machine for both."""
+        """Return the master's clock minus ours [ns].
+
+        0 where no echo contradicts that both are one machine.
+        """
         estimate = self._echoes.estimate()
         if estimate is None or abs(estimate.offset_ns) <= estimate.bound_ns:
             return 0

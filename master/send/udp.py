@@ -1,4 +1,7 @@
-"""A UDP socket towards one receiver, who may be there or not: whoever listens hears."""
+"""UDP socket towards one receiver, who may be absent.
+
+Whoever listens receives.
+"""
 
 import socket
 
@@ -9,7 +12,9 @@ class UdpSender:
     """Holds the socket and the address, looked up once. Safe to close twice."""
 
     def __init__(self, host: str, port: int, key: str) -> None:
-        """Open it; `key` is where the settings say the address, for errors.
+        """Open the socket.
+
+        `key` is where the settings state the address, for errors.
 
         Raises:
             PhalanxError: The host is unknown.

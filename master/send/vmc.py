@@ -1,4 +1,6 @@
-"""Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol (OSC over UDP, protocol.vmc.info, 3.1).
+"""Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol.
+
+OSC over UDP, protocol.vmc.info, 3.1.
 
 Two datagrams a pose, each below the size that a network splits: what is available, the time and the root; then the
 bones of the hand. Bones of which nothing is known are left out, so that the avatar keeps them as they are.
@@ -24,7 +26,10 @@ _STILL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class VmcSink:
-    """A `Sink` that sends every pose as bones; other messages are nothing to it. Holds the socket and the blanks."""
+    """A `Sink` that sends every pose as bones.
+
+    It ignores other messages. Holds the socket and the blanks.
+    """
 
     def __init__(self, settings: VmcOutput, times: Times) -> None:
         """Open the socket.
@@ -71,7 +76,10 @@ class VmcSink:
         self._udp.close()
 
     def _rows(self, pose: HandPose, side: Side) -> tuple[Float, Float]:
-        """Positions (16, 3) [m] and rotations xyzw (16, 4), as the settings want the hand's own bone."""
+        """Return positions (16, 3) [m] and rotations xyzw (16, 4).
+
+        The hand's own bone is as the settings state.
+        """
         bones = self._maps[side].bones(pose)
         place, quaternion = bones.position_m, bones.rotation_xyzw
         place[0] = (self._settings.forearm_m if side == "right" else -self._settings.forearm_m, 0.0, 0.0)

@@ -1,4 +1,6 @@
-"""The bones of a VRM avatar's hands from a hand of ours: local rotations and positions, in Unity's axes.
+"""Bones of a VRM avatar's hands from the poses of a hand.
+
+Local rotations and positions, in Unity's axes.
 
 Three frames, and one rest pose:
 
@@ -42,7 +44,10 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _hamilton() -> Float:
-    """Linear map (16, 4) from all products of an element of a with one of b to the quaternion a b, wxyz."""
+    """Return the linear map (16, 4) of quaternion multiplication.
+
+    From all products of an element of a with one of b to the quaternion a b, wxyz.
+    """
     table = np.zeros((4, 4, 4))
     table[0] = np.eye(4)  # 1 times anything
     table[:, 0] = np.eye(4)
@@ -56,13 +61,19 @@ _PRODUCT = _hamilton()
 
 
 def bone_names(side: Side) -> tuple[str, ...]:
-    """Unity's `HumanBodyBones` of one hand (16): the hand, then thumb ... little from the palm outward."""
+    """Return Unity's `HumanBodyBones` of one hand (16).
+
+    The hand, then thumb ... little from the palm outward.
+    """
     top = side.capitalize()
     return (f"{top}Hand", *(f"{top}{finger}{segment}" for finger in _FINGERS for segment in _SEGMENTS))
 
 
 def t_pose(side: Side) -> Float:
-    """Orientations (16, 3, 3) of the joints behind the bones in the T-pose: joint axes -> avatar axes."""
+    """Return T-pose orientations (16, 3, 3) of the joints behind the bones.
+
+    Joint axes -> avatar axes.
+    """
     out = 1.0 if side == "right" else -1.0
     half = np.sqrt(0.5)
     finger = _axes(np.array([out, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
@@ -84,7 +95,9 @@ class Bones:
 
 
 class BoneMap:
-    """Turns poses of one side into bones. Holds the T-pose, and how the rig lies to the avatar, as linear maps.
+    """Map from poses of one side to bones.
+
+    Holds the T-pose, and the rotation from rig to avatar, as linear maps.
 
     Quaternions all along: the maps are products with constant ones, and there is no trigonometry in a pose.
     """
@@ -98,7 +111,10 @@ class BoneMap:
         self._to_bone = np.stack([before @ one for one in after])  # (16, 4, 4): orientation wxyz -> G
 
     def bones(self, pose: HandPose) -> Bones:
-        """All bones; that of the hand is turned as the palm lies in the room, behind an arm in the T-pose."""
+        """Return all bones of a pose.
+
+        The bone of the hand is rotated as the palm is oriented in the room, behind an arm in the T-pose.
+        """
         joint = np.where(pose.valid[_ROWS, None], pose.orientation_wxyz[_ROWS], np.nan)
         bone = (self._to_bone @ joint[..., None])[..., 0]  # G, (16, 4) wxyz
         parent = bone[_PARENT_ROWS] * _CONJUGATE
@@ -113,7 +129,10 @@ class BoneMap:
         return Bones(position, mirrored_xyzw(local))
 
     def flexed(self, R_forearm_palm: Float) -> Float:
-        """Rotation xyzw (4,) of the hand's bone for a wrist bent by `R_forearm_palm` (3, 3), Unity's axes."""
+        """Return the rotation xyzw (4,) of the hand's bone for a flexed wrist.
+
+        Flexed by `R_forearm_palm` (3, 3); Unity's axes.
+        """
         C = self._rest[0] @ _JOINT_PALM  # palm axes of the T-pose -> avatar
         return mirrored_xyzw(matrix_to_quaternion(C @ R_forearm_palm @ C.T))
 

@@ -1,4 +1,6 @@
-"""Hands and objects for web pages: JSON by WebSocket in the joint order of WebXR, and the page that shows them.
+"""Hands and objects for web pages.
+
+JSON by WebSocket in the joint order of WebXR, and the page that shows them.
 
 On this machine it is plain, for whoever is on it. Where other machines reach it, it is encrypted by the certificate of
 this machine's pages and wants to be shown a key (docs/security.md); with --open it is plain there, but wants the key.
@@ -70,7 +72,9 @@ class WebSink:
         self.server = WebServer(settings.host, settings.port, request_filter=request_filter)
 
     def write(self, message: ResultMessage) -> None:
-        """Offer a hand or an object to every client; costs nothing while there is none. Others are left alone.
+        """Offer a hand or an object to every client.
+
+        Costs nothing while there is none. Other messages are ignored.
 
         Raises:
             PhalanxError: The server has ended.

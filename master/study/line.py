@@ -1,4 +1,6 @@
-"""The real line, from a recording to poses: the slave as a process, its detections, the master's own pipeline.
+"""Real processing line of the study, from a recording to poses.
+
+It runs the slave as a process, then feeds its detections to the master's own pipeline.
 
 What the truth says the sensors would see without error can take the place of what they saw: whatever is wrong then
 comes from the model of the hand, its calibration, or from what a laser point and a fingertip cannot tell.
@@ -32,7 +34,9 @@ _GROUPS = slice(1, 6)  # rows of the truth's line: palm, thumb ... little, thena
 
 
 def claim(folder: Path, rig: RigCalibration) -> None:
-    """Let a recording say this of its device, from now on.
+    """Store a rig in a recording's manifest as the description of its device.
+
+    The recording states this rig from then on.
 
     Raises:
         RecordingError: It is none, or cannot be written.
@@ -42,7 +46,9 @@ def claim(folder: Path, rig: RigCalibration) -> None:
 
 
 def detect(folder: Path, camera: str, hand: Path, out: Path) -> None:
-    """Run `phalanx-slave run -o` on a recording of a wrist camera, into the folder `out`.
+    """Run `phalanx-slave run -o` on a recording of a wrist camera.
+
+    The detections go into the folder `out`.
 
     Raises:
         PhalanxError: It ended with an error, which the text repeats.
@@ -66,7 +72,9 @@ def detect(folder: Path, camera: str, hand: Path, out: Path) -> None:
 
 
 def write_exact(folder: Path, camera: str, out: Path) -> None:
-    """Write into the folder `out` what sensors without error would have reported of a recording with truth.
+    """Write error-free detections of a recording with truth into the folder `out`.
+
+    They are what sensors without error would have reported.
 
     The centroid of the lit and seen part of the line on each finger, and the tip where it is seen.
 
@@ -105,7 +113,9 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
 
 
 def solved(folder: Path, hand: HandProfile, detections: Path, solver_mode: SolverMode | None) -> Poses:
-    """Solve detections of a recording as `phalanx replay` does; poses.npz and summary.json go beside them.
+    """Solve the detections of a recording as `phalanx replay` does.
+
+    poses.npz and summary.json are written beside them.
 
     Raises:
         RecordingError: A file is missing or broken, or nothing was seen at all.

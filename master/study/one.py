@@ -1,4 +1,7 @@
-"""One participant from start to end: the guided motion, its calibration, the trials, and what the line made of them."""
+"""One simulated participant from start to end.
+
+The guided motion, its calibration, the trials, and the results of the processing line.
+"""
 
 import shutil
 from dataclasses import dataclass
@@ -152,7 +155,9 @@ def _settings(task: Task) -> dict[str, object]:
 
 
 def _may_go_on(task: Task, folder: Path) -> bool:
-    """Whether all that is needed is there from before: frames, or what was made of them.
+    """Return whether an earlier run left everything needed to resume.
+
+    That is the frames, or what was computed from them.
 
     Exact inputs need no frames, the guided motion does.
     """
@@ -208,7 +213,10 @@ def _knowledge(
 def _calibrated(
     task: Task, who: Participant, guided: Path, there: Path
 ) -> tuple[RigCalibration, HandProfile, Calibrated]:
-    """Rig and hand as our own calibration makes them of this participant's guided motion."""
+    """Calibrate rig and hand from this participant's guided motion.
+
+    The project's own calibration is used.
+    """
     rig, hand, refused = about(task.rig), who.measured, False
     claim(guided, rig)
     save(there / "measured.json", hand)

@@ -1,4 +1,6 @@
-"""Who takes part: a hand with bones of its own, a device that sits a little askew, skin that is darker or brighter.
+"""Simulated participants of the study.
+
+Each has a hand with its own bone lengths, a device that sits slightly misaligned, and darker or brighter skin.
 
 Each is drawn from the study's seed and a number. What is known of somebody before a trial is one of
 
@@ -59,7 +61,9 @@ class Participant:
 
 
 def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandProfile) -> Participant:
-    """Draw participant `number` of a study around a rig file with a palm pose, and the usual hand.
+    """Draw participant `number` of a study.
+
+    The draw varies around a rig file with a palm pose, and the usual hand.
 
     Fingers bend as the Digits paper says (preset D), up to how people stray from it.
     """
@@ -84,7 +88,10 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
 
 
 def about(rig: RigCalibration) -> RigCalibration:
-    """The rig file with what its maker knows: how differently people wear the device (standard deviations)."""
+    """Return the rig file with the spread of device placement between people.
+
+    It is what the maker of the device knows: how differently people wear it, as standard deviations.
+    """
     known = {
         "rotation_sigma_deg": round(float(np.degrees(ROTATION_RAD) / np.sqrt(3.0)), 4),
         "shift_sigma_mm": round(float(1e3 * SHIFT_M / np.sqrt(3.0)), 4),
@@ -94,7 +101,9 @@ def about(rig: RigCalibration) -> RigCalibration:
 
 
 def with_bones(hand: HandProfile, palm: float, bones: Float) -> HandProfile:
-    """The hand with its palm (wrist to knuckles) and radii times `palm`, and phalanges times `bones` (5, 3).
+    """Return the hand with scaled palm and phalanges.
+
+    The palm (wrist to knuckles) and the radii are multiplied by `palm`, the phalanges by `bones` (5, 3).
 
     Of the thumb the first bone is its metacarpal.
     """
@@ -113,7 +122,10 @@ def with_bones(hand: HandProfile, palm: float, bones: Float) -> HandProfile:
 
 
 def rotated(rig: RigCalibration, rotation_rad: Float, shift_m: Float) -> RigCalibration:
-    """The rig with a device that is turned (3,) about the wrist joint and shifted (3,), in the camera's axes."""
+    """Return the rig with its device rotated and shifted about the wrist joint.
+
+    The rotation (3,) about the wrist joint and the shift (3,) are in the camera's axes.
+    """
     pose = np.array(rig.T_camera_palm, dtype=np.float64)
     pose[:3, :3] = rotation_vector_to_matrix(rotation_rad) @ pose[:3, :3]
     pose[:3, 3] += shift_m
@@ -121,14 +133,20 @@ def rotated(rig: RigCalibration, rotation_rad: Float, shift_m: Float) -> RigCali
 
 
 def _measured(hand: HandProfile) -> HandProfile:
-    """The hand with the provenance that `calibrate hand` gives to fingers whose length it measured."""
+    """Return the hand with the provenance of measured finger lengths.
+
+    It is the provenance that `calibrate hand` gives to fingers whose length it measured.
+    """
     sigma = {"finger_sigma_mm": 1e3 * FINGER_SIGMA_M, "bone_sigma_mm": 1e3 * BONE_SIGMA_M}
     how = {name: provenance("calibrate hand", ("study",), sigma) for name in FINGERS[1:]}
     return replace(hand, provenance=hand.provenance | how)
 
 
 def _lengths(hand: HandProfile) -> Float:
-    """Lengths (5, 3) [m] of the three bones of each finger, the thumb's metacarpal among them."""
+    """Return the bone lengths (5, 3) [m], three for each finger.
+
+    The thumb's metacarpal is among them.
+    """
     place = [
         [np.array(hand.rest_joints[JOINTS[j]].position_m) for j in chain[-4:]] for chain in FINGER_JOINTS
     ]
@@ -136,7 +154,10 @@ def _lengths(hand: HandProfile) -> Float:
 
 
 def _bone_errors(rng: np.random.Generator) -> Float:
-    """Errors (5, 3) [m] of measured bones: of each alone BONE_SIGMA_M, of each finger's sum FINGER_SIGMA_M."""
+    """Draw errors (5, 3) [m] of measured bone lengths.
+
+    Each bone alone has the standard deviation BONE_SIGMA_M, the sum of each finger FINGER_SIGMA_M.
+    """
     whole = rng.normal(0.0, FINGER_SIGMA_M, (5, 1)) / 3.0
     # Without their mean, three numbers keep two thirds of their variance.
     alone = rng.normal(0.0, np.sqrt(1.5 * (BONE_SIGMA_M**2 - FINGER_SIGMA_M**2 / 9.0)), (5, 3))

@@ -1,4 +1,7 @@
-"""The study as a picture: errors by finger and pose, cells that are not reached, the paper's figures, ICC."""
+"""Plot of the study results.
+
+Errors by finger and pose, cells that are not reached, the paper's figures, ICC.
+"""
 
 import math
 from pathlib import Path

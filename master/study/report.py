@@ -1,4 +1,7 @@
-"""The study's result for people: tables on the terminal and in study.md, every trial in study.json."""
+"""Readable report of the study's result.
+
+Tables on the terminal and in study.md, every trial in study.json.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -184,12 +187,18 @@ def _icc_lines(again: list[Repeated]) -> list[str]:
 
 
 def _of_cells(one: Repeated) -> str:
-    """How many cells a coefficient is of, marked where they are fewer than half of the poses."""
+    """Format the number of cells that a coefficient is based on.
+
+    It is marked where they are fewer than half of the poses.
+    """
     return f"{one.cells}{' (few)' if 2 * one.cells < len(POSES) else ''}"
 
 
 def _cause_lines(result: Result) -> list[str]:
-    """Mean error by finger under every condition: what knowledge and what sensing cost."""
+    """Tabulate the mean error by finger under every condition.
+
+    The table shows what knowledge and what sensing cost.
+    """
     lines = [
         _CAUSES,
         "",
@@ -209,7 +218,10 @@ def _cause_lines(result: Result) -> list[str]:
 
 
 def _mode_lines(result: Result) -> list[str]:
-    """Mean error of the tracked fingers by what they were solved from, and whether that left a choice."""
+    """Tabulate the mean error of the tracked fingers by solver input.
+
+    That is what they were solved from, and whether the solution was ambiguous.
+    """
     kinds = (("laser alone (fk)", SolverMode.FK, False), ("laser and tip (ik)", SolverMode.IK, False))
     lines = [
         "By level, of the same condition: mean absolute error in degrees (trials).",

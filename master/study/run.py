@@ -1,4 +1,7 @@
-"""All participants of a study, several at a time, or the trials of given recordings; then tables and picture."""
+"""Runner of a whole study, followed by its tables and picture.
+
+It processes all participants, several at a time, or the trials of given recordings.
+"""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -20,7 +23,11 @@ DETECTED = "recorded, detected"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """A simulated study: the task of each participant, how many there are, how many at a time, and what is judged."""
+    """A simulated study: task, participants, parallel jobs and judged condition.
+
+    It holds the task of each participant, how many participants there are, how many run at a time, and which
+    condition is judged.
+    """
 
     task: Task
     participants: int
@@ -85,7 +92,9 @@ def recorded(
     out: Path,
     progress: Callable[[int, int, str], None],
 ) -> Result:
-    """The study of given recordings: each is of one participant, and is detected and solved here.
+    """Detect and solve given recordings, and evaluate them as a study.
+
+    Each recording is of one participant.
 
     Args:
         folders: Recordings of wrist devices, with truth and the poses' names (`trials_of`).

@@ -1,4 +1,6 @@
-"""What a participant does before the camera: every block has the six poses in an order of its own, each made anew.
+"""Simulated session of a participant before the camera.
+
+Every block has the six poses in an order of its own, each pose made anew.
 
 From one pose to the next the fingers go within half a second, then hold for a fifth of one: a trial is what is held.
 Nobody makes a pose twice alike: each trial has its own posture, near the pose, and drifts slowly as hands do
@@ -31,7 +33,10 @@ _STREAM = 62
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """One trial: which pose of which block (1, 2, ...), and when it was held [ns], ends included."""
+    """One trial: its pose, its block and its time interval.
+
+    Blocks are numbered 1, 2, ...; the interval in which the pose was held is in [ns], ends included.
+    """
 
     block: int
     pose: str
@@ -54,7 +59,9 @@ def record_trials(
     step: int,
     trial_s: float = TRIAL_S,
 ) -> None:
-    """Render all trials of a participant as a recording with its truth and trials.csv.
+    """Render all trials of a participant as a recording.
+
+    Its truth and trials.csv are written with it.
 
     Args:
         folder: New or empty.
@@ -88,7 +95,9 @@ def record_trials(
 
 
 def record_guided(folder: Path, who: Participant, camera: CameraCalibration, count: int, step: int) -> None:
-    """Render the guided motion of `calibrate wrist subject` in `count` triples, evenly over it; arguments as above.
+    """Render the guided motion of `calibrate wrist subject`.
+
+    It is rendered in `count` strobe cycles, evenly spread over it; arguments as above.
 
     The motion is slow: within a triple the hand is taken to stand still.
 

@@ -1,4 +1,7 @@
-"""The study's figures: errors by finger and pose, whether a cell is reached, and how repeatable a finger is."""
+"""Statistics of the study.
+
+Errors by finger and pose, whether a cell is reached, and how repeatable a finger is.
+"""
 
 from dataclasses import dataclass
 
@@ -45,7 +48,9 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Repeated:
-    """How alike two trials of a finger are: ICC(1,1), mean over the draws, and how many targets it is of.
+    """Repeatability of a finger as ICC(1,1) between two trials.
+
+    It is the mean over the draws, with the number of targets.
 
     Targets of one or two poses are alike, and what is small in itself makes a low coefficient: `cells` says of how many
     reached cells they are. `truth_icc` is that of the true angles of the same trials: nobody makes a pose twice alike.
@@ -59,13 +64,18 @@ class Repeated:
 
 
 def cells_of(trials: list[Trial]) -> list[Cell]:
-    """Fingers thumb ... little, each in every pose of the study that there are trials of."""
+    """Return the cell of each finger in every pose that has trials.
+
+    The fingers are thumb ... little, the poses those of the study.
+    """
     poses = [pose for pose in POSES if any(one.pose == pose for one in trials)]
     return [_cell(trials, finger, pose) for finger in range(len(FINGERS)) for pose in poses]
 
 
 def repeated(trials: list[Trial], seed: int, draws: int = DRAWS) -> list[Repeated]:
-    """ICC of every finger between two random blocks of each participant; targets are participant x pose.
+    """Compute the ICC of every finger between two random blocks.
+
+    The blocks are drawn for each participant; targets are participant x pose.
 
     A target counts where both of its trials were tracked and its cell is reached.
     """
@@ -97,7 +107,9 @@ def repeated(trials: list[Trial], seed: int, draws: int = DRAWS) -> list[Repeate
 
 
 def icc_1_1(ratings: Float) -> float:
-    """Intraclass correlation ICC(1,1) of ratings (targets, k): one-way random effects, single rating.
+    """Compute the intraclass correlation ICC(1,1) of ratings (targets, k).
+
+    The model is one-way random effects, single rating.
 
     (BMS - WMS) / (BMS + (k - 1) WMS) with the mean squares between and within targets (Shrout & Fleiss, Psychological
     Bulletin 86, 1979, table 3). Blocks are drawn for each person anew, so that no rating is of the same judge
@@ -140,7 +152,10 @@ def _pairs(
     trials: list[Trial],
     rng: np.random.Generator,
 ) -> Float:
-    """Measured and true angles (n, 2, 2) of both trials of each target, for two blocks drawn for each participant."""
+    """Return the angles of both trials of each target.
+
+    Measured and true angles (n, 2, 2); two blocks are drawn for each participant.
+    """
     rows: list[list[tuple[float, float]]] = []
     for who in people:
         blocks: Int = np.unique([one.block for one in trials if one.participant == who])

@@ -1,4 +1,7 @@
-"""Trials of a recording: when each pose was held, and what a solved run says of it against the truth."""
+"""Trials of a recording.
+
+When each pose was held, and how a solved run compares with the truth.
+"""
 
 import csv
 from pathlib import Path
@@ -107,7 +110,9 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
 
 
 def held_in(folder: Path, truth: WristTruth) -> list[Held]:
-    """Which pose is held when, of trials.csv or else of the labels in truth.npz, by name or by letter (`A_...`).
+    """Return which pose is held when.
+
+    It is read from trials.csv or else from the labels in truth.npz, by name or by letter (`A_...`).
 
     Rows of one label that follow one another are one trial; the nth trial of a pose is of block n.
 
@@ -180,7 +185,10 @@ def _pose_of(label: str) -> str | None:
 
 
 def _finger(angle: Float, true: Float, tracked: Bool, solver_mode: Float) -> tuple[float, float, int]:
-    """Median angle, mean truth [deg] and level of one finger in the triples (n,) of a trial."""
+    """Evaluate one finger over the strobe cycles (n,) of a trial.
+
+    Returns its median angle, mean truth [deg] and level.
+    """
     own = tracked if tracked.any() else np.isfinite(angle)
     if not own.any():
         return float("nan"), float(true.mean()), 0
@@ -188,6 +196,9 @@ def _finger(angle: Float, true: Float, tracked: Bool, solver_mode: Float) -> tup
 
 
 def _most(flags: Bool, of: Bool | None = None) -> Flags:
-    """Of each finger whether at least half of (n, 5) are set; `of` (n, 5): of those only."""
+    """Return for each finger whether at least half of its flags (n, 5) are set.
+
+    If `of` (n, 5) is given, only the entries set in it count.
+    """
     total = np.full(5, len(flags)) if of is None else of.sum(axis=0)
     return tuple(((flags.sum(axis=0) * 2 >= total) & (total > 0)).tolist())

@@ -1,4 +1,6 @@
-"""Hands for web browsers: `webxr_json` (poses as JSON), the page that shows them, and how another page embeds the hand.
+"""Hands for web browsers.
+
+`webxr_json` (poses as JSON), the page that shows them, and how another page embeds the hand.
 
 To embed the hand in another page (the console does):
 
@@ -38,7 +40,9 @@ def static_dir() -> Path:
 
 
 def three_js_path() -> Path:
-    """The bundle of three.js that NiceGUI brings: an ES module that exports THREE, OrbitControls, GLTFLoader.
+    """Return the path of the three.js bundle that comes with NiceGUI.
+
+    It is an ES module that exports THREE, OrbitControls, GLTFLoader.
 
     Raises:
         PhalanxError: NiceGUI is not installed, or has moved its bundle.

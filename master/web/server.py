@@ -1,4 +1,6 @@
-"""A small server for browsers: the page and its files by HTTP, what it is offered by WebSocket at /hands.
+"""Small server for browsers.
+
+It serves the page and its files by HTTP, and the offered messages by WebSocket at /hands.
 
 One thread with one event loop, whatever the number of clients. Each client has room for the newest text of each key (a
 hand, an object) and no more: who reads too slowly skips, delays nobody, and costs no memory. Who is gone is forgotten.
@@ -134,7 +136,9 @@ class WebServer:
         return self._skipped + sum(mailbox.skipped for mailbox in list(self._mailboxes.values()))
 
     def offer(self, key: str, text: bytes) -> None:
-        """Send `text` (JSON, UTF-8) to every client; never waits. A newer text of `key` replaces one not yet sent.
+        """Send `text` (JSON, UTF-8) to every client without ever waiting.
+
+        A newer text of `key` replaces one not yet sent.
 
         Raises:
             PhalanxError: The server has ended.
@@ -191,7 +195,10 @@ class WebServer:
             mailbox.put(texts)
 
     async def _client(self, connection: ServerConnection) -> None:
-        """Serve one client until it goes; one of many that came at once, for whom there is no room, goes now."""
+        """Serve one client until it disconnects.
+
+        A client for whom there is no room, since many came at once, is disconnected at once.
+        """
         if len(self._mailboxes) >= self._clients:
             await connection.close(1013, f"{self._clients} clients are connected already")
             return
@@ -247,7 +254,10 @@ class WebServer:
 
 
 async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
-    """Send what comes; `send` waits while the client does not read, and meanwhile the mailbox keeps the newest."""
+    """Send the newest messages of a mailbox to a client.
+
+    `send` waits while the client does not read, and meanwhile the mailbox keeps the newest.
+    """
     try:
         while True:
             for text in await mailbox.take():
@@ -257,7 +267,10 @@ async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
 
 
 def foreign(headers: Headers, own_names: frozenset[str]) -> str | None:
-    """Why a request is not from a page of this server, nor from a program; None where it is."""
+    """Return why a request comes from a foreign web page.
+
+    That is, neither from a page of this server nor from a program; None where it is from one of these.
+    """
     try:
         host, origin = headers.get("Host", ""), headers.get("Origin")
     except MultipleValuesError:

@@ -1,4 +1,6 @@
-"""A hand as JSON in the joint order of WebXR Hand Input: what web pages, game engines and scripts read.
+"""Hand as JSON in the joint order of WebXR Hand Input.
+
+Web pages, game engines and scripts read it.
 
 Two frames are offered. `webxr` (the usual): x right, y up, z towards the viewer, so that the hand is before an eye at
 the origin that looks along -z, as the reference camera does. It is the rig frame (x right, y down, z away) turned by pi
@@ -65,7 +67,10 @@ class JointJson(Struct, frozen=True):
 
 
 class HandJson(Struct, frozen=True, tag_field="type", tag="hand"):
-    """One hand at one instant; the JSON object of `webxr_json`. `joints` are 25 in the order of WebXR."""
+    """One hand at one time: the JSON object of `webxr_json`.
+
+    `joints` are 25 in the order of WebXR.
+    """
 
     version: int
     frame: Frame
@@ -77,7 +82,10 @@ class HandJson(Struct, frozen=True, tag_field="type", tag="hand"):
 
 
 class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
-    """One rigid object at one instant; the JSON object of `object_json`. Fields as in `JointJson` and `ObjectPose`."""
+    """One rigid object at one time: the JSON object of `object_json`.
+
+    Fields as in `JointJson` and `ObjectPose`.
+    """
 
     version: int
     frame: Frame
@@ -91,7 +99,10 @@ class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
 
 
 def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
-    """The pose as JSON (`HandJson`), without line feeds; what is not known is null, never NaN."""
+    """Encode the pose as JSON (`HandJson`), without line feeds.
+
+    What is not known is null, never NaN.
+    """
     points = _points(pose.position_m[1:], frame)
     rotations = _quaternions(pose.orientation_wxyz[1:], frame)
     sigma_mm: Float = np.sqrt(np.einsum("jii->j", pose.cov_m2[1:]) / 3.0) * 1e3
@@ -114,7 +125,10 @@ def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
 
 
 def object_json(pose: ObjectPose, frame: Frame = "webxr") -> bytes:
-    """The pose of an object as JSON (`ObjectJson`); what is not known is null, never NaN."""
+    """Encode the pose of an object as JSON (`ObjectJson`).
+
+    What is not known is null, never NaN.
+    """
     return _ENCODER.encode(
         ObjectJson(
             version=FORMAT_VERSION,
@@ -138,7 +152,10 @@ def _points(position_m: Float, frame: Frame) -> list[Triple | None]:
 
 
 def _quaternions(orientation_wxyz: Float, frame: Frame) -> list[Four | None]:
-    """Quaternions (N, 4), w x y z, to the rig frame, as x y z w to the frame of the message."""
+    """Convert quaternions (N, 4) from the rig frame to the frame of the message.
+
+    They rotate to the rig frame, as w x y z; the result rotates to the frame of the message, as x y z w.
+    """
     order, signs = _QUATERNION_ORDER[frame]
     rotations = orientation_wxyz[:, order] * signs
     rotations = np.where(rotations[:, 3:] < 0.0, -rotations, rotations)

@@ -1,5 +1,7 @@
-"""A simulated camera with faults that come and go, for rehearsals of the checklist: what is wrong is in a JSON file
-that is read again whenever it changes (`phalanx-slave run --camera synthetic --faults FILE`, docs/checklist.md).
+"""Simulated camera with faults that come and go, for checklist rehearsals.
+
+The faults are in a JSON file that is read again whenever it changes (`phalanx-slave run --camera synthetic --faults
+FILE`, docs/checklist.md).
 
 The pictures, settings and times are those of the camera inside; here they are spoiled as a real one spoils them.
 """
@@ -25,7 +27,10 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
 class Patch(Struct, frozen=True, forbid_unknown_fields=True):
-    """A disc of one colour before the camera: its middle and radius [px], its colour in sRGB, blue first."""
+    """A disc of one colour before the camera.
+
+    Its centre and radius are in [px], its colour in sRGB, blue first.
+    """
 
     uv: tuple[float, float]
     radius_px: Annotated[float, Meta(gt=0.0, le=1000.0)]
@@ -77,12 +82,17 @@ class Frozen:
 
 
 class FaultyCamera:
-    """A `FrameSource` and `Tunable` around a simulated one. Holds the faults, and what the camera was told last."""
+    """A `FrameSource` and `Tunable` that adds faults to a simulated camera.
+
+    Holds the faults, and the settings that the camera was last given.
+    """
 
     def __init__(
         self, source: SyntheticCamera, camera: CameraCalibration, path: Path, frozen: Frozen | None = None
     ) -> None:
-        """Have the faults that `path` says; there need be no such file yet.
+        """Load the faults from the file `path`.
+
+        The file need not exist yet.
 
         `frozen` is the same for every opening of one camera.
 
@@ -137,7 +147,10 @@ class FaultyCamera:
         self._camera = camera
 
     def metrics(self) -> dict[str, float]:
-        """Its settings as they are, which is not as they were told where it exposes by itself."""
+        """Return the actual settings of the camera.
+
+        They differ from the commanded ones where it exposes by itself.
+        """
         return self._source.metrics()
 
     def counts(self) -> dict[str, int]:

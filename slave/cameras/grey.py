@@ -22,7 +22,10 @@ from common.frame_recording import Illumination
 
 
 class Pixels(StrEnum):
-    """What a slave wants of its camera: (H, W, 3) BGR; (H, W) of a monochrome sensor; (H, W) luma of colours."""
+    """Pixel format that a slave requests of its camera.
+
+    (H, W, 3) BGR; (H, W) of a monochrome sensor; (H, W) luma of colours.
+    """
 
     COLOUR = "colour"
     GREY = "grey"
@@ -54,7 +57,9 @@ _FULL_RANGE = np.clip(np.round((np.arange(256) - 16.0) * _LIMITED), 0, 255).asty
 
 
 def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: int) -> Image | None:
-    """New grey image (H, W) from the bytes of one frame; None for a frame that is cut.
+    """Make a new grey image (H, W) from the bytes of one frame.
+
+    None for a frame that is truncated.
 
     Args:
         data: (N,) the bytes of the frame.
@@ -113,7 +118,9 @@ def luma(
 
 
 def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
-    """Refuse words (H, W) that hold fewer bits, in their low ends: as bytes they would be nearly black.
+    """Refuse words (H, W) that hold fewer bits in their low ends.
+
+    As bytes they would be nearly black.
 
     The kernel lets a driver call them Y16 and does not say at which end they lie. Values on top end with zeros.
 
@@ -130,7 +137,10 @@ def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
 
 
 def _rows(data: npt.NDArray[np.uint8], height: int, stride: int, used: int) -> Image | None:
-    """The bytes (height, used) of the rows without their padding; None where there are too few."""
+    """Return the bytes (height, used) of the rows without their padding.
+
+    None where there are too few.
+    """
     if stride < used or data.size < stride * (height - 1) + used:
         return None
     return np.lib.stride_tricks.as_strided(data, (height, used), (stride, data.strides[0]), writeable=False)

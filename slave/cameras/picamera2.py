@@ -1,4 +1,6 @@
-"""A Raspberry Pi camera: everything fixed before the start, read back from captured frames, compared.
+"""Raspberry Pi camera.
+
+All settings are fixed before the start, read back from captured frames and compared.
 
 Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
@@ -47,7 +49,10 @@ _LOG = logging.getLogger(__name__)
 
 
 class Picamera2Camera:
-    """A `FrameSource`. Holds the open camera, the timeline of its frames, and metadata and small image of the last."""
+    """A `FrameSource` of a Raspberry Pi camera.
+
+    Holds the open camera, the timeline of its frames, and metadata and small image of the last.
+    """
 
     def __init__(
         self,
@@ -56,7 +61,9 @@ class Picamera2Camera:
         clock: Clock,
         stop: threading.Event | None = None,
     ) -> None:
-        """Open, configure, start, check what the camera really does and wait for synchronisation.
+        """Open, configure and start the camera, check it and wait for synchronisation.
+
+        The check compares what the camera really does.
 
         Args:
             calibration: The camera file: mode, exposure, gains.
@@ -90,7 +97,10 @@ class Picamera2Camera:
 
     @property
     def lores(self) -> Image | None:
-        """Small image of the frame read last: (3 h / 2, w) planar YUV420 (I420), or None where not asked for."""
+        """Return the small image of the frame read last.
+
+        (3 h / 2, w) planar YUV420 (I420), or None where not asked for.
+        """
         return self._lores
 
     def read(self) -> Frame | None:
@@ -151,7 +161,9 @@ class Picamera2Camera:
             raise CameraError(f"{self._where}: could not be closed: {failure[0]}") from failure[0]
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change exposure, gains and rate while another thread reads frames; see `Tunable`.
+        """Change exposure, gains and rate while another thread reads frames.
+
+        See `Tunable`.
 
         Raises:
             CameraError: Out of range, not taken, no frames are read, or another rate where it runs in step with others.
@@ -166,7 +178,10 @@ class Picamera2Camera:
         self._calibration = camera
 
     def metrics(self) -> dict[str, float]:
-        """Settings as the metadata of the last frame has them, and whether it runs in step."""
+        """Return the settings in the metadata of the last frame.
+
+        They include whether the camera runs in step.
+        """
         metadata = self._metadata.newest
         found = {} if metadata is None else read_figures(metadata)
         return found if self._sync is None else found | self._sync.metrics()
@@ -188,7 +203,9 @@ class Picamera2Camera:
         self._settle(camera, self._insist(live))
 
     def _insist(self, live: Mapping[str, Any]) -> Iterator[Mapping[str, object]]:
-        """Write controls, and again some frames later; the metadata of the frames meanwhile.
+        """Write controls repeatedly and yield the metadata of the frames meanwhile.
+
+        They are written again some frames later.
 
         picamera2 loses controls that another thread writes while it recycles a request (`CompletedRequest.release`
         takes the controls, then makes an empty set of them).
@@ -260,7 +277,9 @@ class Picamera2Camera:
         )
 
     def _capture(self, with_image: bool) -> tuple[dict[str, object], Image, Image | None]:
-        """Metadata, image and small image of one request; empty images where not asked for.
+        """Capture one request and return its metadata, image and small image.
+
+        Images are empty where not asked for.
 
         Raises:
             CameraError: No frame came, or the library failed.

@@ -1,4 +1,6 @@
-"""What Phalanx uses of picamera2 and libcamera: their interface as types, and the one place that imports them.
+"""Interface of picamera2 and libcamera as far as Phalanx uses it.
+
+It is given as types; this is the one place that imports them.
 
 Both come with the Raspberry Pi's system, not from the package registry, so they are imported when a camera is
 opened and their absence is an error that says how to install them. The names and meanings below were read in
@@ -21,10 +23,16 @@ INSTALL = (
 
 
 class Request(Protocol):
-    """One captured frame (`CompletedRequest`): its buffers go back to the camera when it is released."""
+    """One captured frame (`CompletedRequest`).
+
+    Its buffers go back to the camera when it is released.
+    """
 
     def make_array(self, name: str) -> npt.NDArray[Any]:
-        """Copy of the stream `name`; the padding of rows is cut off for RGB, not for YUV420."""
+        """Copy the stream `name`.
+
+        The padding of rows is cut off for RGB, not for YUV420.
+        """
         ...
 
     def get_metadata(self) -> Mapping[str, object]:
@@ -55,7 +63,10 @@ class Library(Protocol):
         ...
 
     def create_video_configuration(self, **parts: Any) -> dict[str, Any]:
-        """Make a configuration from `main`, `lores`, `raw`, `sensor`, `controls`, `buffer_count`."""
+        """Make a camera configuration for video.
+
+        It is made from `main`, `lores`, `raw`, `sensor`, `controls`, `buffer_count`.
+        """
         ...
 
     def configure(self, camera_config: dict[str, Any]) -> None:
@@ -63,7 +74,10 @@ class Library(Protocol):
         ...
 
     def camera_configuration(self) -> Mapping[str, Any]:
-        """The configuration as the camera took it, with size, format and stride of each stream."""
+        """Return the configuration as the camera took it.
+
+        It has size, format and stride of each stream.
+        """
         ...
 
     def start(self) -> None:
@@ -71,7 +85,10 @@ class Library(Protocol):
         ...
 
     def set_controls(self, controls: Mapping[str, Any]) -> None:
-        """Change controls of the running camera, from any thread; frames show them some frames later."""
+        """Change controls of the running camera, from any thread.
+
+        Frames show the change some frames later.
+        """
         ...
 
     def capture_request(self, wait: float) -> Request:
@@ -89,7 +106,10 @@ class Library(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Enums:
-    """Values of libcamera's enumerations; None where this version of libcamera lacks them."""
+    """Values of libcamera's enumerations.
+
+    None where this version of libcamera lacks them.
+    """
 
     noise_reduction_off: object
     af_manual: object

@@ -1,4 +1,6 @@
-"""What a camera file means for libcamera: the controls to write, and the values that must be read back.
+"""Mapping of a camera file to libcamera settings.
+
+The controls to write, and the values that must be read back.
 
 Tolerances. libcamera programs exposure and frame duration in whole rows, rounding down, so one row is allowed. It
 programs the analogue gain in codes of the sensor: OV5647 has steps of 1/16, IMX219 has 256 / (256 - code), that is
@@ -153,7 +155,10 @@ def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, An
 def wanted_settings(
     camera: CameraCalibration, available: Mapping[str, object], pixels: Pixels = Pixels.COLOUR
 ) -> tuple[Setting, ...]:
-    """What the metadata of a captured frame must say; tolerances as in the text above."""
+    """Return the values that the metadata of a captured frame must have.
+
+    Tolerances are as in the text above.
+    """
     row_us = camera.row_time_us if camera.row_time_us > 0.0 else GLOBAL_SHUTTER_ROW_US
     exposure = row_us + EXPOSURE_SHARE * camera.exposure_us
     gain = max(1.0 / 16.0, camera.analogue_gain**2 / 256.0)
@@ -173,7 +178,10 @@ def wanted_settings(
 
 
 def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
-    """What the metadata of a frame says of the settings, by the names of `common.camera_settings`, and more."""
+    """Read the settings and more from the metadata of a frame.
+
+    The names are those of `common.camera_settings`.
+    """
     found: dict[str, float] = {}
     for name, metrics in (
         ("ExposureTime", ("exposure_us",)),

@@ -193,7 +193,7 @@ def wait_in_step(
     clock: Clock,
     stopped: Callable[[], bool],
 ) -> None:
-    """Read frames until libcamera says that those of all cameras are in step.
+    """Read frames until libcamera reports that all cameras are in step.
 
     Args:
         capture: The metadata of the next frame.

@@ -1,4 +1,7 @@
-"""Play a recording of raw frames as a camera: in its own time, or as fast as possible."""
+"""Playback of recorded raw frames as a camera.
+
+It runs in the recording's own time, or as fast as possible.
+"""
 
 import time
 from pathlib import Path
@@ -106,7 +109,10 @@ class ReplayCamera:
 
 
 def is_grey(manifest: Manifest, camera: str) -> bool:
-    """Whether a camera of a recording is that of a wrist device, whose frames are grey."""
+    """Return whether a camera of a recording belongs to a wrist device.
+
+    The frames of such a camera are grey.
+    """
     rigs = (manifest.rig, *manifest.rigs)
     return any(rig is not None and rig.kind == "wrist" and camera in rig.cameras for rig in rigs)
 

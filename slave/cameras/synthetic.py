@@ -1,4 +1,6 @@
-"""A camera that looks at the simulated scene, in real time: the first-class stand-in for hardware.
+"""Camera that looks at the simulated scene in real time.
+
+It is the first-class stand-in for hardware.
 
 Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, says
 `epoch + start offset + k periods`, until the rate is changed. It is handed over when a real sensor would have read out
@@ -38,7 +40,10 @@ from slave.sources import Frame
 
 @dataclass(frozen=True, slots=True)
 class _Pace:
-    """When frames are exposed: frame `seq` at `t_ns` [ns], the others at this rate before and after."""
+    """Exposure times of the frames.
+
+    Frame `seq` is exposed at `t_ns` [ns], the others at this rate before and after.
+    """
 
     seq: int
     t_ns: int
@@ -49,7 +54,10 @@ class _Pace:
 
 
 class SyntheticCamera:
-    """A `FrameSource` that renders. Holds its settings, the number of the next frame and how many were skipped."""
+    """A `FrameSource` that renders its frames.
+
+    Holds its settings, the number of the next frame and how many were skipped.
+    """
 
     def __init__(
         self,
@@ -64,7 +72,9 @@ class SyntheticCamera:
         *,
         live: bool = False,
     ) -> None:
-        """Prepare the renderer. The camera may join at any time: `seq` counts from the epoch.
+        """Prepare the renderer.
+
+        The camera may join at any time: `seq` counts from the epoch.
 
         Args:
             scene: What it looks at.
@@ -146,7 +156,10 @@ class SyntheticCamera:
         return figures(self._camera)
 
     def counts(self) -> dict[str, int]:
-        """`camera.skipped`: frames that this process was too slow to draw; they count as dropped, too."""
+        """Return the count `camera.skipped`.
+
+        It counts frames that this process was too slow to draw; they count as dropped, too.
+        """
         return {"camera.skipped": self.skipped}
 
     def _draw(self, seq: int, t_ns: int) -> tuple[Image, Illumination]:
@@ -165,7 +178,10 @@ class SyntheticCamera:
     def _draw_lit(
         self, renderer: WristRenderer, t_s: float, t_ns: int, lights: SimulatedStrobe
     ) -> tuple[Image, Illumination]:
-        """What the lights had on during the exposure; a light that was on for a part of it adds that part."""
+        """Draw the frame with the lights that were on during the exposure.
+
+        A light that was on for a part of it adds that part.
+        """
         half_ns = round(self._camera.exposure_us * 500.0)
         lit = lights.during(t_ns - half_ns, t_ns + half_ns)
         shares = {Illumination.LASER: lit.laser, Illumination.LED: lit.led}
@@ -185,7 +201,9 @@ class SyntheticCamera:
         return round(self._camera.exposure_us * 500.0 + self._rows_ns)
 
     def _due_next(self) -> int:
-        """Number of the next frame: the one after the last, or the first that is not yet read out.
+        """Return the number of the next frame.
+
+        It is the one after the last, or the first that is not yet read out.
 
         A cycle of a strobe that has begun is brought to its end, late or not.
         """
@@ -223,6 +241,9 @@ def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> No
 
 
 def _sensitivity(camera: CameraCalibration) -> Float:
-    """What the settings make of one light, blue, green, red (3,): exposure [us] times the gains of each channel."""
+    """Return the sensitivity to blue, green and red light (3,) under the settings.
+
+    It is the exposure [us] times the gains of each channel.
+    """
     red, blue = camera.colour_gains
     return camera.exposure_us * camera.analogue_gain * np.array([blue, 1.0, red])

@@ -1,4 +1,6 @@
-"""A USB camera, or any other single-planar V4L2 camera: controlled, stamped and counted by the kernel.
+"""USB camera, or any other single-planar V4L2 camera.
+
+It is controlled, stamped and counted by the kernel.
 
 Frames come in four mapped buffers. Each is decoded into an image of its own before its buffer goes back, so nobody
 ever writes to a frame that was handed over. A slave that is late takes the newest frame and leaves the others; one that
@@ -74,7 +76,10 @@ def device_path(place: str) -> Path:
 
 
 class V4l2Camera:
-    """A `FrameSource`. Holds the device, its buffers and the last number; `broken` counts damaged frames."""
+    """A `FrameSource` of a V4L2 camera.
+
+    Holds the device, its buffers and the last number; `broken` counts damaged frames.
+    """
 
     def __init__(
         self,
@@ -83,7 +88,9 @@ class V4l2Camera:
         clock: Clock,
         open_device: Callable[[Path], abi.Device] = abi.KernelDevice,
     ) -> None:
-        """Open, set format, rate and controls, start, and check what the camera really does.
+        """Open and configure the camera, start it and check what it really does.
+
+        Configuring sets format, rate and controls.
 
         Args:
             calibration: The camera file: size, rate, exposure.
@@ -207,7 +214,10 @@ class V4l2Camera:
             ) from error
 
     def metrics(self) -> dict[str, float]:
-        """Settings as the camera has them now, and the rate measured at the start; nothing where it is gone."""
+        """Return the current settings of the camera and its measured rate.
+
+        The rate was measured at the start; the result is empty where the camera is gone.
+        """
         found = {} if self._settings is None else self._settings.metrics()
         return found | {"frame_rate_hz": self._rate_hz} if found else found
 
@@ -257,7 +267,10 @@ class V4l2Camera:
         return name
 
     def _retime(self, camera: CameraCalibration) -> None:
-        """Have frames come at the rate of `camera` while the loop reads them, and see that they do."""
+        """Change the frame rate to that of `camera` and check it.
+
+        The loop goes on reading the frames meanwhile.
+        """
         settings = self._settings
         assert settings is not None  # the constructor opened it
         settings.ask(lambda device: self._set_rate(device, camera))
@@ -341,7 +354,10 @@ class V4l2Camera:
                 return image, done
 
     def _count(self, sequence: int) -> None:
-        """Number of the frame, from the driver's 32-bit number; a driver that does not count adds one."""
+        """Update the frame number from the driver's 32-bit number.
+
+        For a driver that does not count, one is added.
+        """
         step = 1 if self._sequence is None else (sequence - self._sequence) % 2**32
         # A step of half the 32-bit range or more runs backwards
         self._seq += step if 0 < step < 2**31 else 1
@@ -368,7 +384,10 @@ class V4l2Camera:
 
 
 def _steps(old: CameraCalibration, new: CameraCalibration) -> list[CameraCalibration]:
-    """From `old` to `new`: rate and exposure one after the other, so that the exposure always fits into a frame."""
+    """Return the steps of settings from `old` to `new`.
+
+    Rate and exposure change one after the other, so that the exposure always fits into a frame.
+    """
     retimed = structs.replace(old, frame_rate_hz=new.frame_rate_hz)
     exposed = structs.replace(new, frame_rate_hz=old.frame_rate_hz)
     if same_exposed(retimed, new) or same_exposed(exposed, new):
@@ -383,7 +402,10 @@ def _rate_of(times: Sequence[tuple[int, int]]) -> float:
 
 
 def _usb_clock_is_used() -> bool:
-    """Whether uvcvideo reckons its stamps from the cameras' own clocks; it does not unless told to."""
+    """Return whether uvcvideo derives its time stamps from the cameras' own clocks.
+
+    It does so only if configured to.
+    """
     try:
         return int(USB_CLOCK.read_text()) != 0
     except (OSError, ValueError):

@@ -1,4 +1,6 @@
-"""The kernel's V4L2 interface as far as a camera needs it: structures, request numbers, and an open device.
+"""The kernel's V4L2 interface as far as a camera needs it.
+
+Structures, request numbers, and an open device.
 
 Layouts and numbers are those of linux/videodev2.h on 64-bit machines, where x86-64 and aarch64 agree; the tests hold
 them against sizes and numbers that a C compiler gave. Only single-planar memory-mapped capture is here. No library is
@@ -62,7 +64,10 @@ class FormatDescription(c.Structure):
 
 
 class FrameSizes(c.Structure):
-    """struct v4l2_frmsizeenum; `size` is width, height, or min, max, step of width, then of height."""
+    """struct v4l2_frmsizeenum.
+
+    `size` is width, height, or min, max, step of width, then of height.
+    """
 
     _fields_ = [
         *_words("index", "pixel_format", "type"),
@@ -120,7 +125,10 @@ class RequestBuffers(c.Structure):
 
 
 class Buffer(c.Structure):
-    """struct v4l2_buffer; `offset` is the first member of the union m, which is a pointer wide."""
+    """struct v4l2_buffer.
+
+    `offset` is the first member of the union m, which is a pointer wide.
+    """
 
     _fields_ = [
         *_words("index", "type", "bytesused", "flags", "field"),
@@ -266,7 +274,10 @@ class KernelDevice:
 
 
 def fourcc(text: str) -> int:
-    """Number of a pixel format such as "YUYV", or "Y10", whose fourth letter is a space."""
+    """Return the code of a pixel format such as "YUYV" or "Y10".
+
+    The fourth letter of "Y10" is a space.
+    """
     return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 

@@ -1,4 +1,6 @@
-"""Settings of a V4L2 camera by name: every automatic off, every value written, read back, compared.
+"""Settings of a V4L2 camera by name.
+
+Every automatic is switched off, every value written, read back and compared.
 
 Names are those of v4l2-ctl and current kernels ("White Balance, Automatic" is `white_balance_automatic`); standard
 controls are recognised by their number, since kernels have renamed them. Only exposure has a physical unit (100 us).
@@ -171,7 +173,10 @@ def _menu(device: Device, query: QueryControl) -> dict[int, str]:
 
 
 def plain_name(name: str) -> str:
-    """The kernel's name as v4l2-ctl writes it: lower case, everything else one underscore."""
+    """Return the kernel's control name as v4l2-ctl writes it.
+
+    It is in lower case, with everything else as one underscore.
+    """
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
@@ -182,7 +187,9 @@ def plan(
     missing: Iterable[str],
     pixels: Pixels = Pixels.COLOUR,
 ) -> tuple[Setting, ...]:
-    """What to write, in this order, and to find again: automatics off, exposure, then what was given.
+    """Plan which settings to write, in this order, and to read back.
+
+    Automatics off, exposure, then the given settings.
 
     Args:
         camera: The camera file; its exposure is used as it is.
@@ -222,7 +229,10 @@ def plan(
 
 
 def _exposure(camera: CameraCalibration, control: Control) -> Setting:
-    """Exposure in units of 100 us, on the nearest step; half a step off the camera file is allowed."""
+    """Return the exposure setting in units of 100 us, on the nearest step.
+
+    It may differ from the camera file by half a step.
+    """
     wanted = camera.exposure_us / EXPOSURE_UNIT_US
     if not control.low - 0.5 <= wanted <= control.high + 0.5:
         raise CameraError(

@@ -1,4 +1,6 @@
-"""In which format a V4L2 camera delivers: what it offers, which offer is taken, and how its bytes become an image.
+"""Image formats of a V4L2 camera.
+
+What the camera offers, which offer is chosen, and how its bytes become an image.
 
 Uncompressed formats are preferred because JPEG moves colours at the edges of the markers; it is taken where only it
 reaches size and rate, as with most USB 2 cameras above 640x480 at 30 Hz. The size must be offered exactly and the rate
@@ -71,7 +73,10 @@ class Offer:
     continuous: bool = False
 
     def reaches(self, rate_hz: float) -> bool:
-        """Whether this rate [Hz] is offered; a driver that does not say is believed until it is read back."""
+        """Return whether this rate [Hz] is offered.
+
+        A driver that does not list rates is assumed to reach it until it is read back.
+        """
         if not self.rates_hz:
             return True
         slack = RATE_SHARE * rate_hz
@@ -87,7 +92,10 @@ class Offer:
 
 
 def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
-    """Everything the camera offers; of a continuous range of sizes its ends and, if within, the wanted size [px]."""
+    """Read all formats, sizes and rates that the camera offers.
+
+    Of a continuous range of sizes, its ends and, if within, the wanted size [px] are returned.
+    """
     offers: list[Offer] = []
     for description in _enumerate(device, ENUM_FMT, lambda i: FormatDescription(index=i, type=CAPTURE)):
         pixel_format = int(description.pixelformat)
@@ -99,7 +107,9 @@ def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
 def choose_offer(
     offers: Sequence[Offer], size: tuple[int, int], rate_hz: float, pixels: Pixels = Pixels.COLOUR
 ) -> Offer:
-    """The best format for these pixels that has exactly this size [px] and this rate [Hz].
+    """Choose the best format for these pixels with this size and rate.
+
+    It must have exactly this size [px] and this rate [Hz].
 
     Raises:
         CameraError: There is none; the text lists what there is.
@@ -137,7 +147,9 @@ class Layout:
     full_range: bool = False
 
     def image(self, data: memoryview) -> Image | None:
-        """New image, BGR (H, W, 3) or grey (H, W); None for a frame that is cut or broken.
+        """Make a new image, BGR (H, W, 3) or grey (H, W).
+
+        None for a frame that is truncated or broken.
 
         Raises:
             CameraError: Its values do not lie where they should.
@@ -193,7 +205,7 @@ def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image
 
 
 def _enumerate(device: Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
-    """Entries 0, 1, … until the driver says that there is no more."""
+    """Yield the entries 0, 1, … until the driver reports that there is no more."""
     for index in range(256):  # a driver that never ends its enumeration is broken
         item = entry(index)
         try:

@@ -1,4 +1,6 @@
-"""Settings of one open V4L2 camera: written and checked at the start, the exposure changed while frames are read.
+"""Settings of one open V4L2 camera.
+
+They are written and checked at the start; the exposure is changed while frames are read.
 
 A change comes from another thread than the loop's. It writes the control, lets some frames pass and reads everything
 back. Gain and white balance are codes of the camera's maker, given by `--control`: they stay as they are.
@@ -66,7 +68,9 @@ class V4l2Settings:
         return len(self._wanted)
 
     def check(self, settle: Callable[[], None]) -> None:
-        """Compare everything once the stream runs; a camera that fell back to its own values is told once more.
+        """Compare all settings once the stream runs.
+
+        A camera that fell back to its own values gets them once more.
 
         Args:
             settle: Lets some frames pass.

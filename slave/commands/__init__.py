@@ -1,1 +1,4 @@
-"""What `phalanx-slave` can be asked, a file for each command: purpose and examples, its options, what it does."""
+"""Commands of `phalanx-slave`, one file each.
+
+Each file has purpose and examples, its options, and what it does.
+"""

@@ -1,4 +1,7 @@
-"""How the camera of `run` and `record` is opened, with the lights of a wrist device."""
+"""Opening of the camera of `run` and `record`.
+
+The lights of a wrist device are opened with it.
+"""
 
 import argparse
 import threading
@@ -28,7 +31,9 @@ def open_lit(
     stop: threading.Event | None = None,
     connection_lost: ConnectionLost = nobody,
 ) -> FrameSource:
-    """Open the camera, and the lights of a wrist device, which are dark before it is opened.
+    """Open the camera, and the lights of a wrist device.
+
+    The lights are dark before the camera is opened.
 
     Args:
         options: Of `run` or `record`.

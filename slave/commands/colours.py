@@ -1,4 +1,4 @@
-"""`phalanx-slave colours`: the colours of the markers of a camera, from a recording."""
+"""`phalanx-slave colours`: marker colours of a camera from a recording."""
 
 import argparse
 from collections.abc import Generator
@@ -12,7 +12,7 @@ from common.terminal import echo, remark
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find them, write the camera file, and say what collides with what.
+    """Find the colours, write the camera file and print which colours collide.
 
     Raises:
         PhalanxError: The recording or a file is missing or broken, or the colours cannot be told apart.

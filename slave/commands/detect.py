@@ -1,4 +1,7 @@
-"""`phalanx-slave run -o`: what a camera of a recording shows, the same bytes on every run."""
+"""`phalanx-slave run -o`: detections of a recorded camera.
+
+The output has the same bytes on every run.
+"""
 
 import argparse
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""`phalanx-slave record --from`: a recording of videos or pictures that other programs made."""
+"""`phalanx-slave record --from`: recording from videos or pictures.
+
+They were made by other programs.
+"""
 
 import argparse
 from pathlib import Path
@@ -32,7 +35,10 @@ def import_foreign(options: argparse.Namespace) -> int:
 
 
 def camera_path(text: str) -> tuple[str | None, Path]:
-    """A camera, if one is named, and its video or folder; a path with `=` in it is one if it is there."""
+    """Split an argument into an optional camera and its video or folder.
+
+    A path with `=` in it counts as a path if it exists.
+    """
     name, equals, path = text.partition("=")
     if Path(text).exists() or not (name and equals and path):
         return None, Path(text)

@@ -1,4 +1,7 @@
-"""`phalanx-slave run --imu` sends what an IMU measures; `record --imu-csv` takes in a table of one."""
+"""`phalanx-slave run --imu` and `record --imu-csv`.
+
+The first sends what an IMU measures, the second imports a table of IMU samples.
+"""
 
 import argparse
 import os
@@ -20,7 +23,7 @@ USUAL_NAME = "imu"
 
 
 def send_imu(options: argparse.Namespace) -> int:
-    """Send samples until it is told to end.
+    """Send samples until stopped.
 
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.

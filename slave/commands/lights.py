@@ -1,4 +1,7 @@
-"""`phalanx-slave doctor --lights`: what laser and LEDs of a rig may do, and a test of them."""
+"""`phalanx-slave doctor --lights`: limits and test of a rig's lights.
+
+It shows what laser and LEDs may do, and tests them.
+"""
 
 import argparse
 

@@ -66,7 +66,7 @@ def camera_path(options: argparse.Namespace, camera: str) -> Path:
 
 
 def world_of(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, RigCalibration]:
-    """Folder and rig of the files that say how the simulated world is.
+    """Return folder and rig of the files that describe the simulated world.
 
     Raises:
         CalibrationError: As `slave.simulated.world_of`.
@@ -87,7 +87,10 @@ def clock_of(options: argparse.Namespace, true_clock: Clock) -> SkewedClock:
 
 
 def skew_of(options: argparse.Namespace, true_clock: Clock) -> str:
-    """How the slave's clock differs from the machine's, for whoever compares two recordings; empty: not at all."""
+    """Describe how the slave's clock differs from the machine's.
+
+    It is for whoever compares two recordings; empty if there is no difference.
+    """
     skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
     return skewed + (f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else "")
 

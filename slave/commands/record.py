@@ -1,4 +1,7 @@
-"""`phalanx-slave record`: raw frames of a camera to disk, an IMU beside it; or a recording of what is there already."""
+"""`phalanx-slave record`: raw frames of a camera to disk.
+
+An IMU may be recorded beside it; or a recording is made of existing data.
+"""
 
 import argparse
 import os
@@ -32,7 +35,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """What is recorded, and by what clocks: the slave's, and that of the simulated world."""
+    """Recorded scene and its clocks.
+
+    The clocks are the slave's, and that of the simulated world.
+    """
 
     rig: RigCalibration
     camera: CameraCalibration
@@ -62,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def record_camera(options: argparse.Namespace) -> int:
-    """Record until the length is reached, or it is told to end.
+    """Record until the length is reached or until stopped.
 
     Raises:
         PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
@@ -128,7 +134,10 @@ def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
 def _record(
     options: argparse.Namespace, scene: _Scene, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
 ) -> "tuple[Progress, PhalanxError | None]":
-    """Record the camera to its end; how much that is, and what has ended it before its time."""
+    """Record the camera to its end.
+
+    Returns how much was recorded, and the error that ended it early, if any.
+    """
     from slave.progress import Length, ProgressDisplay
     from slave.recorder import Recorder, feed
 

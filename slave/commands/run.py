@@ -1,4 +1,8 @@
-"""`phalanx-slave run`: finds markers, or fingers before a wrist device, and sends where they are; or another sensor."""
+"""`phalanx-slave run`: detect and send in real time.
+
+It detects markers, or fingers before a wrist device, and sends where they are; or it sends the data of another
+sensor.
+"""
 
 import argparse
 import os
@@ -62,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def send_camera(options: argparse.Namespace) -> int:
-    """Detect and send until it is told to end.
+    """Detect and send until stopped.
 
     Raises:
         PhalanxError: A file, the camera, its lights, a key or the network is not as it must be.

@@ -17,7 +17,7 @@ from slave.stopping import stop_by_signal
 
 
 def send_tracker(options: argparse.Namespace) -> int:
-    """Send poses until it is told to end.
+    """Send poses until stopped.
 
     Raises:
         PhalanxError: A file, the tracker, a key or the network is not as it must be.

@@ -1,1 +1,4 @@
-"""`phalanx-slave doctor`: what of a device is well, what is not, and how that is mended. It changes nothing."""
+"""`phalanx-slave doctor`: diagnosis of a device.
+
+It reports what is well, what is not, and how to mend that. It changes nothing.
+"""

@@ -1,4 +1,6 @@
-"""The camera itself: it opens, has every setting of its file with all automatics off, and gives frames.
+"""Checks of the camera itself.
+
+It opens, has every setting of its file with all automatics off, and delivers frames.
 
 One that the running service has cannot be opened a second time. Of a V4L2 camera the automatics are read all the same;
 of another it is said that it was not looked at.
@@ -55,7 +57,10 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
 
 
 def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) -> Finding:
-    """Open it as the slave does: each setting is written and read back; then some frames."""
+    """Open the camera as the slave does and read some frames.
+
+    Each setting is written and read back first.
+    """
     found: list[Finding] = []
 
     def look() -> None:

@@ -1,4 +1,6 @@
-"""The system's clock, for cameras in step and for people who read logs. Phalanx itself measures the clocks of its link.
+"""Checks of the system's clock.
+
+It matters for cameras in step and for people who read logs. Phalanx itself measures the clocks of its link.
 
 `chronyc -c tracking` is a line of 14 fields (chronyc(1)); the offset is seconds that the system is ahead of NTP.
 """

@@ -26,7 +26,9 @@ PARSER_EXIT = 2
 
 
 def run(options: argparse.Namespace) -> int:
-    """Notify what is well, and what is not; or look at the lights, or list ports; the exit code.
+    """Report what is well and what is not, and return the exit code.
+
+    Instead, it may check the lights or list ports.
 
     Raises:
         UsageError: An option of the lights is given without them.
@@ -92,7 +94,10 @@ def _look(
 
 
 def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":
-    """Options of a slave: those of its service, each replaced by what the doctor was told."""
+    """Return the options of a slave.
+
+    They are those of its service, each replaced by the doctor's own option where given.
+    """
     given = [
         word
         for option in ("rig", "camera", "calibration")

@@ -1,4 +1,7 @@
-"""What the service may open: its groups, the devices that its options name, the buffers of libcamera."""
+"""Checks of what the service may open.
+
+Its groups, the devices that its options name, the buffers of libcamera.
+"""
 
 import argparse
 import stat
@@ -19,7 +22,10 @@ RULE = (
 
 
 def check_groups(system: System) -> Finding:
-    """Whether all groups of the unit exist: systemd starts it with none missing, or not at all."""
+    """Check that all groups of the unit exist.
+
+    systemd starts the unit only if none is missing.
+    """
     there = _group_ids(system)
     if missing := [name for name in GROUPS if name not in there]:
         return fail("groups", f"missing: {', '.join(missing)}; the service ends with 216/GROUP", SYSUSERS)

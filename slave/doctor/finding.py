@@ -1,4 +1,7 @@
-"""What the doctor found: one line per check, how bad it is, and what mends it. What was not looked at says so."""
+"""Findings of the doctor.
+
+One line per check, how bad it is, and what mends it. A check that was not made is reported as such.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -61,7 +64,10 @@ def exit_code(findings: Sequence[Finding]) -> int:
 
 
 def as_text(findings: Sequence[Finding]) -> str:
-    """A line per check, the fix below it; what was not looked at comes last, in one block."""
+    """Format one line per check, with the fix below it.
+
+    Checks that were not made come last, in one block.
+    """
     seen = [one for one in findings if one.verdict is not Verdict.UNSEEN]
     width = max((len(one.check) for one in findings), default=0)
     lines: list[str] = []
@@ -78,7 +84,10 @@ def as_text(findings: Sequence[Finding]) -> str:
 
 
 def as_json(findings: Sequence[Finding], program: Program) -> str:
-    """The same for programs: {"host", "version", "ok", "findings": [{"check", "verdict", "text", "fix"}]}."""
+    """Format the findings as JSON for programs.
+
+    {"host", "version", "ok", "findings": [{"check", "verdict", "text", "fix"}]}.
+    """
     report = {
         "host": program.host,
         "version": program.version,

@@ -1,4 +1,7 @@
-"""The machine itself: 64 bit, which system on which board, Python, room, heat, supply."""
+"""Checks of the machine itself.
+
+64 bit, which system on which board, Python, disk space, heat, supply.
+"""
 
 import platform
 import re
@@ -122,7 +125,10 @@ def _throttled(system: System) -> Finding:
 
 
 def _flags(system: System) -> int | None:
-    """Those of the firmware: asked by vcgencmd, which knows all of them on every board; else those of sysfs."""
+    """Read the status flags of the firmware.
+
+    vcgencmd is asked, which knows all of them on every board; else those of sysfs are read.
+    """
     asked = system.run(("vcgencmd", "get_throttled"), 5.0)
     if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
         return int(found[1], 16)

@@ -1,4 +1,7 @@
-"""The keys of a device: all there, of each other, for this name, valid, and nobody else's to read."""
+"""Checks of the keys of a device.
+
+All exist, belong together, are for this name, are valid, and nobody else can read them.
+"""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -21,7 +24,10 @@ _PUBLIC = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicK
 
 
 def folder_of(system: System, given: Path | None) -> Path:
-    """Where the keys are: as told, as the environment says, or where an installer puts them."""
+    """Return the folder of the keys.
+
+    It is the given one, the one that the environment states, or where an installer puts them.
+    """
     if given is not None:
         return given
     named = system.environment.get("PHALANX_KEYS")

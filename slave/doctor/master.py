@@ -1,4 +1,7 @@
-"""Whether the master is heard: does a beacon of this rig arrive within a second, and from where. Nothing is sent."""
+"""Check whether the master is received.
+
+It tests whether a beacon of this rig arrives within a second, and from where. Nothing is sent.
+"""
 
 import os
 import socket

@@ -1,4 +1,7 @@
-"""The libraries of the service, asked of its own Python: what is there for somebody else helps it nothing."""
+"""Checks of the libraries of the service, made by its own Python.
+
+Libraries that are installed for another Python do not help the service.
+"""
 
 import sys
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,7 @@
-"""The computer as the doctor sees it: files below a root, programs that answer. A test lays its own."""
+"""The computer as the doctor sees it.
+
+Files below a root, and programs that answer. A test supplies its own.
+"""
 
 import os
 import subprocess
@@ -12,7 +15,7 @@ from slave.install.program import finished
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """What a program said.
+    """Output of a program.
 
     Attributes:
         code: Its exit code, negative for a signal; None: it is not there, or did not end in time.
@@ -66,7 +69,10 @@ class System:
         return self.root / str(place).lstrip("/")
 
     def text(self, place: str) -> str | None:
-        """Content of a file without its end of line and its NUL (device tree); None: it cannot be read."""
+        """Return the content of a file without its end of line and its NUL.
+
+        The NUL is that of the device tree; None: it cannot be read.
+        """
         try:
             return self.path(place).read_text(errors="replace").strip("\0\n ")
         except OSError:

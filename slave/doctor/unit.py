@@ -1,4 +1,7 @@
-"""The service itself, as systemd tells it: does it run, how often was it restarted, what did it say last."""
+"""Checks of the service itself, as systemd reports it.
+
+Does it run, how often was it restarted, what did it print last.
+"""
 
 from dataclasses import dataclass
 

@@ -1,1 +1,4 @@
-"""Videos and pictures of cameras that are not ours: whose they are, when they were taken, as a recording."""
+"""Import of videos and pictures of foreign cameras as a recording.
+
+It finds which camera they belong to and when they were taken.
+"""

@@ -1,4 +1,6 @@
-"""Make a recording of foreign videos and pictures: calibration, times and rows; pictures are linked, not decoded anew.
+"""Conversion of foreign videos and pictures to a recording.
+
+It makes calibration, times and rows; pictures are linked, not decoded again.
 
 A video or picture gets a second name in the recording's folder (a hard link), which takes no room; where the disks
 differ it is copied. It is read once, to count its frames and what is broken in it.
@@ -50,7 +52,10 @@ class Wish:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Imported:
-    """What one camera took: numbers of its frames, what they are called in the recording, and when they were taken."""
+    """What one camera took.
+
+    Numbers of its frames, their names in the recording, and when they were taken.
+    """
 
     source: Source
     files: Mapping[int, str]
@@ -59,7 +64,9 @@ class _Imported:
 
 
 def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dict[str, int]:
-    """Write the recording; a former import in the same folder is replaced, nothing else is.
+    """Write the recording.
+
+    A former import in the same folder is replaced, nothing else is.
 
     Returns:
         Camera -> number of its frames.
@@ -126,7 +133,9 @@ def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
 def _imported(
     source: Source, camera: CameraCalibration, wish: Wish, notify: Callable[[str], None]
 ) -> _Imported:
-    """Numbers, names and times of the frames of one camera, said in a line.
+    """Return numbers, names and times of the frames of one camera.
+
+    They are reported in one line.
 
     Raises:
         RecordingError: No frame can be decoded, the size is another one, or the times are of no use.
@@ -213,7 +222,10 @@ def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], w
 
 
 def _write(out: Path, manifest: Manifest, imported: Sequence[_Imported]) -> None:
-    """The manifest, the pictures under their names in the recording, and then the rows, by time."""
+    """Write the manifest, the pictures and the rows.
+
+    The pictures have their names in the recording; the rows follow, sorted by time.
+    """
     first = min(int(one.timed.t_ns[0]) for one in imported)  # tables may count from any instant
     rows: list[FrameRow] = []
     for one in imported:

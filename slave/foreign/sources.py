@@ -42,7 +42,9 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def found_in(paths: Sequence[Path]) -> list[Path]:
-    """The videos and folders of pictures that are named, or that are in a folder that is named.
+    """Find videos and folders of pictures.
+
+    They are those that are named, or that are in a folder that is named.
 
     Raises:
         RecordingError: One is neither, or holds both; the text names it.
@@ -72,7 +74,9 @@ def found_in(paths: Sequence[Path]) -> list[Path]:
 
 
 def sources_of(paths: Sequence[Path], rig: RigCalibration, notify: Callable[[str], None]) -> list[Source]:
-    """The camera of each: that of its name, or, where no name is a camera's, in the order of the rig.
+    """Assign a camera to each video or folder of pictures.
+
+    It is the camera of its name, or, where no name is a camera's, the next in the order of the rig.
 
     Raises:
         RecordingError: Some names are cameras and some are not, or there are not as many as cameras.
@@ -106,7 +110,9 @@ def sources_of(paths: Sequence[Path], rig: RigCalibration, notify: Callable[[str
 def rig_for(
     calibration: Path, name: str | None, paths: Sequence[Path], named: Mapping[str, Path]
 ) -> RigCalibration:
-    """The rig called `name`; None: the one marker rig that has these cameras, and no other.
+    """Return the rig called `name`, or the one that fits the cameras.
+
+    `name` None: the one marker rig that has these cameras, and no other.
 
     Raises:
         RecordingError: There is none, or several could be meant.

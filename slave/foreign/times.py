@@ -1,4 +1,7 @@
-"""When foreign frames were taken: a table of times, the video's own, or a constant rate."""
+"""Times at which foreign frames were taken.
+
+They come from a table of times, the video's own times, or a constant rate.
+"""
 
 import csv
 import io

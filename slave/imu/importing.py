@@ -1,4 +1,7 @@
-"""`phalanx-slave record --imu-csv FILE`: somebody else's IMU table becomes an imu.csv, and what is in it is said."""
+"""`phalanx-slave record --imu-csv FILE`: import of a foreign IMU table.
+
+The table becomes an imu.csv, and its content is reported.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +21,9 @@ _NO_QUATERNION = np.full(4, np.nan)
 
 
 def import_table(table: Table, source: str, folder: Path | None, notify: Callable[[str], None]) -> None:
-    """Make the orientation of every sample, say what the recording has, and write imu.csv.
+    """Compute the orientation of every sample and write imu.csv.
+
+    What the recording has is reported.
 
     Args:
         table: The recording.
@@ -76,7 +81,10 @@ def import_table(table: Table, source: str, folder: Path | None, notify: Callabl
 def _send_orientation(
     found: Float, sigma_rad: Float, fusion: OrientationFilter, table: Table, notify: Callable[[str], None]
 ) -> None:
-    """How it lies at the end, how unsure that is, and how right the tilt is where there is a truth."""
+    """Report the final orientation and its uncertainty.
+
+    Where there is a truth, the error of the tilt is reported, too.
+    """
     known = np.isfinite(found).all(axis=1)
     if not known.any():
         notify("orientation: never known: too short, or forces are missing")

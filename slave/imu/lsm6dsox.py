@@ -1,4 +1,6 @@
-"""The ST LSM6DSOX (or LSM6DSO) on an I2C bus, by its FIFO: every sample whole and with its own time stamp.
+"""Driver of the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
+
+It reads the FIFO: every sample is whole and has its own time stamp.
 
 Opened, it is asked who it is, reset, given its settings, and every register is read back and compared. It measures at
 the lowest of its rates that is not below the rig's, 16 g and 2000 deg/s, and puts each measurement with a stamp into
@@ -102,7 +104,10 @@ def buses(where: Path = Path("/dev")) -> list[str]:
 
 
 class Lsm6dsoxImu:
-    """An `ImuSource`. Holds the bus, what came and is not handed over yet, and the number of the last sample."""
+    """An `ImuSource` of the ST LSM6DSOX.
+
+    Holds the bus, the samples that are not handed over yet, and the number of the last sample.
+    """
 
     def __init__(
         self,
@@ -246,7 +251,7 @@ class Lsm6dsoxImu:
 
     @contextmanager
     def _errors(self) -> Generator[None]:
-        """Errors of the bus, in words that say what to do."""
+        """Convert errors of the bus to messages that state what to do."""
         try:
             yield
         except OSError as error:

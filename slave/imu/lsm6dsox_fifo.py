@@ -1,4 +1,6 @@
-"""The numbers of an ST LSM6DSOX: registers, rates, and what its FIFO holds. Pure: bytes in, measurements out.
+"""Registers, rates and FIFO format of an ST LSM6DSOX.
+
+Pure: bytes in, measurements out.
 
 Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO says the same of itself, and what
 is used here is the same in it. A word of the FIFO is a tag and six bytes, little endian:
@@ -65,7 +67,10 @@ _CLIPPED = 32767
 
 
 class Rate(NamedTuple):
-    """An output data rate: its code in CTRL1_XL, CTRL2_G and FIFO_CTRL3, and what it is nominally [Hz]."""
+    """An output data rate.
+
+    Its code in CTRL1_XL, CTRL2_G and FIFO_CTRL3, and its nominal value [Hz].
+    """
 
     code: int
     rate_hz: float
@@ -75,7 +80,10 @@ RATES = [Rate(code, 6667.0 / (1 << (10 - code))) for code in range(1, 7)]  # 13 
 
 
 def settings(rate: Rate) -> dict[Register, int]:
-    """What is written at the start, FIFO still off: 16 g, 2000 deg/s, blocks that do not tear, time stamps."""
+    """Return the register values written at the start, with the FIFO still off.
+
+    16 g, 2000 deg/s, blocks that do not tear, time stamps.
+    """
     return {
         Register.CTRL9_XL: 0xE2,  # I3C off
         Register.CTRL3_C: 0x44,  # block data update; addresses count on
@@ -96,7 +104,10 @@ def temperature_c(data: bytes) -> float:
 
 
 class Measured(NamedTuple):
-    """One time slot: its stamp [25 us nominally] since the start, rate (3,) [rad/s], force (3,) [m/s^2]."""
+    """Measurements of one time slot.
+
+    Its stamp [25 us nominally] since the start, rate (3,) [rad/s], force (3,) [m/s^2].
+    """
 
     ticks: int
     gyro_rad_s: Float
@@ -104,7 +115,9 @@ class Measured(NamedTuple):
 
 
 class Slots:
-    """Push machine. Holds the words of the slot that is not complete, and how often the stamps have wrapped.
+    """Push machine that assembles FIFO words into time slots.
+
+    Holds the words of the slot that is not complete, and how often the stamps have wrapped.
 
     Attributes:
         counts: `broken.parity` of a tag, `broken.incomplete` slots, `clipped` axes, which are NaN.

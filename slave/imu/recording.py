@@ -1,4 +1,7 @@
-"""A real IMU beside the camera that is recorded: its samples go to imu.csv, row by row, on a thread of their own."""
+"""Recorder of a real IMU beside the camera that is recorded.
+
+Its samples go to imu.csv, row by row, on a thread of their own.
+"""
 
 import csv
 import threading
@@ -14,7 +17,7 @@ from slave.sources import ImuSource
 
 
 class ImuRecorder:
-    """Reads an IMU, and writes what it says once there is a recording.
+    """Reader of an IMU that writes its samples once there is a recording.
 
     Holds the thread, the file, and in `failure` what has ended it before its time.
     """
@@ -58,7 +61,10 @@ class ImuRecorder:
         self._kept = True
 
     def close(self) -> dict[str, int]:
-        """End; take away what nobody wanted to keep. What was counted; safe to call twice."""
+        """Stop, delete an unwanted file and return the counts.
+
+        Safe to call twice.
+        """
         self._stop.set()
         self._thread.join()
         self._source.close()

@@ -117,7 +117,10 @@ def ports() -> list[str]:
 
 
 class Ximu3Imu:
-    """An `ImuSource`. Holds the port, what came and is not handed over yet, and the newest of each slow value."""
+    """An `ImuSource` of the x-IMU3.
+
+    Holds the port, the samples that are not handed over yet, and the newest of each slow value.
+    """
 
     def __init__(
         self,
@@ -188,7 +191,7 @@ class Ximu3Imu:
         return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
 
     def metrics(self) -> Mapping[str, float]:
-        """`temperature_c`, `battery_percent`, as they were last told."""
+        """Return the last received `temperature_c` and `battery_percent`."""
         return dict(self._metrics)
 
     def _begin(self) -> None:
@@ -251,7 +254,7 @@ class Ximu3Imu:
                 self._counts[f"broken.{message.name.lower()}"] += 1
 
     def _dated(self, message: Data, arrival_ns: int) -> bool:
-        """Whether a message can have been measured when it says."""
+        """Return whether the time stamp of a message is possible."""
         try:
             possible = self._device_clock.observe(message.t_us * 1000, arrival_ns)
         except ClockSteppedError:
@@ -299,7 +302,7 @@ class Ximu3Imu:
 
     @contextmanager
     def _errors(self, what: str) -> Generator[None]:
-        """Errors of the port, in words that say what to do."""
+        """Convert errors of the port to messages that state what to do."""
         try:
             yield
         except (OSError, termios.error, ValueError, OverflowError) as error:  # the last two: of a baud rate
@@ -312,7 +315,10 @@ NEEDED += ("inertial_message_rate_divisor",)
 
 
 def settings(over: str, inertial_divisor: int) -> Iterator[tuple[str, bool | int]]:
-    """Settings by the names of User Manual v1.11, section "Individual settings"; `over` is usb or serial."""
+    """Yield the settings of the x-IMU3.
+
+    The names are those of User Manual v1.11, section "Individual settings"; `over` is usb or serial.
+    """
     yield "binary_mode_enabled", True
     yield f"{over}_data_messages_enabled", True
     yield "inertial_message_rate_divisor", inertial_divisor

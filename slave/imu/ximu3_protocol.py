@@ -1,4 +1,6 @@
-"""The byte stream of an x-io x-IMU3: bytes in, messages out, no input or output of its own.
+"""Byte stream of an x-io x-IMU3.
+
+Bytes in, messages out, no input or output of its own.
 
 Source: x-IMU3 User Manual v1.11, section "Communication protocol". Every message ends with LF (0x0A), which stands
 nowhere else:
@@ -34,7 +36,10 @@ _TEXT = re.compile(rf"{_STAMP}{_COMMA}([^\n]+)\n")
 
 
 class Kind(Enum):
-    """A kind of data message: its letter, and how many numbers it carries; 0 is a text."""
+    """A kind of data message.
+
+    Its letter, and how many numbers it carries; 0 is a text.
+    """
 
     INERTIAL = ("I", 6)  # gyroscope x y z [deg/s], accelerometer x y z [g]
     MAGNETOMETER = ("M", 3)  # [a.u.]
@@ -80,7 +85,10 @@ class Fault(Enum):
 
 
 class Data(NamedTuple):
-    """A data message: what, when by the device's clock [us], and its numbers, or its text as bytes."""
+    """A data message.
+
+    Its kind, its time by the device's clock [us], and its numbers, or its text as bytes.
+    """
 
     kind: Kind
     t_us: int
@@ -90,7 +98,9 @@ class Data(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the device says to a command: the key in small letters and figures only, as it compares keys itself.
+    """Answer of the device to a command.
+
+    The key has small letters and figures only, as the device compares keys itself.
 
     A refusal is a value of one part, `error`.
     """
@@ -100,7 +110,10 @@ class Answer:
 
     @property
     def fields(self) -> dict[str, object]:
-        """What a value of several parts says; none of a plain one."""
+        """Return the fields of a value of several parts.
+
+        A plain value has none.
+        """
         return cast(dict[str, object], self.value) if isinstance(self.value, dict) else {}
 
 
@@ -112,7 +125,10 @@ class Decoder:
         self._rest = b""
 
     def push(self, data: bytes) -> Iterator[Data | Answer | Fault | None]:
-        """Messages that end in `data`, in order, and a `Fault` for each that is none; None: of another channel."""
+        """Yield the messages that end in `data`, in order.
+
+        A `Fault` stands for each that is no message; None: of another channel.
+        """
         pieces = (self._rest + data).split(END)
         self._rest = pieces.pop()
         for piece in pieces:

@@ -7,7 +7,10 @@ from slave.install.probe import OLDEST, judge, probe
 
 
 def print_line(line: str) -> None:
-    """One line, at once: the PC shows it while the next step runs. The PC may be gone; the installation goes on."""
+    """Print one line at once.
+
+    The PC shows it while the next step runs. The PC may be gone; the installation goes on.
+    """
     try:
         print(line, flush=True)
     except BrokenPipeError:
@@ -15,7 +18,10 @@ def print_line(line: str) -> None:
 
 
 def refuse(action: str) -> int:
-    """Say what an old Python needs to be told, in its own words: the installer itself it cannot read."""
+    """Report that this Python is too old.
+
+    It runs under the old Python, which cannot read the installer itself.
+    """
     facts = probe()
     why = judge(facts)
     print_line(

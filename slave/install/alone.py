@@ -1,4 +1,6 @@
-"""One installation at a time on a machine: one whose PC went away goes on to its end, and the next waits for it.
+"""Lock that allows one installation at a time on a machine.
+
+An installation whose PC went away goes on to its end, and the next waits for it.
 
 The lock is on a folder that is always there, so no file of it comes and goes, and it ends with whoever has it. That one
 has an end, too: each command that an installer runs has a time limit.

@@ -1,4 +1,7 @@
-"""The command line of `phalanx-slave install` as text: all of the installer that a slave which only runs loads."""
+"""The command line of `phalanx-slave install` as text.
+
+It is all of the installer that a slave which only runs loads.
+"""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Our lines in a Raspberry Pi's config.txt: a marked block, only of what the file does not say already."""
+"""Phalanx's lines in a Raspberry Pi's config.txt.
+
+They are a marked block that has only what the file does not state already.
+"""
 
 from collections.abc import Sequence
 
@@ -7,7 +10,10 @@ _ALL = "[all]"  # lines before may be for one model only
 
 
 def with_block(text: str, lines: Sequence[str]) -> str:
-    """`text` with a block of those `lines` that it does not say itself; without a block if it says all of them."""
+    """Return `text` with a block of those `lines` that it lacks.
+
+    Without a block if it has all of them.
+    """
     plain = without_block(text)
     own = _shown_to_all(plain)
     missing = [line for line in lines if line not in own]
@@ -33,7 +39,10 @@ def without_block(text: str) -> str:
 
 
 def _shown_to_all(text: str) -> set[str]:
-    """Lines that hold on every model; of a setting that is said twice, the last one."""
+    """Return the lines that hold on every model.
+
+    Of a setting that is stated twice, the last one counts.
+    """
     stated: dict[str, str] = {}
     everyone = True
     for line in (line.strip() for line in text.splitlines()):

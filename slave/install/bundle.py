@@ -1,4 +1,7 @@
-"""Where keys and calibration come from: folders of this machine, or the archive that the PC sent with the installer."""
+"""Sources of keys and calibration.
+
+Folders of this machine, or the archive that the PC sent with the installer.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`phalanx-slave install`, and what the PC runs on a machine by ssh: the same installer, its options and its words."""
+"""`phalanx-slave install`, and what the PC runs on a machine by ssh.
+
+Both use the same installer, its options and its messages.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,9 @@ def run_here(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = None) -> int:
-    """Install, take back, or remove; the exit code: 0 done, 1 something the user can mend.
+    """Install, roll back, or remove, and return the exit code.
+
+    0 done, 1 something the user can mend.
 
     Args:
         options: Of `add_install`.
@@ -89,7 +94,10 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
 
 
 def _clear(stage: Path) -> None:
-    """Remove what the PC sent for this installation, and what others left that were cut off long ago."""
+    """Remove the files that the PC sent for this installation.
+
+    What other installations left that were cut off long ago is removed, too.
+    """
     for one in stage.parent.glob("*"):
         if one == stage or time.time() - one.stat().st_mtime > _LEFT_S:
             shutil.rmtree(one, ignore_errors=True)
@@ -134,7 +142,10 @@ def missing_packages(there: list[str], picamera2: bool) -> list[str]:
 
 
 def _start_s(systemd: Systemd) -> float | None:
-    """How long the slowest slave of this machine took to start [s]; None: none runs, or nobody can tell."""
+    """Return how long the slowest slave of this machine took to start [s].
+
+    None: none runs, or it is not known.
+    """
     units = [f"phalanx-slave@{path.stem}.service" for path in (Path("/") / ETC).glob("*.env")]
     try:
         took = [systemd.state(unit).start_s for unit in units]
@@ -149,7 +160,9 @@ def _end(options: argparse.Namespace, notify: Notify, result: dict[str, object],
 
 
 def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -> int:
-    """`python3 -m slave.install ACTION ...`: what the PC runs before a slave is installed.
+    """Run `python3 -m slave.install ACTION ...`.
+
+    The PC runs this before a slave is installed.
 
     `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` says what the machine is like; `packages NAME...`
     calls apt.

@@ -2,7 +2,10 @@
 
 
 class InstallError(Exception):
-    """It cannot be installed; the text is one line that says why, and what to do. The machine is as it was before."""
+    """The installation is not possible.
+
+    The text is one line that states why, and what to do. The machine is as it was before.
+    """
 
 
 class NotReadyError(InstallError):

@@ -1,4 +1,7 @@
-"""Options of the installer, and the plan that they make: which slaves of a rig this machine runs, and how."""
+"""Options of the installer, and the plan that they make.
+
+The plan is which slaves of a rig this machine runs, and how.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,10 @@ class Plan:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What a machine is to run; the same here and for `phalanx fleet deploy`, which hands it on."""
+    """Add the options that state what a machine is to run.
+
+    They are the same here and for `phalanx fleet deploy`, which hands them on.
+    """
     parser.add_argument(
         "--master", metavar="HOST", help="host name or address of the PC, whose clock is followed"
     )
@@ -277,7 +283,7 @@ def _boot(options: argparse.Namespace, drivers: Sequence[str]) -> tuple[str, ...
 
 
 def _of(name: str, texts: Sequence[str], names: Sequence[str]) -> str | None:
-    """The last that is said of `name`, or of all."""
+    """Return the last value given for `name`, or for all."""
     return (_all_of(name, texts, names) or [None])[-1]
 
 

@@ -1,4 +1,6 @@
-"""What the machine is like, before anything is installed on it: facts for `judge`. Writes nothing.
+"""Facts about the machine before anything is installed on it.
+
+They are for `judge`. Writes nothing.
 
 An old Python runs this too, so that it is told and not a syntax error.
 """
@@ -122,7 +124,10 @@ def _has_package(name: str) -> bool:
 
 
 def _cameras() -> list[str] | None:
-    """What libcamera finds; None where picamera2 is not installed, so that nobody knows."""
+    """List the cameras that libcamera finds.
+
+    None where picamera2 is not installed, so that it is not known.
+    """
     stated = _output_of(["/usr/bin/python3", "-c", _FIND_CAMERAS])
     for line in (stated or "").splitlines():
         if line.startswith("CAMERAS "):
@@ -131,7 +136,10 @@ def _cameras() -> list[str] | None:
 
 
 def _output_of(command: list[str]) -> str | None:
-    """What a command says; None: it is not there, failed, or takes too long."""
+    """Return the output of a command.
+
+    None: it does not exist, failed, or takes too long.
+    """
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_QUICK_S, check=False

@@ -1,11 +1,14 @@
-"""Other programs, run to their end: how installer and doctor ask the system. Standard library only."""
+"""Other programs, run to their end.
+
+Installer and doctor query the system by them. Standard library only.
+"""
 
 import subprocess
 from collections.abc import Sequence
 
 
 def finished(command: Sequence[str], timeout_s: float) -> "subprocess.CompletedProcess[str]":
-    """A program that is asked for nothing, with what it said, when it has ended.
+    """Run a program without input to its end and return it with its output.
 
     Raises:
         OSError: It cannot be run; `FileNotFoundError`: it is not there.

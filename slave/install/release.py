@@ -1,4 +1,6 @@
-"""Releases below /opt/phalanx: each a virtual environment, made under another name and renamed when it is whole.
+"""Releases below /opt/phalanx.
+
+Each is a virtual environment, made under another name and renamed when it is whole.
 
 It sees the system's packages (picamera2 and libcamera come by apt); what it has itself goes before them. That comes
 from a folder of wheels, without a network, or from the environment that the installer runs in.
@@ -62,7 +64,10 @@ class Source:
         return Source(None, Path(sysconfig.get_path("purelib")))
 
     def _release(self) -> str | None:
-        """The release that the installer runs from, if it does: then only options, keys or files change."""
+        """Return the release that the installer runs from, if it does.
+
+        Then only options, keys or files change.
+        """
         assert self.site is not None
         parts = self.site.resolve().parts
         return parts[4] if parts[:4] == ("/", *RELEASES.split("/")) and len(parts) > 4 else None
@@ -129,7 +134,10 @@ def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -
 
 
 def prune(root: Path, current: str, before: str | None) -> list[str]:
-    """Remove all but the current release and the one before it, else the newest of the others; their names."""
+    """Remove all but two releases and return the names of the removed.
+
+    The current release stays, and the one before it, else the newest of the others.
+    """
     folders = sorted((root / RELEASES).glob("[!.]*"), key=lambda path: path.stat().st_mtime)
     others = [path.name for path in folders if path.name != current]
     kept = before if before in others else others[-1] if others else None
@@ -140,7 +148,10 @@ def prune(root: Path, current: str, before: str | None) -> list[str]:
 
 
 def remove(root: Path, name: str) -> None:
-    """Remove a release. Its name goes first: half of one must never be taken for a whole one."""
+    """Remove a release.
+
+    Its name goes first: half of one must never be taken for a whole one.
+    """
     left = root / RELEASES / f".new-{name}"
     shutil.rmtree(left, ignore_errors=True)
     with contextlib.suppress(FileNotFoundError):
@@ -212,7 +223,10 @@ _QUIET = (
 
 
 def _copy_site(fresh: Path, site: Path) -> None:
-    """Copy what is installed beside us, and our packages if they are elsewhere (an editable installation)."""
+    """Copy the packages that are installed beside the installer.
+
+    Phalanx's own packages are copied, too, if they are elsewhere (an editable installation).
+    """
     there = next((fresh / "lib").glob("python3*/site-packages"))
     shutil.copytree(site, there, dirs_exist_ok=True, symlinks=True, ignore=shutil.ignore_patterns("*.pth"))
     own = _own_packages(site)
@@ -230,7 +244,7 @@ def _own_packages(site: Path) -> Path:
 
 
 def _settle(fresh: Path, final: Path, root: Path) -> None:
-    """Let its scripts name the place that it is going to have, and see that the slave starts there."""
+    """Set the final path in a release's scripts and check that the slave starts."""
     old, new = str(fresh).encode(), str(Path("/") / final.relative_to(root)).encode()
     if not (fresh / "bin/phalanx-slave").is_file():
         raise InstallError(f"release {final.name}: has no phalanx-slave; is its wheel whole?")

@@ -1,4 +1,7 @@
-"""Take everything of ours away: services, releases, keys, calibration, groups, lines of config.txt. apt's stays."""
+"""Removal of everything that belongs to Phalanx.
+
+Services, releases, keys, calibration, groups, lines of config.txt. apt's packages stay.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +78,7 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
 
 
 def packages(names: list[str], machine: Machine) -> None:
-    """Install packages of the system by apt, and say which.
+    """Install packages of the system by apt, and report which.
 
     Raises:
         InstallError: apt failed; without a network `--no-apt` leaves it out.

@@ -1,4 +1,7 @@
-"""The installation, step by step: release, files, switch, restart, wait; taken back if it does not run then."""
+"""The installation, step by step.
+
+Release, files, switch, restart, wait; it is rolled back if the service does not run then.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,9 @@ class Machine:
     settle_s: float
 
     def limit_s(self, unit: str) -> float:
-        """How long the next start of a slave may take that runs now with the same options [s].
+        """Return the time limit [s] for the next start of a slave.
+
+        It is for a slave that runs now with the same options.
 
         While it is waited for, its camera sees nothing: so it is judged by its own last start on this machine.
         """
@@ -133,7 +138,9 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
 
 
 def roll_back(machine: Machine, dry_run: bool = False) -> str:
-    """Go back to what was before the last installation; one line of what is there then, or would be.
+    """Roll back to the state before the last installation.
+
+    Returns one line that states what is there then, or would be.
 
     Raises:
         InstallError: There was none before, or what was before does not run.
@@ -215,7 +222,9 @@ def _finish(machine: Machine, name: str, before: str | None) -> None:
 
 
 def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> None:
-    """Take back; what then fails is said, for the first cause matters more.
+    """Undo an installation.
+
+    What then fails is only reported, for the first cause matters more.
 
     Args:
         machine: Where.

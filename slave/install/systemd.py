@@ -1,4 +1,7 @@
-"""systemd, as an installer needs it: restart a slave, wait until it is ready and stays so, read its last words."""
+"""systemd, as an installer needs it.
+
+It restarts a slave, waits until it is ready and stays so, and reads its last log lines.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ Run = Callable[[Sequence[str]], str]
 
 
 def run_command(command: Sequence[str], deadline_s: float = _COMMAND_S) -> str:
-    """What it says.
+    """Run a command and return its output.
 
     Raises:
         InstallError: It failed, or takes too long; its last line is the reason.
@@ -70,7 +73,10 @@ def run_command(command: Sequence[str], deadline_s: float = _COMMAND_S) -> str:
 
 
 class Systemd:
-    """The system's services. Holds how commands are run and time is told, which tests replace."""
+    """The system's services.
+
+    Holds how commands are run and how time is measured, which tests replace.
+    """
 
     def __init__(
         self,
@@ -107,7 +113,9 @@ class Systemd:
         )
 
     def wait_ready(self, limits: Mapping[str, float], settle_s: float) -> None:
-        """Wait until all of them said READY=1, and none has restarted since for `settle_s`.
+        """Wait until all units have sent READY=1 and none restarts.
+
+        None may have restarted since for `settle_s`.
 
         Args:
             limits: Service -> how long it may take [s]; one whose status asks for more time while it starts has that.
@@ -150,7 +158,10 @@ class Systemd:
             self.sleep(_STEP_S)
 
     def _why(self, unit: str, state: UnitState, since: float, pid: int = 0) -> str:
-        """Its last words since then [s since 1970], of process `pid` if one is given, or how systemd ended it."""
+        """Return the last log lines of a unit since a time, or how systemd ended it.
+
+        The time is in [s since 1970]; the lines are those of process `pid` if one is given.
+        """
         if state.status in _STATUS:
             return f"status {_STATUS[state.status]}"
         words = ["journalctl", f"_SYSTEMD_UNIT={unit}", f"--since=@{since:.0f}"]

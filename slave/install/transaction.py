@@ -1,4 +1,6 @@
-"""Changes of files that can be taken back: what stood there before is kept until the next installation.
+"""Changes of files that can be rolled back.
+
+The former content is kept until the next installation.
 
 The notes are a folder below /opt/phalanx. While its manifest is open, a change is under way: whoever finds it so (the
 power went) takes it back first.
@@ -152,7 +154,9 @@ def read(root: Path, path: str) -> File | None:
 
 
 def write(root: Path, path: str, file: File) -> None:
-    """Write a file whole or not at all; it belongs to whom its folder belongs, so that a slave may save its own again.
+    """Write a file whole or not at all.
+
+    It belongs to the owner of its folder, so that a slave may save its own again.
 
     Raises:
         InstallError: A folder of the slave's is a link: whoever made it would have root write elsewhere.
@@ -190,7 +194,9 @@ def remove(root: Path, path: str) -> None:
 
 @contextlib.contextmanager
 def _folder(root: Path, path: str, *, make: bool) -> Generator[int]:
-    """A descriptor of the folder of a file; what is missing is made, if it is to be, as it should be.
+    """Open a descriptor of the folder of a file.
+
+    Missing folders are made with the right properties if `make` is set.
 
     Raises:
         InstallError: A folder of the slave's is a link.
@@ -212,7 +218,10 @@ def _folder(root: Path, path: str, *, make: bool) -> Generator[int]:
 
 
 def _inner(name: str, folder: int, path: str, make: bool) -> int:
-    """A descriptor of the folder `name` in `folder`; `path` says where that is."""
+    """Open a descriptor of the folder `name` in `folder`.
+
+    `path` states where that is.
+    """
     own, fresh = _is_slaves(path), False
     if make:
         with contextlib.suppress(FileExistsError):

@@ -1,4 +1,7 @@
-"""Which files a plan puts where, with which content. Keys and calibration are looked at before anything is written."""
+"""Files that a plan installs, with their places and content.
+
+Keys and calibration are checked before anything is written.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +103,9 @@ def own_groups() -> list[str]:
 
 
 def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
-    """Refuse what is no rig key, no secret, no certificate, or a key of another certificate.
+    """Refuse invalid keys.
+
+    That is what is no rig key, no secret, no certificate, or a key of another certificate.
 
     Raises:
         InstallError: Names the file.
@@ -162,7 +167,10 @@ def _gone(plan: Plan, root: Path) -> dict[str, File | None]:
 
 
 def _calibration(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
-    """The PC's files where they are new or changed since the last installation; else what the slave saved stays."""
+    """Return the PC's calibration files that are new or changed.
+
+    They are compared with the last installation; else what the slave saved stays.
+    """
     files: dict[str, File | None] = {}
     for path, content in plan.calibration.items():
         there = (root / CALIB / path).exists()

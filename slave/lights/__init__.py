@@ -1,1 +1,4 @@
-"""Laser and LEDs of a wrist device: who switches them, when, and within which limits."""
+"""Laser and LEDs of a wrist device.
+
+Who switches them, when, and within which limits.
+"""

@@ -1,4 +1,6 @@
-"""Laser and LEDs behind two GPIO lines, by libgpiod 2 (Linux's character device); the only file that knows it.
+"""Laser and LEDs behind two GPIO lines.
+
+They are driven by libgpiod 2 (Linux's character device); this is the only file that uses it.
 
 `gpio:CHIP:LASER,LED`: the chip as a path, a name or a number, the lines as numbers of the chip or by name; `/low`
 after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a change
@@ -59,7 +61,10 @@ class Line:
 
 
 class GpioLights:
-    """`Lights` behind two lines. Holds the request of the lines and its heir; None while the chip is away."""
+    """`Lights` behind two GPIO lines.
+
+    Holds the request of the lines and its heir; None while the chip is away.
+    """
 
     def __init__(self, place: str, longest_s: float) -> None:
         """Request the lines, dark.

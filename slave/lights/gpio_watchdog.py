@@ -1,4 +1,6 @@
-"""Darkens two GPIO lines when the slave that lit them cannot: a process of its own, started beside it.
+"""Watchdog that darkens two GPIO lines when the slave that lit them cannot.
+
+It is a process of its own, started beside the slave.
 
     python gpio_watchdog.py FD LONGEST_S        standard input: a pipe; the slave writes `1` before a light goes on
                                             and `0` after it went off
@@ -23,7 +25,10 @@ INACTIVE = 0
 
 
 def main() -> int:
-    """Watch until standard input ends; 0: the lines are dark, 1: they are not there any more."""
+    """Watch until standard input ends, and return the exit code.
+
+    0: the lines are dark, 1: they do not exist any more.
+    """
     for number in (signal.SIGABRT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     lines, longest_s = int(sys.argv[1]), float(sys.argv[2])

@@ -1,4 +1,6 @@
-"""Laser and LEDs behind one LM3644 flash driver on I2C: LED1 drives the laser, LED2 the LEDs.
+"""Laser and LEDs behind one LM3644 flash driver on I2C.
+
+LED1 drives the laser, LED2 the LEDs.
 
 Texas Instruments, LM3644, SNVSA52E (September 2016); sections of that data sheet below. Its flash mode is begun by
 one write and ended by another, or by the chip itself: after the time-out, 10 ms at the least, it clears the mode bits
@@ -46,7 +48,10 @@ FAULTS2 = ("led_hot", "overvoltage", "input_low", "ntc_open", "ntc_short")
 
 
 class FlashDriverLights:
-    """`Lights` behind the chip. Holds the open bus, and whether the chip is known to be set up; counts its faults."""
+    """`Lights` behind the flash driver chip.
+
+    Holds the open bus, and whether the chip is known to be set up; counts its faults.
+    """
 
     def __init__(self, place: str, strobe: StrobeCalibration) -> None:
         """Open the bus, and set the chip up, dark.
@@ -111,7 +116,10 @@ class FlashDriverLights:
             self._drop()
 
     def counts(self) -> dict[str, int]:
-        """`fault.<name>`: what the chip's flags said; `reopened`: how often it was lost and came back."""
+        """Return the fault and reconnection counts.
+
+        `fault.<name>`: what the chip's flags reported; `reopened`: how often it was lost and came back.
+        """
         return dict(self._counts)
 
     def _set_up(self) -> None:
@@ -158,7 +166,10 @@ class FlashDriverLights:
         return self._bus
 
     def _lost(self, error: OSError) -> LightsError:
-        """The bus is opened anew next time: it may have been an adapter that was unplugged."""
+        """Mark the bus to be opened again next time and return the error.
+
+        It may have been an adapter that was unplugged.
+        """
         self._drop()
         return LightsError(
             f"{self._where}: no answer ({error.strerror or error}); `i2cdetect -y {self._number}` shows who answers"
@@ -170,7 +181,10 @@ class FlashDriverLights:
             bus.close()
 
     def _opened(self) -> SMBus:
-        """The bus, with a lock that every program of lights takes: each keeps the limits for itself alone."""
+        """Return the open bus, locked against other programs.
+
+        Every program of lights takes the lock: each keeps the limits for itself alone.
+        """
         try:
             bus = SMBus(self._number)
         except FileNotFoundError as error:

@@ -1,4 +1,6 @@
-"""Stands between whoever makes light and the driver: no pulse too long, no duty too high, and off if nobody does it.
+"""Safety interlock between a source of light commands and the driver.
+
+No pulse is too long, no duty too high, and the light goes off if nobody switches it off.
 
 Wrapped around every driver. It knows nothing of cameras: it holds the two limits of the rig file (`max_pulse_us`,
 `max_duty`) against what is asked for and against what happens, on the clock of this machine. A pulse is refused before
@@ -29,7 +31,9 @@ class Lights(Protocol):
     """Laser and LEDs of a wrist device. Opened dark by its constructor."""
 
     def switch(self, lit: Illumination) -> None:
-        """Have the laser on (`LASER`), the LEDs on (`LED`), or nothing (`AMBIENT`, `NONE`); never both.
+        """Switch the laser on (`LASER`), the LEDs on (`LED`), or both off.
+
+        Nothing is on for `AMBIENT` and `NONE`; laser and LEDs are never on together.
 
         Returns when it is done.
 
@@ -52,7 +56,9 @@ class Lights(Protocol):
 
 
 class Interlock:
-    """A driver within limits. Holds what is on, until when at most, the pulses of the last second, whether it failed.
+    """A light driver within limits.
+
+    Holds what is on, until when at most, the pulses of the last second, whether it failed.
 
     Attributes:
         counts: Event -> how often.
@@ -127,7 +133,10 @@ class Interlock:
             self._on, self._failing = None, False
 
     def look(self) -> float | None:
-        """End what has lasted long enough; in how many seconds to look again, None: there is nothing to look for."""
+        """Switch off a light that has lasted long enough.
+
+        Returns in how many seconds to check again, None: there is nothing to check.
+        """
         with self._changed:
             if not self._failing:
                 if self._on is None:
@@ -163,7 +172,10 @@ class Interlock:
         return {**self.counts, **self._lights.counts()}
 
     def _order(self, order: Callable[[], None]) -> None:
-        """Tell the driver; whatever it raises is a failure, after which a light may be on: the watchdog's work."""
+        """Send an order to the driver.
+
+        Whatever it raises is a failure, after which a light may be on: the watchdog handles that.
+        """
         try:
             order()
         except (

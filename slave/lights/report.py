@@ -1,4 +1,7 @@
-"""The budget of a strobe as text, and its lights without a camera: what `doctor --lights` prints and does."""
+"""The budget of a strobe as text, and a test of its lights without a camera.
+
+This is what `doctor --lights` prints and does.
+"""
 
 import threading
 
@@ -54,7 +57,9 @@ def blink(
     stop: threading.Event,
     seconds: float,
 ) -> int:
-    """Laser and LEDs in turn as before a camera of that rate, through the guard; the number of pulses.
+    """Switch laser and LEDs in turn and return the number of pulses.
+
+    They are switched as before a camera of that rate, through the guard.
 
     Raises:
         LightsError: The lights fail.

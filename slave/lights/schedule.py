@@ -100,7 +100,9 @@ class StrobeSchedule:
         return self._line is not None
 
     def push(self, seq: int, t_ns: int) -> bool:
-        """Take the stamp of a frame: mid-exposure [ns]; whether a new line is begun, whose numbers begin anew.
+        """Take the time stamp of a frame, its mid-exposure [ns].
+
+        Returns whether a new line is begun, whose numbers start again.
 
         The number `seq` matters for the first frame of a line only.
         """
@@ -138,7 +140,10 @@ class StrobeSchedule:
         return number + int((now_ns - begun_ns) // self._line.period_ns)
 
     def after(self, number: int) -> Pulse | None:
-        """The first pulse of a frame after frame `number`; None: not known, or too far ahead."""
+        """Return the first pulse of a frame after frame `number`.
+
+        None: not known, or too far ahead.
+        """
         if self._line is None:
             return None
         for k in range(number + 1, self._stamps[-1][0] + AHEAD + 1):

@@ -1,4 +1,7 @@
-"""A camera whose frames are lit by a strobe: every frame's stamp goes to the controller on its way to the detector."""
+"""Camera whose frames are lit by a strobe.
+
+Every frame's stamp goes to the controller on its way to the detector.
+"""
 
 from msgspec.structs import replace
 
@@ -11,7 +14,10 @@ from slave.sources import Frame, FrameSource, Tunable
 
 
 class StrobedCamera:
-    """A `FrameSource` around one, `Tunable` where that is. Closes camera and lights. Holds the exposure limit."""
+    """A `FrameSource` around another, whose frames are lit by a strobe.
+
+    It is `Tunable` where the inner one is. Closes camera and lights. Holds the exposure limit.
+    """
 
     def __init__(
         self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Strobe
@@ -126,5 +132,8 @@ def _rows_us(camera: CameraCalibration) -> float:
 
 
 def _exposed_us(camera: CameraCalibration) -> float:
-    """From the beginning of the first row's exposure to the end of the last one's [us]."""
+    """Return the time [us] in which any row of a frame is exposed.
+
+    From the beginning of the first row's exposure to the end of the last one's.
+    """
     return camera.exposure_us + _rows_us(camera)

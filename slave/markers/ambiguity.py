@@ -1,4 +1,6 @@
-"""Things beside the hand that have the colour of a marker: counted, so that somebody takes them away.
+"""Counts of things beside the hand that have the colour of a marker.
+
+They are counted so that somebody removes them.
 
 The detector finds the hand among them while it can; each is one more way to be wrong, above all when the hand comes
 back. What counts has at least `LEAST` px^2 and a share of the marker's own area, does not touch the marker, and is no
@@ -17,7 +19,9 @@ APART = 1.0  # of the marker's size between the two: what is nearer may be a pie
 
 
 class ColourAmbiguityMonitor:
-    """Push machine. Holds in how many frames each marker had company, and where it was last.
+    """Push machine that counts things in the colour of a marker.
+
+    Holds in how many frames each marker had such things beside it, and where they were last.
 
     Attributes:
         frames: Marker -> how many frames.
@@ -67,7 +71,10 @@ def _far(blob: Blob, own: Blob) -> bool:
 
 
 def _whole(blob: Blob, others: Sequence[Blob]) -> bool:
-    """Whether it is a thing of its own: it is not around, nor within, a marker of another colour."""
+    """Return whether a blob is a thing of its own.
+
+    It is neither around nor within a marker of another colour.
+    """
     return not any(
         blob.left - SCALE <= other.u <= blob.right + SCALE
         and blob.top - SCALE <= other.v <= blob.bottom + SCALE
@@ -82,14 +89,20 @@ class MarkerSource(Protocol):
 
 
 def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
-    """What `Health` counts: beside.<marker>, frames with something else in its colour."""
+    """Return the ambiguity counts of `Health`.
+
+    beside.<marker>, frames with something else in its colour.
+    """
     return (
         {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
     )
 
 
 def ambiguity_gauges(detector: MarkerSource | None) -> dict[str, float]:
-    """Gauges of `Health`: beside.<marker>.u and .v, where that was last [px]."""
+    """Return the ambiguity metrics of `Health`.
+
+    beside.<marker>.u and .v, where the other thing was last [px].
+    """
     if detector is None:
         return {}
     places = list(detector.ambiguity.places.items())  # the loop may add one

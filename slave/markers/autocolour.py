@@ -1,4 +1,6 @@
-"""Colour ranges of one camera from a few seconds of a moving, painted hand, without clicks.
+"""Colour ranges of one camera, found without clicks.
+
+They come from a few seconds of a moving, painted hand.
 
 A paint is what keeps one hue, moves with the hand, and has skin beside it. The M strongest hues of that kind are
 the M paints; their pixels of all frames, lit side and shadow side, in every place the hand went, make the ranges
@@ -60,7 +62,10 @@ Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerColour:
-    """One paint: its hue and the thing of it in every frame where it was seen, the largest."""
+    """One marker colour found in the frames.
+
+    Its hue and its largest thing in every frame where it was seen.
+    """
 
     hue: float
     things: tuple[Thing, ...]
@@ -121,12 +126,15 @@ def calibrate_moving(
 
 
 def frames_for(pixels: int) -> int:
-    """How many frames of so many pixels are held at once, for all that more of them would tell."""
+    """Return how many frames of so many pixels are held at once.
+
+    They are limited, though more of them would give more information.
+    """
     return int(np.clip(PIXELS_MOST // pixels, FRAMES_LEAST, FRAMES_MOST))
 
 
 def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surroundings) -> list[MarkerColour]:
-    """The `count` paints among the things of every frame, by hue.
+    """Find the `count` marker colours among the things of every frame, by hue.
 
     Raises:
         FitError: They cannot be told.
@@ -164,7 +172,10 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
 
 
 def places(colours: Sequence[MarkerColour], frames: int) -> Float:
-    """Centroids (F, M, 2) [px] of the paints; NaN where one was not seen."""
+    """Return the centroids (F, M, 2) [px] of the marker colours.
+
+    NaN where one was not seen.
+    """
     uv = np.full((frames, len(colours), 2), np.nan)
     for m, colour in enumerate(colours):
         for thing in colour.things:
@@ -173,7 +184,10 @@ def places(colours: Sequence[MarkerColour], frames: int) -> Float:
 
 
 def pixels_of(colour: MarkerColour) -> Image:
-    """(N, 3) HSV of a paint's pixels in all frames, without mixed rims and highlights."""
+    """Return the pixels (N, 3) HSV of a marker colour in all frames.
+
+    Mixed rims and highlights are excluded.
+    """
     chosen: list[Image] = []
     for thing in colour.things:
         saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
@@ -184,7 +198,10 @@ def pixels_of(colour: MarkerColour) -> Image:
 
 
 def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
-    """All things by the peaks of their smoothed hues; of each peak the largest thing per frame."""
+    """Group all things by the peaks of their smoothed hues.
+
+    Of each peak the largest thing per frame is kept.
+    """
     flat = [thing for row in things for thing in row]
     if not flat:
         return []
@@ -235,7 +252,10 @@ def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[Marke
 
 
 def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
-    """What of the rest might have been a paint, for the message."""
+    """Describe which other things might have been a marker colour.
+
+    The text is for the error message.
+    """
     reasons = ""
     if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SKIN_AROUND]:
         reasons += f"; hue {', '.join(bare)} has no skin beside it"
@@ -255,7 +275,10 @@ def _others(
     colours: Sequence[MarkerColour],
     around: Surroundings,
 ) -> tuple[Image, Image, int]:
-    """HSV pixels of skin near the paint and of the background, and from how many frames."""
+    """Return HSV pixels of skin near the marker colours and of the background.
+
+    Also returns from how many frames they are.
+    """
     skins: list[Image] = []
     grounds: list[Image] = []
     chosen = spread(len(images), BACKGROUND_FRAMES)
@@ -276,7 +299,10 @@ def _others(
 
 
 def _scraps(hsv: Image, around: Surroundings, largest: int) -> Image:
-    """Small coloured pieces that touch skin: paint nearly hidden, which is no background."""
+    """Find small coloured pieces that touch skin.
+
+    They are paint nearly hidden, which is no background.
+    """
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         coloured(hsv, around).astype(np.uint8), connectivity=8
     )

@@ -1,4 +1,6 @@
-"""Which paint is which marker: by the shape of the hand, by an older calibration, or by clicks.
+"""Assignment of marker colours to markers.
+
+It is by the shape of the hand, by an older calibration, or by clicks.
 
 By the hand: an open hand seen from its back is a turned, scaled picture of the profile's flat hand. In every frame
 that shows all paints, or all but one, all orders of names are held against it (a similarity without reflection,
@@ -81,7 +83,9 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambd
 
 
 def pattern_of(profile: HandProfile, names: tuple[str, ...]) -> Float:
-    """Markers (M, 2) of the flat hand as a camera sees its back: u to the right, v down, fingers up [m].
+    """Return the markers (M, 2) of the flat hand as a camera sees its back.
+
+    u to the right, v down, fingers up [m].
 
     Raises:
         CalibrationError: The profile has no such marker.
@@ -93,7 +97,7 @@ def pattern_of(profile: HandProfile, names: tuple[str, ...]) -> Float:
 
 
 def votes_of(uv: Float, pattern: Float, orders: Int) -> tuple[list[int], int]:
-    """Votes of the frames that show all paints, or all but one.
+    """Count the votes of the frames that show all marker colours, or all but one.
 
     Args:
         uv: (F, M, 2) centroids [px]; NaN where not seen.
@@ -135,7 +139,9 @@ def by_hues(
     where: str,
     notify: Notify = lambda _text: None,
 ) -> Namer:
-    """Names from the hues of a camera file, of another camera or from before the lamp was changed.
+    """Return a namer that uses the hues of a camera file.
+
+    The file is of another camera or from before the lamp was changed.
 
     Raises:
         CalibrationError: The file has no range for a marker.

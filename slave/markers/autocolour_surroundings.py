@@ -1,4 +1,6 @@
-"""What all frames of a moving hand share: its skin, the desk, and the coloured things that stand on it.
+"""What all frames of a moving hand share.
+
+Its skin, the desk, and the coloured things that stand on it.
 
 background   median over the frames: what stands still for most of the time
 skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
@@ -54,7 +56,10 @@ def background_of(images: Sequence[Image]) -> Image:
 
 
 def spread(count: int, most: int) -> list[int]:
-    """At most `most` of the indices below `count`, evenly spread, first and last among them."""
+    """Return at most `most` of the indices below `count`, evenly spread.
+
+    First and last are among them.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
@@ -105,7 +110,10 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
 
 
 def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
-    """Saturation (180,) above which a pixel of that hue is coloured: more than what the whole desk shows of the hue."""
+    """Return the saturation (180,) above which a pixel of that hue is coloured.
+
+    It is more than what the whole desk shows of the hue.
+    """
     height, width = background.shape[:2]
     samples: list[Image] = []
     tiles = np.zeros((HUES, TILES * TILES))
@@ -136,7 +144,9 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
 
 
 def _moved(thing: Thing, images: Sequence[Image]) -> bool:
-    """Whether a thing of the background is a paint of a hand that rested there: it is seen whole, but elsewhere.
+    """Return whether a thing of the background is a paint of a resting hand.
+
+    It is one if it is seen whole, but elsewhere.
 
     Clutter only gets covered, and then it is smaller.
     """
@@ -170,7 +180,9 @@ def _moved(thing: Thing, images: Sequence[Image]) -> bool:
 
 
 def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
-    """Whether the desk came to light where a thing of the background was: a finger tip that was bent away.
+    """Return whether the desk appeared in the place of a background thing.
+
+    The thing was then a finger tip that was flexed away.
 
     The desk is what lies around the thing in the background and is not skin.
     """

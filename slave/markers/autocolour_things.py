@@ -1,4 +1,7 @@
-"""Coloured things in one frame: connected pixels of one hue, more saturated than the desk and not of the skin's hue."""
+"""Coloured things in one frame.
+
+Connected pixels of one hue, more saturated than the desk and not of the skin's hue.
+"""
 
 from dataclasses import dataclass
 from typing import cast
@@ -84,7 +87,10 @@ class Surroundings:
 
 
 def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = False) -> list[Thing]:
-    """Coloured things of one frame, without clutter; `border`: those cut by the image's border, too."""
+    """Return the coloured things of one frame, without clutter.
+
+    `border`: those cut by the image's border, too.
+    """
     hsv = hsv_of(image)
     skin = around.skin.mask(hsv)
     mask = coloured(hsv, around).astype(np.uint8)
@@ -105,7 +111,10 @@ def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = 
 
 
 def coloured(hsv: Image, around: Surroundings) -> Bool:
-    """Pixels (H, W) that may be paint: more saturated than the desk, not dark, and not of the skin's hue."""
+    """Return the mask (H, W) of pixels that may be paint.
+
+    They are more saturated than the desk, not dark, and not of the skin's hue.
+    """
     return (hsv[..., 1] >= around.floor[hsv[..., 0]]) & (hsv[..., 2] >= DARK)
 
 
@@ -123,7 +132,10 @@ def hsv_of(image: Image) -> Image:
 
 
 def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
-    """Connected parts of one hue each, the most frequent hue first: paints that touch are cut apart."""
+    """Split a piece into connected parts of one hue each.
+
+    The most frequent hue comes first: paints that touch are separated.
+    """
     parts: list[Bool] = []
     rest = piece.copy()
     for _ in range(HUES_OF_ONE):

@@ -1,4 +1,6 @@
-"""Find the connected blobs of every colour in the scanned frame: the candidates among which the markers are.
+"""Detection of the connected blobs of every colour in the scanned frame.
+
+They are the candidates among which the markers are.
 
 The scan looks at every fourth pixel of every fourth row, which any round marker from 6 px on cannot slip through;
 smaller ones and slivers do now and then, so a colour that no point of the grid shows is sought on further grids.
@@ -111,7 +113,9 @@ def find_blobs(
 
 
 def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: float) -> tuple[Blob, float]:
-    """`blob` with the pieces that something in front of the marker split from it, and how far that may mislead.
+    """Return `blob` joined with the pieces that an occluder split from it.
+
+    The occluder is something in front of the marker. Also returns how far joining may mislead.
 
     Args:
         blob: The marker's largest piece.
@@ -153,7 +157,10 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
 def _label(
     mask: npt.NDArray[np.uint8], left: int, top: int
 ) -> list[tuple[int, int, int, int, int, float, float]]:
-    """Connected parts of a mask, largest first: left, top, width, height, points, mean x, mean y on the grid."""
+    """Label the connected parts of a mask, largest first.
+
+    Each is left, top, width, height, points, mean x, mean y on the grid.
+    """
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     rows = [
         (left + x, top + y, w, h, area, left + u, top + v)

@@ -1,4 +1,6 @@
-"""Detects the markers whose colours are known, and none while no colour is: for a slave that is still being set up.
+"""Detector of the markers whose colours are known.
+
+It finds none while no colour is known: for a slave that is still being set up.
 
 Its colours are fixed: few markers do not tell the light from their paint. With the last colour another detector takes
 over (`changing`), which follows the light.
@@ -29,7 +31,10 @@ class CalibratedDetector:
         engine: Engine = NUMPY,
         free: Collection[str] = (),
     ) -> None:
-        """Build the detector; arguments as of `MarkerDetector`, but the camera may lack colours."""
+        """Build the detector.
+
+        Arguments are as of `MarkerDetector`, but the camera may lack colours.
+        """
         calibrated = tuple(name for name in markers if name in (camera.markers or {}))
         self.missing = tuple(name for name in markers if name not in calibrated)
         self._rows = [markers.index(name) for name in calibrated]

@@ -1,4 +1,6 @@
-"""Measure the sub-pixel centroid of the visible paint of every marker, in small windows of the full-resolution image.
+"""Sub-pixel centroids of the visible paint of every marker.
+
+They are measured in small windows of the full-resolution image.
 
 A threshold knows whole pixels only. At the rim a pixel holds paint and surroundings in proportion to the covered
 area, and light adds linearly, so in linear light the amount of paint is measurable:
@@ -109,7 +111,10 @@ def _measure_stack(
     alone: Sequence[bool],
     gap: int = 0,
 ) -> list[Measured | None]:
-    """Measure in windows of one size; `gap` empty rows and columns keep them apart where paint meets their border."""
+    """Measure the blobs in windows of one size.
+
+    `gap` empty rows and columns keep the windows apart where paint meets their border.
+    """
     count = len(blobs)
     height = max([b.bottom - b.top for b in blobs]) + 2 * PAD + gap
     width = -(-(max([b.right - b.left for b in blobs]) + 2 * PAD + gap) // EVERY) * EVERY
@@ -209,7 +214,10 @@ def _measure_stack(
 
 
 def _cut_tiles(image: Image, blobs: Sequence[Blob], height: int, width: int) -> Image:
-    """Windows of the blobs one below the other, (M * height, width, 4) BGRA; all 0 outside a window or the image."""
+    """Cut the windows of the blobs, one below the other.
+
+    (M * height, width, 4) BGRA; all 0 outside a window or the image.
+    """
     tall = np.zeros((len(blobs) * height, width, 4), np.uint8)
     base = 0
     for b in blobs:
@@ -224,7 +232,10 @@ def _cut_tiles(image: Image, blobs: Sequence[Blob], height: int, width: int) -> 
 
 
 def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> None:
-    """Clear in the tiles (M, H, W) the parts that are not the blob's, where its colour has other blobs."""
+    """Clear the parts of the tiles (M, H, W) that are not the blob's.
+
+    It is done where the blob's colour has other blobs.
+    """
     for tile, b, lonely in zip(own, blobs, alone, strict=True):
         if lonely:
             continue
@@ -242,13 +253,19 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
 
 
 def _meets_border(own: Bool) -> bool:
-    """Whether paint lies so near to the border of a tile (M, H, W) that a neighbourhood would reach over it."""
+    """Return whether marker colour lies near the border of a tile (M, H, W).
+
+    Near means that a neighbourhood would reach over the border.
+    """
     reach = SIDE[0] // 2
     return bool(own[:, :reach].any() or own[:, -reach:].any() or own[:, :, 0].any() or own[:, :, -1].any())
 
 
 def _eroded(own: Bool, width: int) -> Bool:
-    """Pixels that have all four neighbours in the mask as well; windows of `width` one below the other, flat."""
+    """Return the mask pixels whose four neighbours are all in the mask as well.
+
+    The windows of `width` lie one below the other, flattened.
+    """
     inner = own.copy()
     inner[1:] &= own[:-1]  # over the ends of the rows as well: nothing is in the mask there
     inner[:-1] &= own[1:]

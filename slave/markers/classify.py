@@ -1,4 +1,6 @@
-"""Decide for every pixel which markers' colours it may belong to, by one table look-up for all colours.
+"""Classification of every pixel by the marker colours it may belong to.
+
+One table look-up serves all colours.
 
 The table holds one entry per possible 24-bit pixel and one bit per marker. It is *built from* the HSV ranges of
 the camera file by running OpenCV's own conversion over all 2^24 colours, so a look-up equals `cvtColor` +
@@ -35,7 +37,9 @@ SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 
 
 class ColourTable:
-    """Which markers a colour may belong to: bit m of an entry belongs to marker m, the bit after the last to skin.
+    """Look-up table from a colour to the markers it may belong to.
+
+    Bit m of an entry belongs to marker m, the bit after the last marker to skin.
 
     Holds the table (2^24 entries of 1, 2, 4 or 8 bytes), which it shares with those made of it for another light, the
     bytes to look up for those of a picture, and the work buffers of the scan.
@@ -64,16 +68,24 @@ class ColourTable:
 
     @property
     def entries(self) -> Codes:
-        """The table itself: codes (2^24,) at the sum of the `places` of a pixel's blue, green and red."""
+        """Return the table itself, codes (2^24,).
+
+        The index is the sum of the `places` of a pixel's blue, green and red.
+        """
         return self._table
 
     @property
     def places(self) -> Places:
-        """What each byte of blue, green and red (3, 256) adds to the place of a pixel in `entries`."""
+        """Return the index contribution (3, 256) of each byte of blue, green and red.
+
+        The contributions of a pixel add up to its index in `entries`.
+        """
         return self._places
 
     def white_balanced(self, tables: Image) -> "ColourTable":
-        """The table for pictures whose bytes must be mapped before these ranges hold, about 1 ms; shares the entries.
+        """Return the table for images whose bytes must be mapped before lookup.
+
+        The ranges hold only for the mapped bytes. Takes about 1 ms; shares the entries.
 
         Colours that belong to one marker before belong to one marker after: no ranges can come to overlap.
 
@@ -98,7 +110,10 @@ class ColourTable:
         return self.packed_codes(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA).view(np.uint32)[..., 0])
 
     def packed_codes(self, packed: npt.NDArray[np.uint32]) -> Codes:
-        """Class codes of pixels packed into words: blue, green, red from the lowest byte on; the highest is ignored."""
+        """Return the class codes of pixels packed into words.
+
+        Blue, green and red lie from the lowest byte on; the highest byte is ignored.
+        """
         if self._bytes is not None:
             mapped = np.zeros((1, 256, 4), np.uint8)
             mapped[0, :, :3] = self._bytes.T
@@ -161,7 +176,9 @@ def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, wher
 
 
 def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
-    """Pixels inside a range, hue wrapping through 0 where the low hue is above the high one.
+    """Return the mask of pixels inside an HSV range.
+
+    The hue wraps through 0 where the low hue is above the high one.
 
     Args:
         hsv: (..., 3) OpenCV HSV, H 0-179.
@@ -173,7 +190,10 @@ def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
 
 
 def _build(ranges: Sequence[HsvRange]) -> Codes:
-    """A range is a box: a colour has the bits that its hue, its saturation and its value all have."""
+    """Build the table from the colour ranges.
+
+    A range is a box: a colour has the bits that its hue, its saturation and its value all have.
+    """
     kind = next(
         t for t, n in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32), (np.uint64, 64)) if len(ranges) <= n
     )
@@ -199,7 +219,9 @@ def _places(levels: Image) -> Places:
 
 
 def _coarse(table: Codes, levels: Image) -> Codes:
-    """What the scan asks: entries (2^21,) of colours whose lowest three bits are 0, at packed pixels >> 3.
+    """Return the coarse table (2^21,) that the scan looks up.
+
+    It holds the entries of colours whose lowest three bits are 0, at packed pixels >> 3.
 
     Args:
         table: (2^24,) entries.
@@ -212,7 +234,10 @@ def _coarse(table: Codes, levels: Image) -> Codes:
 
 
 def _bits(ranges: Sequence[HsvRange], channel: int, kind: type[np.unsignedinteger]) -> Codes:
-    """Codes (256,) of the levels of one channel of HSV: bit m where it is in range m. Hue wraps through 0."""
+    """Return the codes (256,) of the levels of one channel of HSV.
+
+    Bit m is set where the level is in range m. Hue wraps through 0.
+    """
     level = np.arange(256)
     codes: Codes = np.zeros(256, kind)
     for m, colour in enumerate(ranges):

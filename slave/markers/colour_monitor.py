@@ -1,4 +1,6 @@
-"""Say that a marker is about to be lost while it is still seen: how far its colour is from the border of its range.
+"""Early warning that a marker's colour is about to leave its range.
+
+It warns while the marker is still detected, by the distance of its colour from the border of its range.
 
 Colours are undone to the light of calibration first, so what is left is what following the light does not mend: light
 beyond the bounds, a lamp whose colour von Kries' law does not describe, paint that has become dirty or worn. Each
@@ -44,7 +46,10 @@ class ColourWarning:
 
 
 def hsv(light: Float) -> Float:
-    """OpenCV's H (0..180), S and V (0..255) of linear light (..., 3), blue first, unrounded."""
+    """Convert linear light (..., 3), blue first, to OpenCV's HSV.
+
+    H (0..180), S and V (0..255), unrounded.
+    """
     code = 255.0 * to_srgb(light)
     blue, green, red = code[..., 0], code[..., 1], code[..., 2]
     value, span = code.max(axis=-1), np.ptp(code, axis=-1)
@@ -59,7 +64,10 @@ def hsv(light: Float) -> Float:
 
 
 class ColourMonitor:
-    """Watches the room of every marker's colour. Holds mean, spread and watched time of each, and who is warned of."""
+    """Monitor of the margin between every marker's colour and its range.
+
+    Holds the mean, spread and observed time of each marker, and for which markers a warning was given.
+    """
 
     def __init__(self, names: Sequence[str], ranges: Mapping[str, HsvRange]) -> None:
         """Watch `names`, each in its range."""
@@ -98,7 +106,10 @@ class ColourMonitor:
         return warned + self._ambiguous()
 
     def room(self) -> Float:
-        """Room (M,) of each marker's colour to the nearest border of its range, in spreads; NaN: not watched long."""
+        """Return the margin (M,) of each colour to the nearest border of its range.
+
+        In spreads; NaN: not observed for long enough.
+        """
         spread = np.maximum(np.sqrt(self._variance), FLOOR)
         hue = (self._half - np.abs(self._mean[:, 0])) / spread[:, 0]
         rest = (self._mean[:, 1:] - self._low[:, 1:]) / spread[:, 1:]

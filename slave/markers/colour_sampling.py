@@ -1,4 +1,6 @@
-"""The colour of a marker from one click on the picture of a running camera, beside the colours that others have.
+"""Colour of a marker from one click on the image of a running camera.
+
+The colours that other markers have are taken into account.
 
 The paint under the click is grown as for `phalanx-slave colours`, and the ranges of all markers picked so far are made
 anew together, since how far each may reach depends on its neighbours: six picks give what six clicks in one picture
@@ -57,8 +59,9 @@ class ColourSample:
 
 
 class SampledColours:
-    """Holds the pixels of the paints that were picked since the start, as under the light of calibration, and what was
-    made of them: a range that was changed since counts as one of the file.
+    """Pixels of the marker colours picked since the start, and the ranges made.
+
+    The pixels are as under the light of calibration. A range that was changed since counts as one of the file.
     """
 
     def __init__(self) -> None:
@@ -119,7 +122,7 @@ def undone(image: Image, log_gains: Float) -> Image:
 
 
 def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
-    """The paint (H, W) at or near a pixel (u, v) [px].
+    """Return the marker-coloured region (H, W) at or near a pixel (u, v) [px].
 
     Raises:
         FitError: As `SampledColours.sample`.
@@ -163,7 +166,10 @@ def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
 
 
 def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
-    """The pixel deepest inside what is coloured at a click, or beside it; None: nothing there is."""
+    """Return the pixel deepest inside the coloured region at a click or beside it.
+
+    None: there is no coloured region.
+    """
     width = hsv.shape[1]
     near = NEAR_SHARE * width
     reach = int(near + 8)
@@ -186,7 +192,7 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
 
 
 def _sample_of(colour: HsvRange) -> Image:
-    """One HSV pixel (1, 3) that stands for a paint of which only the range is known."""
+    """Return one HSV pixel (1, 3) for a marker colour known only by its range."""
     if colour.reference_bgr_linear is not None:
         return np.rint(hsv_of_light(np.array([colour.reference_bgr_linear]))).astype(np.uint8)
     low, high = colour.hsv_low, colour.hsv_high
@@ -220,7 +226,10 @@ def _refuse_poor(row: ColourRow) -> None:
 
 
 def _apart(colour: HsvRange, hue: float, made: Mapping[str, HsvRange]) -> HsvRange:
-    """A range without the hues that the picked ones have; it keeps the part about its own hue."""
+    """Return a range without the hues of the picked colours.
+
+    It keeps the part about its own hue.
+    """
     low, high = colour.hsv_low[0], colour.hsv_high[0]
     middle = round(hue) % HUES
     below, above = (middle - low) % HUES, (high - middle) % HUES

@@ -1,4 +1,4 @@
-"""Make the HSV range of every marker from one click on each, and report what collides.
+"""HSV range of every marker from one click on each, with collision report.
 
 A tight range around the clicked paint fails under the next lamp ("a broader range at calibration worked better"), so
 each range is as broad as its neighbours allow: in hue half-way to the next marker or to the skin, at most
@@ -77,7 +77,9 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
 
 
 def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: int = 1) -> list[ColourRow]:
-    """Ranges and collisions of paints whose pixels are known, in the order of `paint`.
+    """Return the ranges and collisions of marker colours whose pixels are known.
+
+    In the order of `paint`.
 
     Args:
         paint: Marker -> (N, 3) HSV of its pixels, of one frame or of many.
@@ -133,7 +135,9 @@ def report(rows: list[ColourRow]) -> str:
 
 
 def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
-    """The paint around a click: connected pixels of its hue, (H, W).
+    """Grow the marker-coloured region (H, W) around a click.
+
+    It consists of connected pixels of the hue at the click.
 
     Raises:
         FitError: The click is outside the image, on something pale, or on a spot too small.
@@ -191,7 +195,10 @@ def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
 
 
 def surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
-    """Skin near the markers, and everything that is neither paint nor its rim."""
+    """Return the masks of skin near the markers and of the background.
+
+    The background is everything that is neither marker colour nor its rim.
+    """
     union = np.any(list(paint.values()), axis=0).astype(np.uint8)
     rim = cv2.dilate(union, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) != 0
     near = cv2.dilate(union, np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)) != 0
@@ -226,7 +233,10 @@ def _range(paint: Image, hue: float, limits: tuple[int, int], background: Image,
 
 
 def _mean_light(paint: Image) -> tuple[float, float, float]:
-    """Mean colour in linear light, blue first, of (N, 3) HSV pixels: light adds linearly, bytes do not."""
+    """Return the mean colour of (N, 3) HSV pixels in linear light, blue first.
+
+    Light adds linearly, bytes do not.
+    """
     bgr = np.asarray(cv2.cvtColor(paint[None], cv2.COLOR_HSV2BGR))[0]
     blue, green, red = np.maximum(to_linear(bgr / 255.0).mean(axis=0), 1e-5).round(5).tolist()
     return blue, green, red

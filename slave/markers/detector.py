@@ -1,4 +1,6 @@
-"""Frame in, marker centroids out: scan, decide which blob is which marker, measure it.
+"""Marker detector: frame in, marker centroids out.
+
+It scans the frame, decides which blob is which marker and measures that blob.
 
 A push machine. It holds one track per marker, and counts what is beside them; a new recording gets a new
 detector (`fresh`).
@@ -142,7 +144,10 @@ class MarkerDetector:
         self.evidence: dict[int, Evidence] = {}
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
-        """A detector of the same camera that has seen nothing yet; shares the colour table."""
+        """Return a detector of the same camera without any tracks.
+
+        It has seen nothing yet and shares the colour table.
+        """
         free = [self._names[m] for m in self._free]
         other = MarkerDetector(self._camera, self._names, initial_uv, self._table, self._engine, free)
         other.windows_only, other._gains = self.windows_only, self._gains
@@ -241,11 +246,16 @@ class MarkerDetector:
         self._tracks = [tracks.get(name) for name in self._names]
 
     def tune(self, camera: CameraCalibration) -> None:
-        """The file has another exposure, over which motion smears, or another margin. From any thread."""
+        """Apply a changed exposure or margin of the camera file.
+
+        Motion smears over the exposure. From any thread.
+        """
         self._exposure_s, self._margin = camera.exposure_us * 1e-6, camera.roi_margin
 
     def recolour(self, table: ColourTable, gains: tuple[float, float, float]) -> None:
-        """Go on with another colour table of the same markers, prepared for the engine; tracks go on.
+        """Continue with another colour table of the same markers.
+
+        The table is prepared for the engine; the tracks are kept.
 
         Args:
             table: Of the light that `gains` (blue, green, red) of that of calibration make.
@@ -264,7 +274,10 @@ class MarkerDetector:
         t_ns: int,
         shift_px: float,
     ) -> tuple[float, ...]:
-        """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
+        """Return the report of one marker and continue its track.
+
+        `before` is its track if it was alive.
+        """
         other = (math.nan, math.nan) if alternative is None else (alternative.u, alternative.v)
         support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
         near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
@@ -298,7 +311,10 @@ class MarkerDetector:
         return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
 
     def _alternative(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
-        """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""
+        """Return the largest other blob of the colour that may be the marker.
+
+        Its size and motion must allow it; a blob that is the rim of another one is excluded.
+        """
         least, most = ALTERNATIVE * blob.area, blob.area / ALTERNATIVE
         others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
         if window is not None:
@@ -330,14 +346,20 @@ class MarkerDetector:
         return self._scanner.around(image, self._table, places, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:
-        """Largest side [px] and area [px^2] of the whole marker as far as its track knows, else inf and nan."""
+        """Return the largest side [px] and the area [px^2] of the whole marker.
+
+        As far as its track knows, else inf and nan.
+        """
         track = self._tracks[m]
         if track is None or not track.alive(t_ns):
             return math.inf, math.nan
         return 1.3 * max(track.width, track.height) + 2.0, track.whole
 
     def _decide(self, scanned: Scanned, windows: list[Window | None]) -> dict[int, Blob]:
-        """Marker row -> its blob, by prediction alone where that answers for every colour that was seen."""
+        """Assign blobs to markers: marker row -> blob.
+
+        By prediction alone where that answers for every colour that was seen.
+        """
         blobs = scanned.blobs
         tracked: dict[int, Blob] = {}
         certain = not self._initial_uv
@@ -386,7 +408,10 @@ class MarkerDetector:
 
 
 def _alone(blob: Blob, options: list[Blob]) -> bool:
-    """Whether no other blob of the colour reaches into the window in which `blob` is measured."""
+    """Return whether no other blob of the colour is in the window of `blob`.
+
+    The window is the one in which `blob` is measured.
+    """
     return not any(
         b.left < blob.right + PAD
         and blob.left - PAD < b.right

@@ -1,4 +1,6 @@
-"""Estimate how far the light has moved from that of calibration, from the colours of the markers themselves.
+"""Estimate of the change of the light since calibration.
+
+It is made from the colours of the markers themselves.
 
 Another light multiplies each channel in linear light by one gain that all surfaces share (von Kries). A marker shows,
 against its colour at calibration, the product of these gains and of its own shading s, which is the same in all three
@@ -97,7 +99,10 @@ def _distance(away: Float, information: Float) -> Float:
 
 
 def bounded(log_gains: Float) -> Float:
-    """Log gains (3,) held within the bounds: green first, then red and blue against it."""
+    """Clip log gains (3,) to their bounds.
+
+    Green first, then red and blue against it.
+    """
     blue, green, red = log_gains.tolist()
     b = min(max(blue - green, -LOG_LIMITS[0]), LOG_LIMITS[0])
     r = min(max(red - green, -LOG_LIMITS[2]), LOG_LIMITS[2])
@@ -113,7 +118,10 @@ def at_bound(log_gains: Float) -> bool:
 
 
 class ColourDrift:
-    """Follows the light of one camera. Holds the log gains, their anchor, and the time of the last look."""
+    """Tracker of the light of one camera.
+
+    Holds the log gains, their anchor, and the time of the last look.
+    """
 
     def __init__(self, reference: Float) -> None:
         """Begin at the light of calibration.
@@ -140,7 +148,10 @@ class ColourDrift:
         self._x = self._anchor = bounded(log_gains)
 
     def shift(self, change: Float) -> None:
-        """Add a change of the light that was seen elsewhere, on what stands still: (3,) log gains."""
+        """Add a change of the light (3,), in log gains, that was measured elsewhere.
+
+        It was measured on what stands still.
+        """
         self._x, self._anchor = bounded(self._x + change), bounded(self._anchor + change)
 
     def push(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:

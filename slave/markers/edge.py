@@ -1,4 +1,6 @@
-"""Find the centre of a cap that something in front of it covers in part, from the edge that is still its own.
+"""Centre of a partly occluded marker cap from its visible edge.
+
+Something in front of the cap covers it in part; only the edge that is still the cap's own is used.
 
 What is left of the cap has its centroid elsewhere: 15 % hidden moves it by an eighth of the radius. The shape that
 the cap had before is known (an ellipse with the second moments of its shares), so only its place is sought: rays
@@ -39,7 +41,10 @@ _WAY: Float = 2.0 / 3.0 * (1.0 - _CHORD**2) ** 1.5 / (math.pi * (1.0 - _SHARE))
 
 
 class Ellipse(NamedTuple):
-    """Second central moments [px^2] of a filled ellipse; its edge is at x' C^-1 x = 4."""
+    """Second central moments [px^2] of a filled ellipse.
+
+    Its edge is at x' C^-1 x = 4.
+    """
 
     xx: float
     xy: float
@@ -47,7 +52,10 @@ class Ellipse(NamedTuple):
 
 
 class Centre(NamedTuple):
-    """The centre of a cap (u, v) [px] in the frame of its window, and the RMS of the edge about it [px]."""
+    """Centre of a cap (u, v) [px] and RMS of its edge about it [px].
+
+    The centre is in the frame of the cap's window.
+    """
 
     u: float
     v: float
@@ -103,7 +111,9 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
 
 
 def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
-    """Whether what hides this share of a cap can have moved the centroid of the rest by (du, dv) [px].
+    """Return whether an occlusion can have moved the centroid by (du, dv) [px].
+
+    The centroid is that of the visible rest of a cap of which this share is hidden.
 
     Of all parts of one area the segment behind a straight edge lies farthest out, so nothing moves the centroid more:
     in a unit disc whose edge is at d by 2/3 (1 - d^2)^1.5 / (pi (1 - h)). An ellipse is such a disc, stretched.
@@ -117,7 +127,10 @@ def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
 
 
 def _edge(share: Float32, start: Float, reach: float) -> Float:
-    """Distance (RAYS,) [px] from `start` to where the shares fall to a half: the paint on each ray, added up."""
+    """Return the distance (RAYS,) [px] from `start` to the edge along each ray.
+
+    The edge is where the shares fall to a half: the marker colour on each ray is added up.
+    """
     steps = (np.arange(math.ceil(reach / STEP_PX)) + 0.5) * STEP_PX
     x = (start[0] + DIRECTIONS[:, :1] * steps).astype(np.float32)
     y = (start[1] + DIRECTIONS[:, 1:] * steps).astype(np.float32)

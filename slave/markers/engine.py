@@ -1,4 +1,7 @@
-"""Which code scans and measures: OpenCV and numpy, or machine code that does the same. Chosen by name alone."""
+"""Choice of the code that scans and measures, by name alone.
+
+The options are OpenCV and numpy, or machine code that does the same.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""The engine of machine code: same arguments, same answers, several times faster; needs the `fast` extra (numba)."""
+"""Engine of machine code for scanning and measuring.
+
+It has the same arguments and results and is several times faster; needs the `fast` extra (numba).
+"""
 
 from weakref import WeakSet
 

@@ -1,4 +1,6 @@
-"""A colour table in brief: what it says of each cell of 8 x 8 x 8 colours, small enough for the fastest caches.
+"""Coarse colour table with one entry per cell of 8 x 8 x 8 colours.
+
+It summarises the colour table for each cell and is small enough for the fastest caches.
 
 The whole table (16 MiB and more) lies in slow memory; nearly all cells belong to the same markers throughout, so that
 only one pixel in sixty has to be looked up there.
@@ -33,7 +35,10 @@ _KNOWN: WeakKeyDictionary[ColourTable, Cells] = WeakKeyDictionary()  # a table n
 
 
 def cells_of(table: ColourTable) -> Cells:
-    """The cells of a table: 15 ms at the first call, then at hand as long as the table lives."""
+    """Return the cells of a table.
+
+    Takes 15 ms at the first call; then they are cached as long as the table lives.
+    """
     known = _KNOWN.get(table)
     if known is None:
         kind = table.entries.dtype

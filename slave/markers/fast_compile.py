@@ -1,4 +1,6 @@
-"""Compile a function to machine code with numba, the package of the `fast` extra; a clear error where it is missing.
+"""Compilation of a function to machine code with numba.
+
+numba is the package of the `fast` extra; a clear error is raised where it is missing.
 
 Machine code is kept beside the source (or in the user's cache folder where that is read-only), so only the first
 start of a version compiles. The cache does not know the constants of other modules: what may change there is passed
@@ -16,7 +18,9 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(function: F) -> F:
-    """`function` as machine code, compiled at the first call with arguments of new types.
+    """Return `function` as machine code.
+
+    It is compiled at the first call with arguments of new types.
 
     It releases the interpreter's lock. Sums may be added up in another order (`reassoc`, `contract`); NaN and
     infinity keep their meaning.

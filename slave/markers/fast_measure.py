@@ -1,4 +1,6 @@
-"""Measure markers as `centroid.measure` does, as machine code: one window after the other, a few passes over each.
+"""Machine code that measures markers as `centroid.measure` does.
+
+One window after the other, with a few passes over each.
 
 The formulas are those of `centroid` and `shares`; here they are written pixel by pixel. In place of stacks and
 masks, each window has its own size, sums are taken only where the paint is, and pixels outside count as nothing.
@@ -40,7 +42,10 @@ RULES = Rules(
 def measure(
     image: Image, table: ColourTable, bits: Sequence[int], blobs: Sequence[Blob], alone: Sequence[bool]
 ) -> list[Measured | None]:
-    """Measure the markers at `blobs`; arguments and answer are those of `centroid.measure`."""
+    """Measure the markers at `blobs`.
+
+    Arguments and result are those of `centroid.measure`.
+    """
     if not blobs:
         return []
     pad = centroid.PAD

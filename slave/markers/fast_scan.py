@@ -1,4 +1,6 @@
-"""Scan a frame and find its blobs as `ColourTable.scan` and `blobs.find_blobs` do, as machine code in one go.
+"""Machine code that scans a frame and finds its blobs in one pass.
+
+It does what `ColourTable.scan` and `blobs.find_blobs` do.
 
 The scan asks the table only for colours whose lowest three bits are 0, so the cells of the
 table answer it (`fast_cells`). Points of a colour are counted while the frame is read; only scattered ones are
@@ -19,7 +21,7 @@ from slave.markers.fast_compile import compiled
 
 
 class Grid(NamedTuple):
-    """The grid of the scan, and the constants of `blobs`, as arguments of machine code.
+    """Grid of the scan and constants of `blobs`, as arguments of machine code.
 
     Attributes:
         step, dx, dy: Distance of its lines, and where it begins [px].
@@ -76,7 +78,9 @@ def scan_blobs(
 def _scan_blobs(
     image: Image, cells: Codes, bits: Int, grid: Grid, codes: Codes, places: Float, boxes: Int
 ) -> int:
-    """Fill in the codes (H, W), and a row for each blob: u, v, area and marker, left, top, right, bottom [px].
+    """Fill in the codes (H, W) and one row for each blob.
+
+    A row holds u, v, area and marker, left, top, right, bottom [px].
 
     Returns:
         The number of rows.
@@ -128,7 +132,10 @@ def _scan_blobs(
 
 @compiled
 def _read(image: Image, cells: Codes, wanted: int, grid: Grid, codes: Codes, hits: Int) -> int:
-    """Codes of the points, and the places of those with a wanted bit; return how many."""
+    """Read the codes of the grid points and collect those with a wanted bit.
+
+    Fills in the codes and the places of these points; returns their number.
+    """
     count = 0
     height, width = codes.shape
     five, ten = np.uint64(5), np.uint64(10)
@@ -168,7 +175,10 @@ def _put(
     place: Float,
     box: Int,
 ) -> None:
-    """From points of the grid to pixels of the image; the box reaches to where the next points would be."""
+    """Convert a blob from grid points to image pixels.
+
+    The box reaches to where the next points would be.
+    """
     step = grid.step
     place[0], place[1], place[2] = grid.dx + step * x, grid.dy + step * y, step * step * points
     box[0] = m

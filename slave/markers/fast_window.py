@@ -1,4 +1,6 @@
-"""One marker's window in machine code: its masks, the share of paint in every pixel, and their moments.
+"""Window of one marker in machine code.
+
+Its masks, the share of marker colour in every pixel, and their moments.
 
 The masks of a window lie in flat arrays of rows of `stride`, `EDGE` of nothing around them, so that no neighbourhood
 leaves them: pixel (x, y) of the window is at (y + EDGE) * stride + EDGE + x. `classes` says what the colour table
@@ -52,7 +54,9 @@ class Rules(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A part of a window [px], x1 and y1 exclusive, and where its pixels lie and which coordinates they have.
+    """Part of a window [px], with the memory layout and coordinates of its pixels.
+
+    x1 and y1 are exclusive.
 
     Attributes:
         x0, y0, x1, y1: The part.
@@ -101,7 +105,10 @@ def measure_windows(
 
 @compiled
 def _ask_ahead(image: Image, asked: Int, pad: int) -> int:
-    """Touch every line of the cache that the windows need: memory is slow, but it answers many questions at once."""
+    """Prefetch every cache line that the windows need.
+
+    Memory is slow, but it answers many requests at once.
+    """
     touched = 0
     for k in range(len(asked)):
         x0, x1 = max(asked[k, LEFT] - pad, 0), min(asked[k, RIGHT] + pad, image.shape[1])
@@ -246,7 +253,10 @@ def _classify(
 
 @compiled
 def _keep_parts_inside(inset: int, width: int, height: int, stride: int, classes: Image) -> None:
-    """What is not connected (8 neighbours) to a pixel of the mask that lies `inset` inside the window is another's."""
+    """Assign mask parts that do not reach inside the window to another marker.
+
+    A part stays if it is connected (8 neighbours) to a pixel of the mask that lies `inset` inside the window.
+    """
     kept = 4  # a class of its own while it grows
     stack = np.empty(width * height, np.int64)
     for y in range(inset, max(height - inset, inset + 1)):
@@ -339,7 +349,10 @@ def _add(a: Image, into: Image, step: int, begin: int, end: int) -> None:
 
 @compiled
 def _add_around(threes: Image, a: Image, into: Image, step: int, begin: int, end: int) -> None:
-    """Sum of a pixel and the sums of three at `step` before and behind it: of seven pixels."""
+    """Add each pixel and the sums of three at `step` before and behind it.
+
+    This is the sum of seven pixels.
+    """
     n = end - begin
     before, here, after, out = threes[begin - step :], a[begin:], threes[begin + step :], into[begin:]
     for p in range(n):
@@ -350,7 +363,10 @@ def _add_around(threes: Image, a: Image, into: Image, step: int, begin: int, end
 def _sums_of_ring(
     whole: Frame, every: int, classes: Image, kinds: Image, light: Float32
 ) -> tuple[float, ...]:
-    """Number, sums and sums of products of the light of the ring's pixels in one of `every` columns."""
+    """Return number, sums and sums of products of the light of the ring's pixels.
+
+    Only one of `every` columns is used.
+    """
     n, b, g, r, bb, bg, br, gg, gr, rr = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     first = -(-whole.x0 // every) * every
     for y in range(whole.y0, whole.y1):
@@ -375,7 +391,10 @@ def _sums_of_ring(
 
 @compiled
 def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -> None:
-    """Other markers' pixels are not near, where a square of 3 x 3 of them fits: a colour fringe is thinner."""
+    """Clear the near mark in thick regions of other markers.
+
+    Other markers' pixels are not near where a square of 3 x 3 of them fits: a colour fringe is thinner.
+    """
     stride = part.stride
     begin, end = (part.y0 + EDGE) * stride, (part.y1 + EDGE) * stride
     a, b = room[0], room[1]
@@ -398,7 +417,10 @@ def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -
 
 @compiled
 def _sums_over(mask: Image, bit: int, part: Frame, light: Float32, ramp: Float32) -> tuple[float, ...]:
-    """Over the pixels with `bit`: number, x, y, xx, xy, yy, light of 3 channels, that times x, that times y."""
+    """Return the sums over the pixels with `bit`.
+
+    They are: number, x, y, xx, xy, yy, light of 3 channels, that times x, that times y.
+    """
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     b, g, r, bx, gx, rx, by, gy, ry = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     count, middle = part.x1 - part.x0, np.float64(part.x_middle - part.x0)
@@ -447,7 +469,10 @@ def _light_over(mask: Image, bit: int, part: Frame, light: Float32) -> tuple[flo
 
 @compiled
 def _discriminant(ring: tuple[float, ...], mean: Three, rules: Rules) -> tuple[Three, float, float]:
-    """Direction of paint in light, its coordinate at the ring's mean, and the power of the step from there."""
+    """Return the discriminant direction of the marker colour in light.
+
+    Also its coordinate at the ring's mean, and the power of the step from there.
+    """
     n = max(ring[0], 1.0)
     b, g, r = ring[1] / n, ring[2] / n, ring[3] / n
     q = rules.shaded
@@ -468,7 +493,10 @@ def _discriminant(ring: tuple[float, ...], mean: Three, rules: Rules) -> tuple[T
 
 @compiled
 def _shading(sums: tuple[float, ...], w: Three, zero: float, rules: Rules) -> Three:
-    """The plane a + b x + c y of the paint's brightness: coordinates along `w` are sums of light, so are their sums."""
+    """Fit the plane a + b x + c y of the marker colour's brightness.
+
+    Coordinates along `w` are sums of light, so their sums are as well.
+    """
     n, x, y, xx, xy, yy, b, g, r, bx, gx, rx, by, gy, ry = sums
     stiff = max(n, 1.0)
     right = (
@@ -507,7 +535,10 @@ def _share_out(
     into: Float32,
     ramp: Float32,
 ) -> tuple[float, ...]:
-    """Fill in the shares; return their moments 1, x, y, xx, xy, yy in pixels of the window."""
+    """Fill in the shares and return their moments.
+
+    The moments are 1, x, y, xx, xy, yy in pixels of the window.
+    """
     w0, w1, w2, at_zero = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(zero)
     slope, darkest = np.float32(level[1]), np.float32(rules.darkest)
     nothing, all_inside = np.float32(0.0), np.float32(1.0)
@@ -546,7 +577,10 @@ def _share_out(
 
 @compiled
 def _foreign(x0: int, y0: int, x1: int, y1: int, stride: int, classes: Image) -> float:
-    """Share of the mask's neighbours in a part of the window that have another marker's colour."""
+    """Return the share of the mask's neighbours that have another marker's colour.
+
+    Only neighbours in the given part of the window count.
+    """
     rim, others = 0, 0
     for y in range(y0, y1):
         for x in range(x0, x1):

@@ -1,4 +1,6 @@
-"""Choose among all blobs those that are markers: the ones that belong together, as markers of one hand do.
+"""Selection of the blobs that are markers among all blobs.
+
+Those are chosen that belong together, as markers of one hand do.
 
 Used when the past does not answer: at the start, when a marker comes back, or when something in the marker's
 colour (a green mug, a blue pen) competes with it. Three facts tell markers from clutter, none of which knows the
@@ -34,7 +36,9 @@ SECOND_HAND = 3  # markers
 
 
 class Candidate(NamedTuple):
-    """A blob that may be marker `marker`, and what speaks for it; made by `candidate`.
+    """Blob that may be marker `marker`, with the evidence for it.
+
+    Made by `candidate`.
 
     Attributes:
         marker: Row of the marker.
@@ -78,7 +82,9 @@ def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
 
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
-    """Whether `blob` may be the rim of a blob of another colour, where the hue runs through its own.
+    """Return whether `blob` may be the rim of a blob of another colour.
+
+    At such a rim the hue runs through the colour of `blob`.
 
     It touches one that is much larger, or its middle lies in or next to the box of one that is as large: motion
     blur makes rims wide.
@@ -99,7 +105,10 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
 
 
 def connected(blobs: Sequence[Blob]) -> bool:
-    """Whether every blob is linked to another one; skin around both is taken as given, since the past vouches."""
+    """Return whether every blob is linked to another one.
+
+    Skin around both is taken as given, since their past supports it.
+    """
     reach = (REACH * (1.0 + SKIN_REACH)) ** 2
     places = [(blob.u, blob.v, math.sqrt(blob.area)) for blob in blobs]
     for i, (u, v, size) in enumerate(places):
@@ -112,7 +121,9 @@ def connected(blobs: Sequence[Blob]) -> bool:
 
 
 def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
-    """The markers among the candidates: marker row -> candidate. A marker without a plausible blob is absent.
+    """Choose the markers among the candidates: marker row -> candidate.
+
+    A marker without a plausible blob is absent.
 
     The best group is a hand. Markers that it has not may be on a second hand: a group of at least `SECOND_HAND`
     markers with skin. Less than that is clutter that happens to lie together.
@@ -174,7 +185,10 @@ def _best_group(candidates: Sequence[Candidate], links: Sequence[set[int]], amon
 
 
 def _components(links: Sequence[set[int]], among: set[int]) -> list[list[int]]:
-    """Sets of candidates that are linked directly or through others, in a fixed order."""
+    """Return the connected components of the candidates in a fixed order.
+
+    A component is a set of candidates that are linked directly or through others.
+    """
     rest = set(among)
     groups: list[list[int]] = []
     while rest:
@@ -189,7 +203,10 @@ def _components(links: Sequence[set[int]], among: set[int]) -> list[list[int]]:
 
 
 def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
-    """How well a candidate suits the rest of its group, to choose among rivals of one marker."""
+    """Score how well a candidate suits the rest of its group.
+
+    It serves to choose among alternatives of one marker.
+    """
     others = [c for c in members if c.marker != candidate.marker and c.blob.area >= SPECK]
     if not others:
         return candidate.score + 1e-4 * candidate.blob.area
@@ -200,8 +217,10 @@ def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
 
 
 def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
-    """Whether a blob lies like clutter beside a hand: no skin touches it, and it is as large as the largest
-    marker, or thin like a pen. A cap seen from its tip has no skin around it either, but it is small and round.
+    """Return whether a blob lies like clutter beside a hand.
+
+    No skin touches it, and it is as large as the largest marker, or thin like a pen. A cap seen from its tip has no
+    skin around it either, but it is small and round.
     """
     others = [c for c in others if c.blob.area >= SPECK]
     if not others or candidate.bonus >= TRACKED or candidate.skin >= SKINLESS:

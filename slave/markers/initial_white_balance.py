@@ -1,4 +1,6 @@
-"""Find the light of a picture that nothing is known of, from all its colours at once.
+"""Initial estimate of the light of an image from all its colours at once.
+
+Nothing else is known of the image.
 
 Under a light much warmer or cooler than that of calibration every hue has moved, and one paint looks like another one
 at calibration. What none of them can imitate is the whole set: only under the right light do all paints in the picture
@@ -107,14 +109,17 @@ def lights() -> Float:
 
 
 def off_line(log_gains: Float) -> float:
-    """How far red against green lies off the line of black bodies, given blue against green."""
+    """Return the distance of red against green from the line of black bodies.
+
+    Given blue against green.
+    """
     blue, green, red = log_gains
     line = lights()[-1]
     return float(abs((red - green) - line[2] / line[0] * (blue - green)))
 
 
 def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float) -> Evidence:
-    """What a picture says for a light.
+    """Return the evidence of an image for a light.
 
     Args:
         half: (h, w, 3) BGR, every second pixel of every second row, C-contiguous.
@@ -150,7 +155,10 @@ def _separated_hues(a: Float, b: Float) -> float:
 
 
 def _colours(half: Image, mask: Image) -> list[Float]:
-    """Mean linear light (3,) of the inner pixels of the largest blobs of a mask, at most `BLOBS_EACH`."""
+    """Return the mean linear light (3,) of the largest blobs of a mask.
+
+    Over the inner pixels of each blob; at most `BLOBS_EACH` blobs.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     rows = cast(list[list[int]], stats.tolist())  # left, top, width, height, area
     fair = [i for i in range(1, count) if SPECK <= rows[i][4] <= LARGEST * mask.size]

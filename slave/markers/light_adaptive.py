@@ -30,7 +30,9 @@ REFUSE = 0.2  # and from which the old one may take one marker for another: thre
 
 
 class LightAdaptiveDetector:
-    """Detects with colours that follow the light. Holds the light, the table in use and the one being made.
+    """Marker detector whose colours follow the light.
+
+    Holds the light, the table in use and the one being made.
 
     Attributes:
         warnings: What is to be warned of as of the last frame.
@@ -82,7 +84,10 @@ class LightAdaptiveDetector:
 
     @property
     def trusted(self) -> bool:
-        """Whether it may tell markers by their colours: the light is known, and its table made for it."""
+        """Return whether markers may be distinguished by their colours.
+
+        The light must be known and the table made for it.
+        """
         return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
 
     @property
@@ -91,16 +96,22 @@ class LightAdaptiveDetector:
         return self._detector
 
     def adopt(self, other: "LightAdaptiveDetector") -> None:
-        """Go on with the tracks and counts of another detector, under the light that this one knows."""
+        """Take over the tracks and counts of another detector.
+
+        The light stays the one that this detector knows.
+        """
         self._detector.adopt(other._detector)
         self.refused, self.tables = other.refused, other.tables + self.tables
 
     def tune(self, camera: CameraCalibration) -> None:
-        """As of `MarkerDetector`; what an exposure does to the colours is seen as a change of the light."""
+        """Apply a changed camera file, as `MarkerDetector` does.
+
+        What an exposure does to the colours is seen as a change of the light.
+        """
         self._detector.tune(camera)
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
-        """A detector of the same camera, under the same light, that has seen no marker yet."""
+        """Return a detector of the same camera and light that has seen no marker yet."""
         other = copy(self)
         other._detector = self._detector.fresh(initial_uv)
         return other
@@ -129,7 +140,10 @@ class LightAdaptiveDetector:
         return found
 
     def _learn(self, found: Detections, t_ns: int) -> None:
-        """Learn the light, and in the next frame, so that none takes long, look at the room of the colours."""
+        """Learn the light, and check the colour margins in the next frame.
+
+        Split over two frames so that none takes long.
+        """
         if self._look_next:
             undone = found.colour * np.exp(-self.log_gains)
             self._near = self._watch.push(undone, found.clarity, t_ns)
@@ -167,7 +181,9 @@ def detector_for(
     engine: Engine = NUMPY,
     free: Collection[str] = (),
 ) -> LightAdaptiveDetector | MarkerDetector:
-    """A detector that follows the light where the camera file allows it, else one with fixed colours.
+    """Return a light-adaptive detector where the camera file allows it.
+
+    Else one with fixed colours.
 
     Raises:
         CalibrationError: The camera has no colour range for a marker.
@@ -178,6 +194,6 @@ def detector_for(
 
 
 def can_adapt(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:
-    """Whether the camera file says what every marker looked like at calibration."""
+    """Return whether the camera file has every marker's look at calibration."""
     ranges = camera.markers or {}
     return all(name in ranges and ranges[name].reference_bgr_linear is not None for name in markers)

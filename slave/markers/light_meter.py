@@ -1,4 +1,6 @@
-"""See at once when the light changes, on what stands still: the same few hundred pixels of every frame.
+"""Immediate detection of light changes on static parts of the image.
+
+The same few hundred pixels of every frame are compared.
 
 A camera of a rig does not move, so most of its picture is the same desk in every frame. The median over all
 points of the log ratio to what each point showed before is the change of the light; a hand in front of some of them

@@ -1,4 +1,7 @@
-"""Sees no marker: for a slave whose colours are not calibrated yet, while its lens or its place is being measured."""
+"""Detector that sees no marker, for a slave without calibrated colours.
+
+Its lens or its place is being measured meanwhile.
+"""
 
 import numpy as np
 

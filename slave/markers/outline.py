@@ -106,7 +106,10 @@ def outline_of(image: Image, seen: Measured) -> Outline | None:
 
 
 def _edges(image: Image, u: float, v: float, size: float) -> Float32:
-    """Strength (RAYS, RADII) of the edges about (u, v) [px], on rays `_RAY` at `_AT` radii of `size` [px]."""
+    """Return the strength (RAYS, RADII) of the edges about (u, v) [px].
+
+    On rays `_RAY` at `_AT` radii of `size` [px].
+    """
     reach = math.ceil(FARTHEST * size) + 2
     left, top = max(math.floor(u) - reach, 0), max(math.floor(v) - reach, 0)
     part = image[top : math.floor(v) + reach + 1, left : math.floor(u) + reach + 1]
@@ -122,19 +125,25 @@ def _edges(image: Image, u: float, v: float, size: float) -> Float32:
 
 
 def _grid(*axes: Sequence[float] | Float) -> Float:
-    """All triples (N, 3) of three axes."""
+    """Return all triples (N, 3) of three axes."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _distance(circles: Float) -> Float:
-    """Where the rays meet circles (N, 3): (N, RAYS) from the hull's centre; all in its radii."""
+    """Return where the rays meet circles (N, 3), as distances (N, RAYS).
+
+    From the hull's centre; all in the hull's radii.
+    """
     du, dv, radius = circles[:, 0:1], circles[:, 1:2], circles[:, 2:3]
     across = du * _SIN - dv * _COS
     return du * _COS + dv * _SIN + np.sqrt(np.maximum(radius * radius - across * across, 0.0))
 
 
 def _samples(circles: Float) -> Whole:
-    """The samples (N, RAYS) on circles (N, 3), as indices of the flat strength; the ends have no strength."""
+    """Return the samples (N, RAYS) on circles (N, 3).
+
+    As indices of the flat strength; the ends have no strength.
+    """
     place = np.rint((_distance(circles) - NEAREST) / _STEP).astype(np.intp)
     return np.clip(place, 0, RADII - 1) + RADII * _RAY
 
@@ -145,7 +154,10 @@ _FINER = tuple(_grid(*[np.linspace(-half, half, 5)] * 3) for half in FINER)
 
 
 def _best(strength: Float32) -> Float:
-    """The circle (3,) du, dv, radius in radii of the hull along which the edges are strongest on average."""
+    """Return the circle (3,) along which the edges are strongest on average.
+
+    As du, dv, radius in radii of the hull.
+    """
     limited = np.minimum(strength, LIMIT)
     circle: Float = _COARSE[int(np.argmax(limited.take(_COARSE_SAMPLES).sum(axis=1)))]
     for finer in _FINER:
@@ -155,7 +167,10 @@ def _best(strength: Float32) -> Float:
 
 
 def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, float, float]:
-    """Centre, radius, support and standard deviation of the centre, in radii of the hull, by least squares."""
+    """Fit a circle to the edges by least squares.
+
+    Returns centre, radius, support and standard deviation of the centre, in radii of the hull.
+    """
     covariance: Float = np.eye(3)
     own: Bool = np.zeros(RAYS, np.bool_)
     for iteration in range(ROUNDS):

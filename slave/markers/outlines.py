@@ -1,4 +1,6 @@
-"""Choose the markers whose outline is sought in a frame: it costs as much as a frame of clear markers.
+"""Choice of the markers whose outline is sought in a frame.
+
+An outline costs as much as a frame of clear markers.
 
 Where the contrast is low, the surroundings may be the marker as well. Where it is clear, nothing but an outline tells:
 a large marker is looked at when it is found, from time to time, and as long as it has one that holds more than its
@@ -22,7 +24,7 @@ FULLER = 1.08  # and so many times the colour's area
 
 
 class Outlines:
-    """Holds how many frames there were, and which markers have an outline that holds more than their colour."""
+    """Frame count, and markers whose outline holds more than their colour."""
 
     def __init__(self) -> None:
         """No marker has one."""
@@ -62,7 +64,10 @@ class Outlines:
 
 
 def _holds_more(outline: Outline, seen: Measured) -> bool:
-    """Whether it is to be believed: beside a clear contrast only if it is sure, and larger than the colour."""
+    """Return whether the outline is to be used.
+
+    Beside a clear contrast it is used only if it is sure, and larger than the colour.
+    """
     if seen.contrast < CLEAR_CONTRAST:
         return True
     return outline.support >= SURE and math.pi * outline.radius**2 >= FULLER * seen.area

@@ -1,4 +1,4 @@
-"""Say how probable it is that what was found is a marker, from how it looks.
+"""Probability that a detection is a marker, from its appearance.
 
 A field, a window frame or a face holds pixels of every colour, and what a colour table finds there has an area and a
 centroid like a marker. But paint is of one colour against its surroundings, near the middle of its range, and a cap
@@ -104,7 +104,10 @@ def probability_of(evidence: Evidence) -> float:
 
 
 def clarity_of(seen: Measured, whole: float) -> float:
-    """How far (0.01..1) the core's colour is that of the paint alone, given the marker's whole area [px^2]."""
+    """Return how purely (0.01..1) the core shows the marker colour alone.
+
+    Given the marker's whole area [px^2].
+    """
     area, contrast = seen.area, seen.contrast
     clarity = math.sqrt(area / whole) if area < whole else 1.0
     if contrast < CLEAR_CONTRAST:

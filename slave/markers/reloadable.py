@@ -1,4 +1,6 @@
-"""A detector that is replaced while it runs, by one for another camera file: between two frames, tracks go on.
+"""Detector that is replaced at run time by one for another camera file.
+
+The change happens between two frames; tracks are kept.
 
 A colour table takes as long as some tens of frames to make, so the new detector is made on another thread. Where it
 follows the light it must know the light before it is of use: it looks at some frames beside the old one, on that thread
@@ -30,8 +32,11 @@ AnyDetector: TypeAlias = MarkerDetector | LightAdaptiveDetector | CalibratedDete
 
 
 class ReloadableDetector:
-    """Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and what was
-    found of late. Attribute `choice`: whether whole frames are scanned; None: they are."""
+    """Marker detector that can be replaced between two frames.
+
+    Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and recent
+    detections. Attribute `choice`: whether whole frames are scanned; None: they are.
+    """
 
     def __init__(
         self,
@@ -39,7 +44,10 @@ class ReloadableDetector:
         choice: ScanChoice | None = None,
         processor_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
-        """Begin with `detector`; `processor_ns` says what time [ns] this thread has had of the processor."""
+        """Begin with `detector`.
+
+        `processor_ns` returns the processor time [ns] that this thread has had.
+        """
         self._detector = detector
         self.choice, self._processor_ns = choice, processor_ns
         self._next: deque[AnyDetector] = deque(maxlen=1)  # one thread fills it, another empties it
@@ -74,7 +82,10 @@ class ReloadableDetector:
             self.choice.tune(camera)
 
     def replace(self, detector: AnyDetector) -> None:
-        """Let `detector`, of the same markers, take over. Not from the loop's thread: it may take a second."""
+        """Let `detector`, of the same markers, take over.
+
+        Not from the loop's thread: it may take a second.
+        """
         if isinstance(detector, LightAdaptiveDetector):
             try:
                 for image, t_ns in self._frames.following(LOOKS, TIMEOUT_S):
@@ -91,17 +102,26 @@ class ReloadableDetector:
         return self._frames.newest
 
     def found(self, t_ns: int) -> Float | None:
-        """Centroids (M, 2) [px] in the frame of a time [ns], NaN: not seen; None: too long ago. From any thread."""
+        """Return the centroids (M, 2) [px] in the frame of a time [ns].
+
+        NaN: not seen; None: too long ago. From any thread.
+        """
         return next((uv for at_ns, uv in tuple(self._found) if at_ns == t_ns), None)
 
     @property
     def plain(self) -> MarkerDetector | None:
-        """What detects at present, with its colour table; None: no colour is known. From any thread."""
+        """Return the present plain detector with its colour table.
+
+        None: no colour is known. From any thread.
+        """
         return plain_of(self._detector)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Markers without a colour, which are not sought, or will not be from the next frame on. From any thread."""
+        """Return the markers without a colour, which are not sought.
+
+        Or will not be sought from the next frame on. From any thread.
+        """
         coming = tuple(self._next)
         latest = coming[-1] if coming else self._detector
         return latest.missing if isinstance(latest, CalibratedDetector) else ()
@@ -123,7 +143,7 @@ class ReloadableDetector:
 
     @property
     def refused(self) -> int:
-        """Frames in which nothing was reported because the colours were not fit for the light."""
+        """Count the frames without a report because the colours did not fit the light."""
         return self._detector.refused if isinstance(self._detector, LightAdaptiveDetector) else 0
 
     @property
@@ -135,7 +155,10 @@ class ReloadableDetector:
 def marker_changes(
     detector: ReloadableDetector, make: Callable[[CameraCalibration, RigCalibration], AnyDetector]
 ) -> Prepare:
-    """How changed files reach `detector`: what `make` makes of them takes over, where colours or markers changed."""
+    """Return how changed files reach `detector`.
+
+    What `make` makes of them takes over, where colours or markers changed.
+    """
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         made = None

@@ -24,7 +24,9 @@ ROTATING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth
 
 
 class Window(NamedTuple):
-    """Where one marker is expected in one frame; both the gate for blobs and what is scanned.
+    """Expected region of one marker in one frame.
+
+    It is both the gate for blobs and the region that is scanned.
 
     Attributes:
         u, v: Expected centroid [px].
@@ -43,7 +45,10 @@ class Window(NamedTuple):
     largest: float
 
     def cost(self, blob: Blob) -> float:
-        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible."""
+        """Return the cost of assigning `blob`.
+
+        0 is perfect, about 1 is the rim of the window, inf is impossible.
+        """
         x, y = abs(blob.u - self.u), abs(blob.v - self.v)
         if x > self.x or y > self.y or blob.area > self.largest:
             return math.inf
@@ -83,11 +88,13 @@ class Track(NamedTuple):
     t_ns: int
 
     def alive(self, t_ns: int) -> bool:
-        """Whether the track still says where the marker is."""
+        """Return whether the track still predicts where the marker is."""
         return 0 <= t_ns - self.t_ns <= HOLD_NS
 
     def window(self, t_ns: int, image_width: int, roi_margin: float) -> "Window":
-        """Where the marker may be at `t_ns`: at constant velocity for a short time, then anywhere about that place.
+        """Predict where the marker may be at `t_ns`.
+
+        At constant velocity for a short time, then anywhere about that place.
 
         `roi_margin`: how much wider than the marker the window is, share of the image width.
         """
@@ -105,7 +112,10 @@ class Track(NamedTuple):
         return t_ns - self.t_ns > VELOCITY_NS
 
     def sudden(self, blob: Blob) -> bool:
-        """Whether the area of `blob` jumped against the last frame, by more than the grid of the scan explains."""
+        """Return whether the area of `blob` jumped against the last frame.
+
+        The jump must be larger than the grid of the scan explains.
+        """
         ratio = blob.area / self.area
         return not 1.0 / SUDDEN <= ratio <= SUDDEN and abs(blob.area - self.area) > 80.0
 
@@ -122,7 +132,10 @@ class Track(NamedTuple):
 
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
-    """The track after one more sighting; a track that was lost starts anew, without velocity."""
+    """Return the track after one more observation.
+
+    A track that was lost is reinitialised, without velocity.
+    """
     u, v, area, xx, xy, yy = seen.u, seen.v, seen.area, seen.xx, seen.xy, seen.yy
     if area < 1.0:
         area = 1.0

@@ -57,7 +57,7 @@ class ScanChoice:
         return self._scan == "auto" and self._since >= PROBE_EVERY
 
     def push(self, spent_ns: int) -> None:
-        """Take the processor time [ns] of a frame that was scanned as `windows` said."""
+        """Record the processor time [ns] of a frame scanned as `windows` specified."""
         if self.windows:
             self.frames += 1
             self._since += 1

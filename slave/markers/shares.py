@@ -1,4 +1,6 @@
-"""Find the share of paint in every pixel of a stack of windows, in linear light.
+"""Share of marker colour in every pixel of a stack of windows.
+
+In linear light.
 
 1. A linear discriminant between core and ring, w = (S_ring + q m m' + N)^-1 (m - m_ring), m the mean of the core, is
    the colour direction along which the surroundings vary least: skin on one side and table on the other both become

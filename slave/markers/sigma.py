@@ -1,4 +1,4 @@
-"""Say how far a measured centroid may be off, in pixels, from what was measured.
+"""Standard deviation of a measured centroid [px], from the measurement itself.
 
 Five independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
 

@@ -1,4 +1,6 @@
-"""Know the light of one camera at every frame, from three sources that differ in what they can tell.
+"""Light of one camera at every frame, from three sources.
+
+The sources differ in what they can estimate.
 
     initial_white_balance   the first picture: all colours together prove one light      at the start, and after doubt
     light_meter   what stands still: how the light changes, at once             every frame
@@ -41,7 +43,10 @@ POOR_FITS = 5  # looks in a row, half a second, in which the markers fit badly a
 
 
 class WhiteBalance:
-    """The light of one camera. Holds its estimate, whether it is proven, and the proof under way."""
+    """Light of one camera.
+
+    Holds its estimate, whether it is proven, and the proof under way.
+    """
 
     def __init__(self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Workers) -> None:
         """Begin with the light of calibration, not proven.
@@ -72,7 +77,7 @@ class WhiteBalance:
 
     @property
     def trusted(self) -> bool:
-        """Whether markers may be told by their colours."""
+        """Return whether markers may be distinguished by their colours."""
         return self.proven or self._plausible
 
     def look(self, image: Image, t_ns: int) -> None:
@@ -89,7 +94,9 @@ class WhiteBalance:
             self._prove(image, t_ns)
 
     def learn(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
-        """Take in what the markers of that picture showed; None where the last look is too recent.
+        """Update the light from the marker colours of an image.
+
+        Returns None where the last look is too recent.
 
         Args:
             colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
@@ -124,7 +131,7 @@ class WhiteBalance:
         return found
 
     def _change(self, image: Image, change: Change) -> None:
-        """Add a change of the light, unless something in front of the camera only looks like one."""
+        """Add a change of the light unless an object in front of the camera mimics one."""
         sudden = apart(change.log_gains, np.zeros(3)) > SUDDEN
         if sudden and change.agreeing < CLEAR:
             half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
@@ -161,6 +168,9 @@ class WhiteBalance:
 
 
 def apart(a: Float, b: Float, dim: float = DIM) -> float:
-    """How different two lights (3,) look to the colour table, in log gains of red or blue against green."""
+    """Return how different two lights (3,) look to the colour table.
+
+    In log gains of red or blue against green.
+    """
     blue, green, red = (a - b).tolist()
     return max(abs(blue - green), abs(red - green), dim * abs(green))

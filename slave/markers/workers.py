@@ -1,4 +1,7 @@
-"""Who does what takes longer than a frame: a thread pool on a live slave, the caller where runs must be equal."""
+"""Execution of jobs that take longer than a frame.
+
+In a thread pool on a live slave, in the caller where runs must be equal.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -16,7 +19,10 @@ class Workers(Protocol):
 
 
 class Inline:
-    """Does every job at once, in the caller's thread: the same input gives the same output."""
+    """Worker that does every job at once, in the caller's thread.
+
+    The same input gives the same output.
+    """
 
     def submit(self, fn: Callable[[], T], /) -> Future[T]:
         """Do it; the future is done."""

@@ -1,1 +1,4 @@
-"""Devices that track themselves, such as a Vive tracker: one seam, one file per driver."""
+"""Devices that track themselves, such as a Vive tracker.
+
+One interface, one file per driver.
+"""

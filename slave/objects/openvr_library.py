@@ -1,4 +1,6 @@
-"""What Phalanx uses of openvr (pyopenvr): its interface as types, and the one place that imports it.
+"""Interface to openvr (pyopenvr), as far as Phalanx uses it.
+
+Its interface as types, and the one place that imports it.
 
 It is there on PCs with x86 processors only, and useless without SteamVR, so it is imported when a tracker is opened.
 Names and meanings were read in openvr 2.12 (openvr/__init__.py, error_code/__init__.py).
@@ -20,7 +22,10 @@ class VrSystem(Protocol):
     def getDeviceToAbsoluteTrackingPose(
         self, origin: int, predictedSecondsToPhotonsFromNow: float, trackedDevicePoseArray: Any
     ) -> Sequence[Any]:
-        """`TrackedDevicePose_t` of all devices, led to a moment so many seconds after the call."""
+        """Return `TrackedDevicePose_t` of all devices.
+
+        Predicted to a time so many seconds after the call.
+        """
         ...
 
     def getTrackedDeviceClass(self, deviceIndex: int) -> int:

@@ -30,7 +30,10 @@ _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
 
 class OpenVrTracker:
-    """A `TrackerSource`. Holds the connection to SteamVR, which device is ours, and when it is asked next."""
+    """`TrackerSource` that reads a device from SteamVR.
+
+    Holds the connection to SteamVR, which device is ours, and when it is asked next.
+    """
 
     def __init__(
         self,
@@ -91,7 +94,10 @@ class OpenVrTracker:
             self._library.shutdown()
 
     def counts(self) -> Mapping[str, int]:
-        """`lost_itself`: asked while it saw no base station; `absent`: while it was switched off."""
+        """Return the counts `lost_itself` and `absent`.
+
+        `lost_itself`: asked while it saw no base station; `absent`: while it was switched off.
+        """
         return dict(self._counts)
 
     def metrics(self) -> Mapping[str, float]:
@@ -107,7 +113,10 @@ class OpenVrTracker:
                 raise TrackerError("SteamVR ends: start it again")
 
     def _ask(self, system: VrSystem) -> TrackerPose | None:
-        """One pose; None: it is lost, and that has been said just now."""
+        """Ask for one pose.
+
+        None: the device is lost, and that has just been reported.
+        """
         before_ns = self._clock.now_ns()
         poses = system.getDeviceToAbsoluteTrackingPose(
             self._library.TrackingUniverseRawAndUncalibrated, 0.0, None
@@ -126,7 +135,10 @@ class OpenVrTracker:
         return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
     def _found(self, system: VrSystem, now_ns: int) -> int | None:
-        """The device's number, which stays while SteamVR runs; searched again once a second until it is there."""
+        """Return the device's number, which stays while SteamVR runs.
+
+        It is searched again once a second until the device is there.
+        """
         if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= POLL_NS):
             self._looked_ns = now_ns
             self._index = self._search(system)
@@ -185,7 +197,10 @@ class OpenVrTracker:
 
 
 def matrix34(matrix: object) -> tuple[Float, Float] | None:
-    """Place (3,) [m] and quaternion (4,) wxyz of an `HmdMatrix34_t`, row by row; None: it is no pose."""
+    """Convert an `HmdMatrix34_t` to place (3,) [m] and quaternion (4,) wxyz.
+
+    The matrix is given row by row; None: it is no pose.
+    """
     rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
     if rows.shape != (3, 4) or not np.isfinite(rows).all():
         return None

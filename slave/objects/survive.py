@@ -1,4 +1,6 @@
-"""libsurvive as a program of its own, survive-cli, which is started here and whose lines are read; or a file of them.
+"""Tracker source that reads libsurvive's own program, survive-cli.
+
+The program is started here and its lines are read; or the lines of a file are.
 
 The library has no Linux wheel, so nothing of it is loaded: whoever wants it builds it (docs/tracker.md). The program
 writes its lines into a pseudo terminal, because into a pipe C's stdio would write blocks of 4 kB, half a second of
@@ -40,7 +42,10 @@ _LOG = logging.getLogger(__name__)
 
 
 class SurviveTracker:
-    """A `TrackerSource` that reads survive-cli. Holds the program, its terminal, and poses not handed over yet."""
+    """`TrackerSource` that reads survive-cli.
+
+    Holds the program, its terminal, and poses not handed over yet.
+    """
 
     def __init__(
         self,
@@ -125,7 +130,10 @@ class SurviveTracker:
         self._came.extend(self._device.push(data, self._clock.now_ns()))
 
     def _lost(self, now_ns: int) -> TrackerPose:
-        """A pose of NaN: of a time between the last pose and any that may still be on its way."""
+        """Return a pose of NaN for a lost device.
+
+        Its time is between the last pose and any that may still be on its way.
+        """
         self._received_ns = now_ns
         if now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
@@ -138,7 +146,10 @@ class SurviveTracker:
 
 
 class SurviveFile:
-    """A `TrackerSource` that plays lines that were recorded, at the pace of their times. Holds the open file."""
+    """`TrackerSource` that plays recorded lines at the pace of their times.
+
+    Holds the open file.
+    """
 
     def __init__(
         self, name: str, wanted: str | None, path: Path, clock: Clock, stop: threading.Event

@@ -86,7 +86,10 @@ class LineDecoder:
         self._rest = b""
 
     def push(self, data: bytes) -> Iterator[Found]:
-        """What the lines say that end in `data`, in order; other lines: nothing."""
+        """Parse the lines that end in `data`, in order.
+
+        Other lines yield nothing.
+        """
         lines = (self._rest + data).split(b"\n")
         self._rest = lines.pop()
         if len(self._rest) > LONGEST:
@@ -99,7 +102,10 @@ class LineDecoder:
 
 
 def read_line(line: bytes) -> Found | None:
-    """What one line without its end says; None: nothing that matters here."""
+    """Parse one line without its end.
+
+    None: nothing that matters here.
+    """
     words = line.split(None, 3)
     if len(words) < 3:
         return None
@@ -211,7 +217,7 @@ class SurviveDevice:
         return self._counts
 
     def there(self) -> str:
-        """Which devices have told anything, as text for people."""
+        """Return the devices that have reported anything, as text for people."""
         names = list(dict.fromkeys([*self._posed, *self._serials]))
         return ", ".join(self._called(one) for one in names) or "no device at all"
 

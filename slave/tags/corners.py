@@ -1,4 +1,6 @@
-"""Corners of tags to some hundredths of a pixel: a line is laid along each side, the corners are where two meet.
+"""Corners of tags to some hundredths of a pixel.
+
+A line is fitted along each side; the corners are where two lines meet.
 
 A side is an edge between black print and white paper, blurred by lens, pixel and motion: across it the light follows a
 cumulative normal distribution. Its place, slope, width and both levels are fitted to what is seen along the side
@@ -123,7 +125,10 @@ def _fit(
 
 
 def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -> Float:
-    """Points (N, 4, ALONG, 2) [px] of the sides at shares `place` (N, 4, ALONG) of their length."""
+    """Return points (N, 4, ALONG, 2) [px] on the sides of the tags.
+
+    At shares `place` (N, 4, ALONG) of their length.
+    """
     if lens is None:
         return begin[..., None, :] + place[..., None] * (end - begin)[..., None, :]
     a = lens.undistort(begin)
@@ -132,7 +137,10 @@ def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -
 
 
 def _sampled(light: Float, at: Float) -> Float:
-    """Light at points (N, 4, ALONG, ACROSS, 2) [px], between pixels; the rim of the image goes on outside."""
+    """Interpolate the light at points (N, 4, ALONG, ACROSS, 2) [px].
+
+    Between pixels; the rim of the image goes on outside.
+    """
     flat = np.ascontiguousarray(at.reshape(-1, ALONG * ACROSS, 2), np.float32)
     found = cv2.remap(
         light.astype(np.float32),
@@ -146,8 +154,11 @@ def _sampled(light: Float, at: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Sides:
-    """Samples of S sides: light (S, ALONG, ACROSS), their places along (S, ALONG) 0..1 and across (S, ACROSS) [px],
-    how deep and how long a cell is (S,) [px], whether those behind the border are white (S, cells)."""
+    """Samples of S sides.
+
+    Light (S, ALONG, ACROSS), their places along (S, ALONG) 0..1 and across (S, ACROSS) [px], how deep and how long a
+    cell is (S,) [px], whether those behind the border are white (S, cells).
+    """
 
     seen: Float
     place: Float
@@ -159,8 +170,11 @@ class _Sides:
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
-    """S sides: how far outward they lie [px] at begin and end (S, 2), its variances (S, 2) per variance of a sample,
-    mean square of the residuals (S,), contrast (S,), width of the edge (S,) [px]."""
+    """Fitted lines of S sides.
+
+    How far outward they lie [px] at begin and end (S, 2), its variances (S, 2) per variance of a sample, mean square
+    of the residuals (S,), contrast (S,), width of the edge (S,) [px].
+    """
 
     offset: Float
     variance: Float
@@ -192,8 +206,11 @@ def _edges(sides: _Sides) -> _Lines:
 
 
 def _law(p: Float, sides: _Sides) -> tuple[Float, Float]:
-    """Jacobian (S, ALONG * ACROSS, 6) and light (S, ALONG, ACROSS) of edges with parameters (S, 6): light of the black
-    and of the white, offsets at begin and end, by what share the light rises along the side, log of the width."""
+    """Return the Jacobian and light of the edge model at given parameters.
+
+    Jacobian (S, ALONG * ACROSS, 6) and light (S, ALONG, ACROSS) of edges with parameters (S, 6): light of the black
+    and of the white, offsets at begin and end, by what share the light rises along the side, log of the width.
+    """
     dark, bright, first, last, rise, width = p.T[:, :, None, None]
     width = np.exp(width)
     t = sides.place[:, :, None]

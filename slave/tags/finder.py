@@ -1,4 +1,6 @@
-"""Frame in, tags out: those that were seen are looked for where they should be, the rest is searched bit by bit.
+"""Tag finder: frame in, tags out.
+
+Tags that were seen are sought where they should be, the rest of the image is searched part by part.
 
 A push machine; it holds where each tag was and how it moved, and which part of the image is next.
 
@@ -58,7 +60,10 @@ class FoundTags:
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """Where a tag was: corners (4, 2) [px], their velocity (4, 2) [px/s], when, and how wide its edges were."""
+    """Track of a tag.
+
+    Its corners (4, 2) [px], their velocity (4, 2) [px/s], the time, and how wide its edges were.
+    """
 
     uv: Float
     speed: Float
@@ -73,7 +78,10 @@ class _Track:
 
 
 class TagFinder:
-    """Finds the tags of one camera's objects. Holds a track per tag, and which part is searched next."""
+    """Finder of the tags of one camera's objects.
+
+    Holds a track per tag, and which part is searched next.
+    """
 
     def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
         """Seek the tags of `objects`.
@@ -162,7 +170,10 @@ class TagFinder:
     def _search(
         self, part: Image, grey: Image, box: Box, scale: int, found: dict[int, tuple[Float, float]]
     ) -> None:
-        """Seek tags in a part of the image that begins at left, top of `box` and is smaller by `scale`."""
+        """Search for tags in a part of the image.
+
+        The part begins at left, top of `box` and is smaller by `scale`.
+        """
         begun = quads(part)
         begun = (begun + 0.5) * scale - 0.5 + np.array(box[:2], np.float64)
         begun = begun[[not _known(quad, found) for quad in begun]] if len(begun) else begun
@@ -187,7 +198,10 @@ class TagFinder:
                     found[number] = final.uv[k], float(final.sigma_px[k])
 
     def _near(self, tracks: dict[int, _Track], found: dict[int, tuple[Float, float]], t_ns: int) -> list[Box]:
-        """Where lost tags may be, and those beside what was found; boxes that touch become one."""
+        """Return the boxes in which lost tags may be.
+
+        And those beside what was found; boxes that touch become one.
+        """
         boxes: list[Box] = []
         for number, track in tracks.items():
             astray = (

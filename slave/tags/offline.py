@@ -1,4 +1,7 @@
-"""Tags of a whole recording, beside the markers of its frames, into one file per camera; deterministic."""
+"""Tags of a whole recording, into one file per camera.
+
+Beside the markers of its frames; deterministic.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -74,7 +77,9 @@ class TagCollector:
 def tagged_objects(
     recorded: Mapping[str, ObjectProfile], rig: RigCalibration, calibration: Path | None
 ) -> dict[str, ObjectProfile]:
-    """The objects of a rig that have tags: as recorded, or as DIR/objects has them, where `calibration` is given.
+    """Return the objects of a rig that have tags.
+
+    As recorded, or as DIR/objects has them, where `calibration` is given.
 
     Raises:
         CalibrationError: A file is broken, or an object of the rig is nowhere.

@@ -1,4 +1,7 @@
-"""Dark four-sided patches on bright ground: what may be a tag, before its code is read."""
+"""Dark quadrilaterals on bright ground, as candidates for tags.
+
+They are found before the code of a tag is read.
+"""
 
 import cv2
 import numpy as np
@@ -41,7 +44,10 @@ def quads(grey: Image) -> Float:
 
 
 def _with_margin(corners: Float) -> Float:
-    """The same with their sides moved outward: an outline runs through the middles of the outermost dark pixels."""
+    """Return the same quadrilaterals with their sides moved outward.
+
+    An outline runs through the middles of the outermost dark pixels.
+    """
     along = np.roll(corners, -1, axis=1) - corners
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     before = np.roll(along, 1, axis=1)

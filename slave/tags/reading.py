@@ -1,4 +1,6 @@
-"""Read the code of a tag whose corners are known to hundredths, and say how well it fits what is printed.
+"""Reading of a tag's code, with its fit to what is printed.
+
+The corners of the tag are known to hundredths.
 
 The light of every cell is compared with what each tag of the objects would show there, blurred as the tag's edges are:
 by the correlation of the code's cells. So a tag is read though its cells are but two or three pixels wide and no bit of
@@ -107,7 +109,10 @@ class Codes:
 
 
 def _blur(cells: int, width: float) -> Float:
-    """Share (cells, cells) that each cell has in the light at the middle of each other, blurred by `width` cells."""
+    """Return the blur matrix (cells, cells) of a row of cells.
+
+    It holds the share that each cell has in the light at the middle of each other, blurred by `width` cells.
+    """
     apart = (np.arange(cells)[:, None] - np.arange(cells)).astype(np.float64)
     width = max(width, 0.05)
     weight = normal_law((apart + 0.5) / width) - normal_law((apart - 0.5) / width)

@@ -1,1 +1,4 @@
-"""Beside the camera of a wrist device: from strobed frames to laser points and fingertips."""
+"""Processing beside the camera of a wrist device.
+
+From strobed frames to laser points and fingertips.
+"""

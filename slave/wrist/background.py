@@ -1,4 +1,7 @@
-"""Subtract the ambient frame of a triple: the device's own light is left."""
+"""Subtraction of the ambient frame of a strobe cycle.
+
+The device's own light is left.
+"""
 
 import cv2
 import numpy as np
@@ -10,7 +13,9 @@ LEAST = 16  # grey levels that were added: less is noise beside what is white an
 
 
 def lit_line(frame: Image, ambient: Image) -> Image:
-    """As `lit` (H, W), for the laser's line: white where the light that was added made the frame white.
+    """Return the image (H, W) of the laser's line, as `lit` does.
+
+    White where the light that was added made the frame white.
 
     In the sun a line has less room up to white the brighter the skin is: what is left of it says nothing of the line.
     """

@@ -1,4 +1,7 @@
-"""Energy of a seam at each pixel: low in a valley, high on the skin of a finger."""
+"""Energy of a seam at each pixel.
+
+Low in a minimum, high on the skin of a finger.
+"""
 
 import cv2
 import numpy as np
@@ -24,7 +27,9 @@ SIDE_KERNEL = np.ones((1, MARGIN), dtype=np.uint8)
 
 
 def energy(straightened: Image, crossed: int) -> Float32:
-    """Energy of the straightened corridors (S, K): from 0 in a black valley to `SURFACE` on a finger, and `PRIOR`.
+    """Return the energy of the straightened search bands (S, K).
+
+    From 0 in a black minimum to `SURFACE` on a finger, and `PRIOR`.
 
     A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
     beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side

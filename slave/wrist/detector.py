@@ -1,4 +1,6 @@
-"""The whole line of a wrist camera, from frames to what its laser and its LEDs show of five fingers.
+"""Complete pipeline of a wrist camera.
+
+From frames to what its laser and its LEDs show of five fingers.
 
 frame -> strobe -> triple -- LED less ambient ---> seams between the fingers
                          \\-- laser less ambient -> where the laser meets each finger -> fingertips
@@ -29,7 +31,7 @@ RECENT = 4  # triples
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristFound:
-    """What was found in one strobed triple.
+    """Detections in one strobe cycle.
 
     Attributes:
         cycle: The frames.
@@ -62,8 +64,10 @@ class WristFound:
 
 
 class WristDetector:
-    """Holds the strobe, which knows the frames since the last triple, the view that the next triple is seen with, and
-    what was found of late, for whoever shows it.
+    """Detector of a wrist camera.
+
+    Holds the strobe, which knows the frames since the last strobe cycle, the view that the next strobe cycle is seen
+    with, and recent detections, for whoever shows them.
 
     Of a pose nothing is used again: two triples have nothing to do with each other.
     """
@@ -87,7 +91,10 @@ class WristDetector:
         return dict(self._strobe.counts)
 
     def push(self, frame: Frame) -> WristFound | None:
-        """Take the next frame of the camera; what was found, where it completes a triple."""
+        """Take the next frame of the camera.
+
+        Returns the detections where it completes a strobe cycle.
+        """
         cycle = self._strobe.push(frame)
         if cycle is None:
             return None
@@ -96,19 +103,26 @@ class WristDetector:
         return found
 
     def found(self, t_ns: int) -> tuple[Float, Float] | None:
-        """Laser points and tips (5, 2) [px] of the triple whose LED frame is of that time [ns], NaN: not seen.
+        """Return the laser points and tips (5, 2) [px] of a strobe cycle.
+
+        It is the one whose LED frame is of that time [ns]; NaN: not seen.
 
         None: too long ago, or no such frame. From any thread.
         """
         return next(((laser, tips) for at_ns, laser, tips in tuple(self._found) if at_ns == t_ns), None)
 
     def replace(self, view: WristView) -> None:
-        """See with another view, a prepared one, from the next triple on. From any thread."""
+        """Use another view, a prepared one, from the next strobe cycle on.
+
+        From any thread.
+        """
         self._view = view
 
 
 def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
-    """The same view, once all that hangs on it alone (corridors, templates) has been made and is kept.
+    """Return the same view once all its dependent data has been made and cached.
+
+    That is what depends on the view alone (search bands, templates).
 
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
@@ -122,7 +136,7 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
 
 
 def find(cycle: StrobeCycle, view: WristView, engine: Engine = NUMPY) -> WristFound:
-    """What one triple shows of the five fingers."""
+    """Detect the five fingers in one strobe cycle."""
     ambient = cycle.ambient.image
     led = lit(cycle.led.image, ambient)
     fingers = separate(led, view, engine)

@@ -1,4 +1,7 @@
-"""Which code does the inner loops before a wrist device: OpenCV and numpy, or machine code. Chosen by name alone."""
+"""Choice of the code for the inner loops of a wrist device, by name alone.
+
+OpenCV and numpy, or machine code.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,6 @@
-"""The seams between fingers as machine code by numba, and the whole of the engine of that name.
+"""Seams between fingers as machine code by numba.
+
+And the whole of the engine of that name.
 
 What it makes is what `valleys` and `paths` make, but for sums added up in another order. Dozens of calls for a few
 hundred numbers each become one.
@@ -93,7 +95,9 @@ def _energy(
 
 
 def prepare() -> None:
-    """Compile everything, on a drawn line: a first hand must not find a slave that compiles.
+    """Compile everything, on a synthetic line.
+
+    A first hand must not find a slave that compiles.
 
     Some ten seconds on a desktop processor the first time a version runs; half a second later, from the cache.
     """

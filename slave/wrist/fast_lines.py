@@ -1,4 +1,6 @@
-"""The laser line as machine code by numba: its runs, how they link up, and the pieces of each finger's.
+"""Laser line as machine code by numba.
+
+Its runs, how they link up, and the pieces of each finger's line.
 
 What it makes is what `runs` and `finger_lines` make, but for sums added up in another order.
 """
@@ -44,7 +46,10 @@ def _scan(
     whole: Int,
     parts: Float,
 ) -> int:
-    """Column, first row and the one after the last (N, 3), sub-pixel row and peak (N, 2), of an image on its side."""
+    """Scan an image on its side for runs.
+
+    Fills in column, first row and the one after the last (N, 3), sub-pixel row and peak (N, 2).
+    """
     thickest, flat_px, top, of_peak, of_flat = limits
     left, first = corner
     count = 0
@@ -78,7 +83,10 @@ def _scan(
 
 @compiled
 def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: Int) -> int:
-    """Order of runs line by line, first run of each line, and which line it joins; their number."""
+    """Link runs to lines and return their number.
+
+    Fills in the order of runs line by line, the first run of each line, and which line it joins.
+    """
     count = len(whole)
     to, off = np.full(count, -1), np.full(count, math.inf)
     from_ = np.full(count, -1)

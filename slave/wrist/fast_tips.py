@@ -1,4 +1,6 @@
-"""The search for fingertips as machine code by numba: postures, what they cost, outlines, ends.
+"""Search for fingertips as machine code by numba.
+
+Postures, what they cost, outlines, ends.
 
 What it makes is what `fingertips.candidates` makes, but for sums added up in another order.
 """
@@ -92,7 +94,10 @@ class _Outline(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """N hypotheses: as `fingertips.Hypotheses`, and of the samples the middle of the fingertip and its end (N, 4)."""
+    """N hypotheses of fingertip postures.
+
+    As `fingertips.Hypotheses`, and of the samples the middle of the fingertip and its end (N, 4).
+    """
 
     row: Float
     abduction: Float
@@ -207,7 +212,10 @@ def _search(
     edges: _Outline,
     out: Float,
 ) -> None:
-    """Of each finger: outline (x, y, radius, sigma, shown), misfit, and `Ends`; NaN: no posture of it fits."""
+    """Search the fingertip of each finger.
+
+    Fills in the outline (x, y, radius, sigma, shown), residual, and `Ends`; NaN: no posture of the finger fits.
+    """
     length = table.laser.shape[3]
     most = _VARIANTS * length
     found = _Found(np.empty(most), np.empty(most), np.empty(most), np.empty(most), np.empty((most, 4)))
@@ -242,7 +250,10 @@ def _search(
 def _postures(
     image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, finger: int, found: _Found
 ) -> int:
-    """Postures of index ... little that meet the laser where it is seen and are as bright as they should be."""
+    """Collect postures of index ... little that match the laser and brightness.
+
+    They meet the laser where it is seen and are as bright as they should be.
+    """
     length = table.laser.shape[3]
     off, share, lateral, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
     sure, typical, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
@@ -336,7 +347,10 @@ def _take(
     found: _Found,
     count: int,
 ) -> int:
-    """Add a posture where its fingertip is about as bright as it should be; how many there are."""
+    """Add a posture where its fingertip is about as bright as it should be.
+
+    Returns how many there are.
+    """
     if count == len(found.row):
         return count
     middle, near = table.middle[row], table.near[row]
@@ -367,7 +381,7 @@ def _cost(
     of_finger: bool,
     limits: _Limits,
 ) -> float:
-    """As `fingertips.costs`, without what the laser says."""
+    """Return the cost of a posture, as `fingertips.costs`, without the laser."""
     bones = limits.bones
     off = np.empty(bones)
     known = np.empty(bones, np.int64)
@@ -504,8 +518,11 @@ def _fit(led: Image, circle: Float, open_: Float32, edges: _Outline) -> None:
 def _edge(
     led: Image, x: float, y: float, radius: float, way: Float, log: Float32, edges: _Outline
 ) -> tuple[float, float, bool]:
-    """Of one direction: how far beyond the circle the edge is, in radii, how much the logarithm of light falls there,
-    and whether the image shows that far."""
+    """Find the edge of the light in one direction from a circle.
+
+    Returns how far beyond the circle the edge is, in radii, how much the logarithm of light falls there, and whether
+    the image shows that far.
+    """
     height, width = led.shape
     steps = len(edges.share)
     for k in range(steps):

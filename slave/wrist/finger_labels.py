@@ -1,4 +1,6 @@
-"""Whose each part of the laser line is, by where it lies on the laser's plane, where the seams cannot be right.
+"""Finger labels of the parts of the laser line.
+
+By where each part lies on the laser's plane, where the seams cannot be right.
 
 A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
 axis of its own (`LaserWorkspace.place`), even where seams lie in another valley. A wrist that deviates by 5 degrees
@@ -28,7 +30,10 @@ _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
 def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
-    """Fingers (N,) of runs at pixels (N, 2), from those that seams say (N,), `NONE` where there is no line."""
+    """Return the fingers (N,) of runs at pixels (N, 2).
+
+    From the labels (N,) that the seams give, `NONE` where there is no line.
+    """
     beyond, place = workspace.on_plane(points)
     on = finger != NONE
     near = on & workspace.only_thumb(beyond, place)
@@ -72,7 +77,9 @@ def _shift(place: Float) -> float:
 
 
 def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
-    """Which parts (N,) of fingers `of` may go to the `nearest`: not all of a finger's line to one that has its own.
+    """Return which parts (N,) of fingers `of` may go to the `nearest` finger.
+
+    Not all of a finger's line may go to a finger that has its own line.
 
     Then the finger is spread, or the palm is not quite where it should be.
     """
@@ -82,7 +89,9 @@ def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
 
 
 def _at_creases(finger: Int, runs: Runs) -> Int:
-    """Fingers (N,) of runs, with each change of finger along a line moved to the crease near by.
+    """Move each change of finger along a line to the crease near by.
+
+    Returns the fingers (N,) of runs.
 
     A line bends away at the sides of every finger, so that between two that touch its farthest, in the image its
     uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
@@ -106,7 +115,10 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
 
 
 def _climb(start: int, along: range, row: Float, same: Bool) -> int:
-    """The last run from one on along a line, of the same finger: some columns, and farther while it rises."""
+    """Return the last run of the same finger from one run on along a line.
+
+    It covers some columns, and goes farther while the line rises.
+    """
     last = start
     for count, k in enumerate(along, 1):
         if not (same[k] and (count < _CREASE_PX or row[k] < row[last])):

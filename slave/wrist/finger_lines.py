@@ -78,12 +78,17 @@ def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
 
 
 def _of_fingers(of: Int, weight: Float) -> Float:
-    """Sums (5,) of weights (M,) by finger, which `of` (M,) counts from 1; 0: no finger."""
+    """Return the sums (5,) of weights (M,) by finger.
+
+    `of` (M,) counts the finger from 1; 0: no finger.
+    """
     return np.asarray(np.bincount(of, weight, 6)[1:], np.float64)
 
 
 def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
-    """Half of how far (5,) [px] the middle of a finger's line in parts lies from that of its longest part alone.
+    """Return the centroid spread (5,) [px] of fingers whose line is in parts.
+
+    It is half of the distance of the middle of the line in parts from that of its longest part alone.
 
     NaN where the line is whole.
 
@@ -107,8 +112,10 @@ def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
 
 
 def _ends(points: Float, left: Int, right: Int) -> tuple[Float, Int]:
-    """Where lines end (2 P, 2) beyond their first and last runs (P,), and from which runs (2 P,) on straight; left
-    ends first.
+    """Return where lines end (2 P, 2), and the runs from which they are straight.
+
+    The ends lie beyond the first and last runs (P,) of the lines; they go on straight from runs (2 P,). Left ends
+    first.
 
     A line goes round a finger until it is seen no more: near its end it falls away as the root of the distance to the
     end does, most of it in less than a column, and dark. So a long one is continued from a few columns within.

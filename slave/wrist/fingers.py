@@ -101,7 +101,9 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
 def _part(
     paths: Int, straightened: Image, energy: Float32, search_bands: SearchBands, engine: Engine
 ) -> None:
-    """Where a seam and the next one lie in one valley, send the one that is farther out of its corridor to another.
+    """Separate neighbouring seams that lie in one minimum.
+
+    The one that is farther out of its search band is sent to another minimum.
 
     `paths` (3, S) and `energy` are changed.
     """
@@ -126,7 +128,10 @@ def _part(
 
 
 def _in_thumbs(search_bands: SearchBands, seams: Float) -> Float:
-    """Which sample (3, S) of the thumb's corridor each of three seams (3, S) crosses at every circle."""
+    """Return the sample (3, S) of the thumb's search band that each seam crosses.
+
+    For each of three seams (3, S), at every circle.
+    """
     count = seams.shape[1]
     steps = STATION_PX * np.arange(count, dtype=np.float64)
     rows = np.broadcast_to(search_bands.row + steps, seams.shape)

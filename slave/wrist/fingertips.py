@@ -1,4 +1,6 @@
-"""Fingertips in the LED image, by analysis and synthesis: postures that the laser allows, compared with what is seen.
+"""Fingertips in the LED image, by analysis and synthesis.
+
+Postures that the laser allows are compared with what is seen.
 
 The laser gives a point of each finger's skin in space, and with it the abduction and one of the flexions: of the
 finger's table (`postures`) few rows are left. Each says how bright its samples would be; the scale of brightness comes
@@ -159,7 +161,9 @@ class Hypotheses:
 
 
 def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32, Float32]:
-    """Which rows meet the laser about where each finger (5, 2) [m] does; `abduction`, `aside` and `cost` of them.
+    """Return the table rows that meet the laser about where each finger does.
+
+    The fingers are (5, 2) [m]. Returns also the `abduction`, `aside` and `cost` of the rows.
 
     The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser tells little of it, and rows
     come in three abductions.
@@ -207,7 +211,10 @@ def on_plane(laser_m: Float, view: WristView) -> Float32:
 
 
 def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) -> Hypotheses | None:
-    """Postures that the laser points (5, 3) [m] allow, and whose fingertips are about as bright as they should be."""
+    """Return postures consistent with the laser and fingertip brightness.
+
+    The laser points (5, 3) [m] allow them, and their fingertips are about as bright as they should be.
+    """
     table = postures_of(view)
     rows, share, aside, cost = allowed(table, on_plane(laser_m, view))
     seen, bound, outside = image.at(_at(table.middle[rows], share))
@@ -232,14 +239,20 @@ def _at(parabola: Float32, share: Float32) -> Float32:
 
 
 def _logarithm(seen: Float32, predicted: Float32, bound: Bool) -> Float32:
-    """Of nearness by what is predicted; where the image is saturated it may be as bright as predicted."""
+    """Return the logarithm of seen over predicted nearness.
+
+    Where the image is saturated it may be as bright as predicted.
+    """
     off = np.log(np.maximum(seen, LEAST_NEAR) / np.maximum(predicted, np.float32(0.1)))
     np.maximum(off, 0.0, out=off, where=bound)
     return off
 
 
 def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
-    """Minus twice the logarithm of the likelihood (N,) of hypotheses by laser and samples."""
+    """Return minus twice the log likelihood (N,) of hypotheses.
+
+    By laser and samples.
+    """
     seen, bound, outside = image.at(some.uv[:, :APEX])
     predicted = some.table.near[some.rows] * np.float32(gain)
     off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
@@ -319,7 +332,10 @@ Search: TypeAlias = Callable[[Image, LedImage, Float, WristView], Candidates | N
 
 
 def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
-    """What is most likely the end of each finger whose laser point is known; None: of no finger."""
+    """Return the most likely end of each finger whose laser point is known.
+
+    None: of no finger.
+    """
     laser_m = view.on_plane(laser_uv)
     gain = light_scale(image, laser_uv, laser_m)
     some = hypotheses(laser_m, image, gain, view) if gain is not None else None
@@ -340,7 +356,10 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
 
 
 def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32:
-    """`open` (M, DIRECTIONS) of hypotheses (M,), without where something hides the finger next to its end."""
+    """Return `open` (M, DIRECTIONS) of hypotheses (M,), without occluded ends.
+
+    It is cleared where something hides the finger next to its end.
+    """
     open_, uv = some.table.open[some.rows[which]], some.uv[which]
     seen, bound, outside = image.at(uv[:, BONES])
     off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
@@ -353,14 +372,20 @@ def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32
 
 
 def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
-    """What circles (N, 2), (N,) [px] cost that are not where postures have them, nor as large."""
+    """Return the cost of circles (N, 2), (N,) [px] that differ from the postures.
+
+    By place and by size.
+    """
     off = (middle - at) / (AT_SIGMA * radius)[:, None]
     return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SIZE_SIGMA)) ** 2
 
 
 class Ends(NamedTuple):
-    """Of K fingers: where the end is from the middle of the outline (K, 2) and its spread (K,), in radii; how much it
-    faces the camera (K,), and how likely the finger leaves it to be seen (K,)."""
+    """Fingertip ends of K fingers.
+
+    Where the end is from the middle of the outline (K, 2) and its spread (K,), in radii; how much it faces the camera
+    (K,), and how likely the finger leaves it to be seen (K,).
+    """
 
     towards: Float
     spread: Float
@@ -380,7 +405,10 @@ def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candi
 
 
 def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends:
-    """Means over the hypotheses of each finger (K,), by their likelihood where its outline is that circle."""
+    """Return the mean ends over the hypotheses of each finger (K,).
+
+    Weighted by their likelihood where the finger's outline is that circle.
+    """
     least = np.full(5, np.inf)
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least[some.finger[first]] = np.minimum.reduceat(cost, first)
@@ -406,7 +434,9 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
 
 
 def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
-    """How ends (M, 2) turn about the middles of outlines, which lie `off` (M, 2) by `sigma` (M,), in radii.
+    """Return the rotation of ends (M, 2) about the middles of outlines.
+
+    The outlines lie `off` (M, 2) by `sigma` (M,), in radii.
 
     An outline lies beside where it should be for abduction, which the laser tells, or for a twist of the finger.
     """
@@ -434,8 +464,10 @@ def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
 
 
 def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | None:
-    """Nearness [grey levels^0.5] of skin at 1 m that faces the camera, by where the laser meets fingers (5, 2) [px],
-    (5, 3) [m]; None: nothing is lit there."""
+    """Return the nearness of skin at 1 m facing the camera [grey levels^0.5].
+
+    By where the laser meets fingers (5, 2) [px], (5, 3) [m]; None: nothing is lit there.
+    """
     known = np.isfinite(laser_m[:, 0])
     near, clipped, outside = image.at(laser_uv[known].astype(np.float32))
     good = ~clipped & ~outside & (near > LEAST_NEAR)

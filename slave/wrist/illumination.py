@@ -1,4 +1,6 @@
-"""Whether three frames of a strobed camera are ambient, laser and LED, in this order, by what they show.
+"""Check by content that three strobed frames are ambient, laser and LED.
+
+In this order.
 
 All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
 ambient light that swings, explain:
@@ -51,7 +53,9 @@ VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer noth
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """How sure it is that three frames are ambient, laser, LED: base-2 logarithms of measures over their thresholds.
+    """Evidence that three frames are ambient, laser, LED.
+
+    Base-2 logarithms of measures over their thresholds.
 
     Attributes:
         led: The LED frame has broad light that the ambient frame has not.
@@ -88,7 +92,10 @@ def coarse(image: Image) -> Image:
 
 
 def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
-    """Of three coarse frames (60, 80), each as what it should be; -inf: not looked at, as another is not positive."""
+    """Return the evidence that three coarse frames (60, 80) are as they should be.
+
+    -inf: not evaluated, as another measure is not positive.
+    """
     darker = cv2.min(ambient, led)
     valid = _valid(darker)
     if valid < VALID_LEAST * ambient.size:
@@ -121,7 +128,10 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
 
 
 def unlit(frames: Sequence[Image]) -> bool:
-    """Whether no broad light comes or goes within these coarse frames (60, 80): the LEDs light none of them, or all."""
+    """Return whether no broad light comes or goes within these coarse frames.
+
+    Frames are (60, 80). The LEDs light none of them, or all.
+    """
     darkest = reduce(cv2.min, frames)
     valid = _valid(darkest)
     if valid < VALID_LEAST * darkest.size:
@@ -133,7 +143,10 @@ def unlit(frames: Sequence[Image]) -> bool:
 
 
 def brighter(frame: Image, other: Image) -> bool:
-    """Whether one coarse frame (60, 80) has broad light that the other has not, and lacks none: that of the LEDs."""
+    """Return whether one coarse frame (60, 80) has broad light the other has not.
+
+    It must also lack none that the other has; such light is that of the LEDs.
+    """
     darker = cv2.min(frame, other)
     valid = max(_valid(darker), VALID_LEAST * frame.size)
     noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
@@ -144,12 +157,18 @@ def brighter(frame: Image, other: Image) -> bool:
 
 
 def _valid(darker: _Cells) -> int:
-    """Number of cells in which one frame may be brighter than another, of the darker of both."""
+    """Count the cells in which one frame may be brighter than another.
+
+    `darker` is the darker of both frames.
+    """
     return cv2.countNonZero(cv2.threshold(darker, _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1])
 
 
 def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
-    """How far each frame is brighter than the other beyond what noise and a swing of ambient light explain [levels]."""
+    """Return how far each frame is brighter than the other [levels].
+
+    Beyond what noise and a swing of ambient light explain.
+    """
     noise = cv2.LUT(cv2.min(first, second), _NOISE_OF_LEVEL)
     one, other = cv2.subtract(first, second), cv2.subtract(second, first)
     return cv2.subtract(one, noise), cv2.subtract(other, noise)
@@ -170,14 +189,20 @@ def _inside(over: _Cells) -> _Cells:
 
 
 def _broad(over: _Cells, least: float = 0.0) -> int:
-    """How many cells are broadly brighter; 0 where no more than `least` are brighter at all."""
+    """Count the cells that are broadly brighter.
+
+    0 where no more than `least` are brighter at all.
+    """
     if cv2.countNonZero(over) <= least:
         return 0
     return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
 
 
 def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
-    """How many cells of thin lines lie there; `where` is asked only if there can be any."""
+    """Count the cells of thin lines that lie there.
+
+    `where` is called only if there can be any.
+    """
     if cv2.minMaxLoc(over)[1] <= _LINE:
         return 0
     return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))

@@ -71,7 +71,9 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
 
 
 def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
-    """Standard deviations (5,) of centroids: of lines whole, in parts, faint, doubtful, and where no seam was seen.
+    """Return the standard deviations (5,) of centroids.
+
+    Of lines that are whole, in parts, faint, doubtful, and where no seam was seen.
 
     Of a line in parts all but the longest may be another finger's, or what hides the middle of its own.
     """

@@ -48,7 +48,10 @@ class LedOptics:
 
 
 def shrink(led: Image) -> Float32:
-    """Grey levels (h, w) of the difference of LED and ambient frame at a quarter of its resolution."""
+    """Return the difference of LED and ambient frame at a quarter of its resolution.
+
+    In grey levels (h, w).
+    """
     height, width = led.shape
     half = cv2.resize(led, (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # in halves it is fast
     size = (width // SHRINK, height // SHRINK)
@@ -56,12 +59,17 @@ def shrink(led: Image) -> Float32:
 
 
 def nearness(grey: Float32, optics: LedOptics) -> Float32:
-    """sqrt(I / F) (h, w) of grey levels >= 0, NaN where they are; h rows from the top of the image."""
+    """Return the nearness sqrt(I / F) (h, w) of grey levels >= 0.
+
+    NaN where the levels are NaN; h rows from the top of the image.
+    """
     return np.sqrt(grey) * optics.level[: len(grey)]
 
 
 def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:
-    """Relative depth of what is nearest within a radius [px] about a pixel of the image, of nearness (h, w).
+    """Return the relative depth of what is nearest about a pixel of the image.
+
+    Within a radius [px], of nearness (h, w).
 
     The nearest faces the camera, so it is the least inclined. NaN: too dark to tell.
     """

@@ -1,10 +1,13 @@
-"""Sees no finger: for the slave of a wrist device whose lens, laser or palm is still being measured."""
+"""Detector that sees no finger, for a wrist slave being calibrated.
+
+The wrist device's lens, laser or palm is still being measured.
+"""
 
 from slave.sources import Frame
 
 
 class NullWristDetector:
-    """A detector that never completes a triple."""
+    """Detector that never completes a strobe cycle."""
 
     def push(self, frame: Frame) -> None:
         """Nothing, whatever there is."""

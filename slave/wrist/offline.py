@@ -1,4 +1,6 @@
-"""Detect a whole recording of a wrist camera offline: deterministic, without clock or network, a row per triple.
+"""Offline detection of a whole recording of a wrist camera.
+
+Deterministic, without clock or network, a row per strobe cycle.
 
 What the recording says of the illumination of a frame is not used: the strobe tells it from the frames. Where the two
 disagree it is counted, because one of them is wrong then.
@@ -27,7 +29,9 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedWristDetections:
-    """Content of detections_<camera>.npz of a wrist camera: T triples, fingers thumb ... little, NaN = not seen.
+    """Content of detections_<camera>.npz of a wrist camera.
+
+    T strobe cycles, fingers thumb ... little, NaN = not seen.
 
     Attributes:
         t_ns: (T,) middle of the exposure of row 0 of the laser frame [ns].
@@ -140,7 +144,7 @@ def detect_wrist_recording(
     hand_file: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> WristRecordingFound:
-    """Detect laser points and fingertips in every triple of one camera.
+    """Detect laser points and fingertips in every strobe cycle of one camera.
 
     Args:
         folder: Recording.
@@ -178,7 +182,10 @@ def detect_wrist_recording(
 
 
 def _mislabelled(cycle: StrobeCycle) -> int:
-    """How many of the three frames have a label that is not what the strobe took them for; NONE is no label."""
+    """Count the frames of a cycle whose label contradicts the strobe.
+
+    How many of the three have a label that is not what the strobe took them for; NONE is no label.
+    """
     taken = (
         (cycle.ambient, Illumination.AMBIENT),
         (cycle.laser, Illumination.LASER),

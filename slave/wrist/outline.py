@@ -1,4 +1,6 @@
-"""The outline of fingertips at full resolution: circles fitted to the edges of light around where they should be.
+"""Outline of fingertips at full resolution.
+
+Circles are fitted to the edges of light around where they should be.
 
 Along rays from the predicted middle the edge is where light falls off most steeply in proportion; that is the contour
 before the dark, and the foot of the shadow before what is lit behind. Middle and radius are then those of the circle
@@ -80,8 +82,11 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
 
 
 def _edges(led: Image, middle: Float, radius: Float) -> tuple[Float, Float, Bool]:
-    """Of N circles and each direction: how far beyond the circle the edge is (N, DIRECTIONS), in radii; by how much the
-    logarithm of light falls there; and whether the image shows that far."""
+    """Find the edges of light around N circles in each direction.
+
+    Returns how far beyond the circle the edge is (N, DIRECTIONS), in radii; by how much the logarithm of light falls
+    there; and whether the image shows that far.
+    """
     reach = radius[:, None, None].astype(np.float32) * SHARE
     x, y = (
         middle[:, k, None, None].astype(np.float32) + reach * WAY[:, k, None].astype(np.float32)

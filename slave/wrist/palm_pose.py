@@ -1,4 +1,6 @@
-"""How the palm lies before the camera while the wrist is bent: found in each LED image, with a straight wrist as prior.
+"""Pose of the palm before the camera while the wrist is flexed.
+
+Found in each LED image, with a straight wrist as prior.
 
 The device sits on the forearm. A bent wrist turns the palm in the image, ten degrees aside by nearly the breadth of a
 finger, so that what a straight wrist says of roots and corridors names the neighbour. Two things of the palm are plain
@@ -65,13 +67,18 @@ class PalmPose:
 
     @property
     def straight(self) -> bool:
-        """Whether the palm is where a straight wrist has it, as far as can be told."""
+        """Return whether the palm is where a straight wrist has it.
+
+        As far as can be determined.
+        """
         return not self.wrist_angles_rad.any()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Marks:
-    """Where B bends have the marks of the palm in the shrunken image, counted row by row.
+    """Marks of the palm in the shrunken image for B wrist flexions.
+
+    Counted row by row.
 
     Attributes:
         candidates: (B, 2) [rad].
@@ -126,7 +133,10 @@ def _view(view: WristView, flexion: int, deviation: int) -> WristView:
 
 
 def wrist_angles_seen(near: Float32, view: WristView) -> Float:
-    """The bend (2,) [rad] by roots of grey levels (h, w) of the shrunken image; 0 where none is plain."""
+    """Estimate the wrist flexion (2,) [rad] from the shrunken image.
+
+    By roots of grey levels (h, w); 0 where none is plain.
+    """
     marks = _marks(view)
     shown = _shown(near.ravel(), marks)
     score = np.float32(_EVIDENCE) * shown - marks.prior
@@ -194,7 +204,10 @@ def _pixels(view: WristView, points: Float) -> tuple[Int, Float]:
 
 
 def _gaps(view: WristView) -> tuple[Float, Float]:
-    """Both sides and the middle (3, G, 3) of gaps [m], palm frame, and what each counts (G,)."""
+    """Return points of the gaps between fingers and their weights.
+
+    Both sides and the middle (3, G, 3) of gaps [m], palm frame, and the weights (G,).
+    """
     knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
     bone = ends - knuckles
     along = bone / np.linalg.norm(bone, axis=1, keepdims=True)
@@ -210,7 +223,10 @@ def _gaps(view: WristView) -> tuple[Float, Float]:
 
 
 def _edges(view: WristView) -> tuple[Float, Float]:
-    """Inside and outside (2, S, 3) of skin's edges at the sides of the palm [m], palm frame, and their weights (S,)."""
+    """Return points on both sides of skin's edges at the palm and their weights.
+
+    Inside and outside (2, S, 3) of the edges at the sides of the palm [m], palm frame, and the weights (S,).
+    """
     rest, radius = view.model.rest_position_m, view.model.radius_m
     index, little = CHAINS[1], CHAINS[4]
     out = np.array([np.sign(rest[little[0], 0] - rest[index[0], 0]), 0.0, 0.0])

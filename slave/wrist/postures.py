@@ -1,4 +1,6 @@
-"""What the wrist camera sees of each posture of a finger: tables made once, by which its tip is found.
+"""Tables of what the wrist camera sees of each posture of a finger.
+
+Made once; the fingertip is found by them.
 
 The palm stands still before the camera, so a finger of known bones has four angles: abduction, and the flexions of MCP,
 PIP and DIP. Each finger's table holds a grid of the last three, any combination of them; what it holds changes smoothly
@@ -52,7 +54,9 @@ _ORIGIN = np.zeros(3)
 
 
 class Postures(NamedTuple):
-    """Postures of all five fingers, one after another: H of the thumb, then 4 L of index ... little.
+    """Postures of all five fingers, one after another.
+
+    H of the thumb, then 4 L of index ... little.
 
     Attributes:
         thumb: H.
@@ -80,7 +84,10 @@ class Postures(NamedTuple):
 
 
 class _OfFinger(NamedTuple):
-    """The rows of one finger: `uv`, `near`, `laser` (H, 3, 2), `open`, `end` and `twist` of `Postures`."""
+    """Rows of one finger.
+
+    `uv`, `near`, `laser` (H, 3, 2), `open`, `end` and `twist` of `Postures`.
+    """
 
     uv: Float
     near: Float
@@ -92,7 +99,10 @@ class _OfFinger(NamedTuple):
 
 @lru_cache(maxsize=8)
 def plane_axes(view: WristView) -> Float:
-    """Two unit vectors (2, 3) in the laser's plane: across the fingers, to the right in the image, and away."""
+    """Return two unit vectors (2, 3) in the laser's plane.
+
+    One across the fingers, to the right in the image, and one away.
+    """
     across = np.array([1.0, 0.0, 0.0]) - view.normal[0] * view.normal
     across /= np.linalg.norm(across)
     away = np.cross(across, view.normal)
@@ -186,7 +196,10 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
 
 
 def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Float, radius: Float) -> Float:
-    """`twist` of `Postures` (H, 5), of a finger at angles (H, 5, 4) of its joints (H, 4, 3) and end (H, 3) [m]."""
+    """Return `twist` of `Postures` (H, 5).
+
+    Of a finger at angles (H, 5, 4) of its joints (H, 4, 3) and end (H, 3) [m].
+    """
     straight = angles[:1].copy()
     straight[..., 1:] = 0.0
     chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
@@ -205,7 +218,10 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
 
 
 def _parabola(values: Float) -> Float:
-    """Coefficients (H, 3, ...) of 1, a, a^2 through values (H, A, ...) at a = -1, 0, 1, or of one value."""
+    """Return the coefficients (H, 3, ...) of 1, a, a^2 through given values.
+
+    The values (H, A, ...) are at a = -1, 0, 1, or there is one value.
+    """
     if values.shape[1] == 1:
         return np.concatenate([values, np.zeros_like(values), np.zeros_like(values)], axis=1)
     low, middle, high = (values[:, k] for k in range(3))
@@ -213,7 +229,10 @@ def _parabola(values: Float) -> Float:
 
 
 def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
-    """Start and stop (T, 3) of the line along each bone's skin that faces the camera, of joints (T, 4, 3) [m]."""
+    """Return the line along each bone's skin that faces the camera.
+
+    As start and stop (T, 3), of joints (T, 4, 3) [m].
+    """
     out: list[tuple[Float, Float]] = []
     for k in range(3):
         start, stop = bones[:, k], bones[:, k + 1]
@@ -228,7 +247,10 @@ def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
 
 
 def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
-    """Where lines along the skin first meet the laser's plane (T, 3) [m], seen from the camera; NaN: nowhere."""
+    """Return where lines along the skin first meet the laser's plane (T, 3) [m].
+
+    First as seen from the camera; NaN: nowhere.
+    """
     best = np.full(surface[0][0].shape, np.nan)
     nearest = np.full(len(best), np.inf)
     for k, (start, stop) in enumerate(surface):
@@ -244,7 +266,10 @@ def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
 
 
 def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Float]:
-    """Pixels (T, 2) of the highest of joints (T, 4, 3) [m] in the image, and above it."""
+    """Return pixels (T, 2) of the highest joint in the image, and above it.
+
+    Of joints (T, 4, 3) [m].
+    """
     uv = view.optics.project(bones)
     size = view.optics.matrix[0, 0] * radius / np.maximum(bones[..., 2], NEAREST_M)
     tops = (uv[..., 1] - size).reshape(-1, nodes, 4)[:, nodes // 2]
@@ -258,7 +283,10 @@ def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Flo
 
 
 def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Float, Float]:
-    """Nearness [1/m] and distance [m] (T, S) that pixels (T, S, 2) show of fingers of joints (T, 4, 3) [m]."""
+    """Return the nearness [1/m] and distance [m] (T, S) of fingers at given pixels.
+
+    The pixels are (T, S, 2), the joints of the fingers (T, 4, 3) [m].
+    """
     near, first = np.zeros(uv.shape[:2]), np.full(uv.shape[:2], np.inf)
     for k in range(0, len(bones), _CHUNK):
         part = slice(k, k + _CHUNK)

@@ -1,4 +1,7 @@
-"""What a wrist device knows of itself and its hand, from the files of a slave, also when they change while it runs."""
+"""Device and hand data of a wrist device, from the files of a slave.
+
+Also when the files change while it runs.
+"""
 
 from collections.abc import Callable
 
@@ -25,7 +28,7 @@ def view_of(files: CameraFiles) -> WristView:
 
 
 def wrist_changes(detector: WristDetector) -> Prepare:
-    """How changed files reach `detector`: with the next triple."""
+    """Return how changed files reach `detector`: with the next strobe cycle."""
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         if (old.camera.intrinsics, old.rig, old.hand) == (new.camera.intrinsics, new.rig, new.hand):

@@ -36,7 +36,9 @@ _FEWEST = 3  # columns of a line
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Runs:
-    """Bright runs of columns, line after line, and in each line column by column; N of them.
+    """Bright runs of columns.
+
+    Line after line, and in each line column by column; N of them.
 
     Attributes:
         column: (N,).
@@ -61,13 +63,18 @@ NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_
 
 
 def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
-    """The runs of the rows from `first_row` on, and which of them (N,) belong to a line."""
+    """Return the runs of the rows from `first_row` on, and which lie on a line.
+
+    The latter is a mask (N,).
+    """
     runs = line_runs(laser, first_row)
     return runs, in_lines(runs)
 
 
 def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]:
-    """What may be a line: the part (w, h) of a laser image, column by column, and the levels (w, h) it must exceed.
+    """Return the part of a laser image that may be a line, and its thresholds.
+
+    The part is (w, h), column by column; the levels (w, h) must be exceeded.
 
     And at which column and row of the image it begins.
     """
@@ -112,7 +119,9 @@ def line_runs(laser: Image, first_row: int) -> Runs:
 
 
 def _across(levels: Image, size: Int) -> tuple[Float, Float]:
-    """Where the centres of runs (N,) are beyond their first rows [px], and their peaks (N,) [grey levels].
+    """Return the centres of runs (N,) [px] and their peaks (N,) [grey levels].
+
+    The centres are given beyond the runs' first rows.
 
     Args:
         levels: The grey levels of all runs, one run after another.
@@ -131,7 +140,10 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
 
 
 def in_lines(runs: Runs) -> Bool:
-    """Which runs belong to a line: long enough, and not much darker than what is near, as a glow is."""
+    """Return which runs belong to a line.
+
+    They are long enough, and not much darker than what is near, as a glow is.
+    """
     peak, joins = runs.peak, runs.joins
     if not len(peak):
         return np.empty(0, dtype=np.bool_)
@@ -157,7 +169,9 @@ def in_lines(runs: Runs) -> Bool:
 
 
 def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
-    """Runs (N,), given by column and then by row, each with the nearest of those of the next column that it overlaps.
+    """Link runs (N,), given by column and then by row, to the next column.
+
+    Each run is linked to the nearest of those of the next column that it overlaps.
 
     Where two meet in one, the line goes on from the nearer one, and the other joins it.
     """

@@ -1,4 +1,6 @@
-"""Paths of least energy through several straight corridors at once, by dynamic programming from both of their ends.
+"""Minimum-energy paths through several straight search bands at once.
+
+By dynamic programming from both of their ends.
 
 The two halves of every corridor lie beside each other in one array, so that one loop over half of the stations serves
 all. Which way each sample was reached is then worked out for the whole array in a few passes, and going back along a
@@ -24,7 +26,9 @@ _Float32 = npt.NDArray[np.float32]
 
 
 def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
-    """Path (C, S) of least energy through each corridor, as its sample at every station; at most two aside a step.
+    """Return the path (C, S) of least energy through each search band.
+
+    As its sample at every station; at most two aside a step.
 
     Args:
         energy: (S, K), the corridors side by side, `FENCE` at both ends of each.
@@ -55,7 +59,10 @@ def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
 
 
 def _cheapest(cost: _Float32) -> _Float32:
-    """The least cost (N - 4,) from which each sample but the outer two of `cost` (N,) can be reached, step included."""
+    """Return the least cost (N - 4,) of reaching each sample.
+
+    For each sample but the outer two of `cost` (N,), step included.
+    """
     best = np.minimum(cost[:-4], cost[4:])
     best += STEP_COST
     np.minimum(best, cost[1:-3], out=best)
@@ -66,7 +73,10 @@ def _cheapest(cost: _Float32) -> _Float32:
 
 
 def _moves(cost: _Float32) -> list[memoryview]:
-    """For each row of costs (R, N) but the first, how far aside in the row before each sample was reached from."""
+    """Return how far aside in the row before each sample was reached from.
+
+    For each row of costs (R, N) but the first.
+    """
     best = cost[:-1, 2:-2].copy()
     moves = np.zeros((len(best), cost.shape[1]), dtype=np.int8)
     inner = moves[:, 2:-2]
@@ -78,7 +88,10 @@ def _moves(cost: _Float32) -> list[memoryview]:
 
 
 def _back(moves: list[memoryview], k: int) -> list[int]:
-    """Samples (R,) of the path that ends at sample k of the last row, from there to the first."""
+    """Trace the path that ends at sample k of the last row.
+
+    Returns its samples (R,) from there to the first.
+    """
     out = [k]
     for row in reversed(moves):
         k += row[k]

@@ -1,4 +1,6 @@
-"""Where in the image the seams between the fingers of one hand can run: made once, from what its fingers can do.
+"""Search bands in the image for the seams between the fingers of one hand.
+
+Made once, from what its fingers can do.
 
 The three seams among index ... little have rows of the image as stations, the thumb's has circles about the thumb's
 root (CMC). A corridor is a middle and a half width at each station, in pixels along the row or in radians along the
@@ -45,7 +47,7 @@ _UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchBands:
-    """The corridors of the four seams, in the order of `LATERAL`; S stations.
+    """Search bands of the four seams, in the order of `LATERAL`; S stations.
 
     Attributes:
         row: First row of the stations of the three finger seams [px].
@@ -77,24 +79,36 @@ class SearchBands:
     palm: Int
 
     def polar(self, uv: Float) -> tuple[Float, Float]:
-        """Radius [px] and angle [rad], positive towards the thumb's side, of pixels (N, 2) about the thumb's root."""
+        """Return the polar coordinates of pixels (N, 2) about the thumb's root.
+
+        Radius [px] and angle [rad], positive towards the thumb's side.
+        """
         x, y = uv[:, 0] - self.root[0], uv[:, 1] - self.root[1]
         along = x * self.up[0] + y * self.up[1]
         across = self.thumb_side * (y * self.up[0] - x * self.up[1])
         return np.hypot(x, y), np.arctan2(across, along)
 
     def lateral(self, seam: int) -> Float:
-        """Lateral positions (S, LATERAL[seam] + 2 MARGIN) of the samples across one corridor and its margins."""
+        """Return the lateral positions of the samples across one search band.
+
+        The positions are (S, LATERAL[seam] + 2 MARGIN), including its margins.
+        """
         share = np.arange(-MARGIN, LATERAL[seam] + MARGIN, dtype=np.float64) / (LATERAL[seam] - 1) * 2.0 - 1.0
         return self.middle[seam, :, None] + self.half[seam, :, None] * share
 
     def across(self, seams: slice, path: Int) -> Float:
-        """Lateral positions (M, S) of samples (M, S) of some of the corridors."""
+        """Return the lateral positions (M, S) of samples of some search bands.
+
+        The samples are (M, S).
+        """
         count = np.array(LATERAL[seams])[:, None] - 1
         return self.middle[seams] + self.half[seams] * (2.0 * (path - MARGIN) / count - 1.0)
 
     def sample(self, seam: int, lateral: Float) -> Float:
-        """Samples (..., S) of one corridor, with fractions, of lateral positions (..., S): `across` turned round."""
+        """Return the samples (..., S) of one search band at lateral positions.
+
+        With fractions, of lateral positions (..., S): the inverse of `across`.
+        """
         share = (lateral - self.middle[seam]) / self.half[seam]
         return (share + 1.0) * (LATERAL[seam] - 1) / 2.0 + MARGIN
 
@@ -112,7 +126,7 @@ class SearchBands:
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie
 def search_bands_of(view: WristView) -> SearchBands:
-    """The corridors of one wrist rig and hand.
+    """Return the search bands of one wrist rig and hand.
 
     Raises:
         CalibrationError: The palm lies so that no finger can be seen.
@@ -138,7 +152,10 @@ def search_bands_of(view: WristView) -> SearchBands:
 
 
 def _palm(view: WristView) -> Int:
-    """Columns and rows (P, 2) of the image along the outer half of the metacarpals of index ... little."""
+    """Return pixels along the outer half of the metacarpals of index ... little.
+
+    Columns and rows (P, 2) of the image.
+    """
     rest = view.model.rest_position_m
     roots, ends = rest[list(METACARPALS)], rest[CHAINS[1:, 0]]
     uv = in_image(view, np.concatenate([roots + share * (ends - roots) for share in (0.5, 0.75, 1.0)]))[0]
@@ -148,7 +165,10 @@ def _palm(view: WristView) -> Int:
 
 
 def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
-    """Middle and half width (3, S) [px] of the corridors among index ... little at the given rows."""
+    """Return the search bands among index ... little at the given rows.
+
+    Middle and half width (3, S) [px].
+    """
     limits = view.model.limits_rad
     points = along_bones(view, finger_postures(view, 1, 8, 8))
     focal = view.optics.matrix[0, 0]
@@ -178,7 +198,10 @@ def _weight(view: WristView, rows: Float) -> Float32:
 
 
 def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
-    """Middle and half width (S,) of the intervals low ... high (N,) that lie near each station."""
+    """Return the middle and half width (S,) of the intervals near each station.
+
+    The intervals are low ... high (N,).
+    """
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
     if not known.any():
@@ -191,8 +214,10 @@ def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, F
 
 
 def _thumb_workspace(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
-    """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
-    many stations the thumb crosses however it is held.
+    """Return the thumb's search band and the stations that the thumb crosses.
+
+    Middle and half width [rad] on the finger's side of all that its axis can reach; and how many stations the thumb
+    crosses however it is held.
 
     Raises:
         CalibrationError: No posture of the thumb, or of its tip, is before the camera.

@@ -1,4 +1,6 @@
-"""Recognise ambient, laser and LED frames by content, and join them to triples.
+"""Recognition of ambient, laser and LED frames by content.
+
+The frames are joined to strobe cycles.
 
 The strobe is that of Kim et al. 2012.
 
@@ -55,7 +57,9 @@ class _Seen:
 
 
 class Strobe:
-    """Joins frames to triples. Holds the last three frames, and where the last triple and the present cycle end.
+    """Assembler of frames to strobe cycles.
+
+    Holds the last three frames, and where the last strobe cycle and the present cycle end.
 
     Attributes:
         counts: Event -> how often since the start.
@@ -83,7 +87,10 @@ class Strobe:
         self.margin = np.nan
 
     def push(self, frame: Frame) -> StrobeCycle | None:
-        """The triple that this frame completes, or None. Never looks at `frame.illumination`."""
+        """Return the strobe cycle that this frame completes, or None.
+
+        Never looks at `frame.illumination`.
+        """
         cells = coarse(frame.image)
         last = self._seen[-1] if self._seen else None
         periods = 0.0 if last is None else (frame.t_ns - last.latest.t_ns) / self._period_ns
@@ -100,7 +107,10 @@ class Strobe:
         return self._completed()
 
     def _begin(self, frame: Frame, cells: Image) -> None:
-        """Know of no cycle: the next triple is believed, wherever it is."""
+        """Reset the cycle position.
+
+        The next strobe cycle is accepted, wherever it is.
+        """
         self.counts["gaps"] += bool(self._seen)
         self._seen = [_Seen(frame, cells, 0, follows=False, latest=frame)]
         self._at = None
@@ -127,7 +137,10 @@ class Strobe:
         return StrobeCycle(*(one.frame for one in self._seen)) if in_step else None
 
     def _instead(self, *, whole: bool) -> str | None:
-        """What a cycle is whose last frame is not lit by LEDs, by those of its frames that came."""
+        """Classify a cycle whose last frame is not lit by LEDs.
+
+        By those of its frames that were received.
+        """
         frames = [one for one in self._seen if self._due - CYCLE < one.place <= self._due]
         early = [one.cells for one in frames if one.place < self._due]
         last = [one.cells for one in frames if one.place == self._due]

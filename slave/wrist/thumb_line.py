@@ -22,7 +22,9 @@ _LEAST_PX = 4.0  # of line, for a centroid
 
 
 def on_ball(beyond_m: Float) -> bool:
-    """Whether a line (N,) so far beyond the MCP's skin [m] is rather on the ball than on the thumb.
+    """Return whether a line (N,) is rather on the ball than on the thumb.
+
+    The line is so far beyond the MCP's skin [m].
 
     Where the wrist is straight the thumb stands across the plane; a bent one can bring the ball there alone.
     """
@@ -30,7 +32,9 @@ def on_ball(beyond_m: Float) -> bool:
 
 
 def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
-    """How much the thumb's part of a line has its centroid beside that of the whole (2,), and its deviation [px].
+    """Return the centroid offset of the thumb's part of a line (2,).
+
+    It is how much this centroid lies beside that of the whole line; also its deviation [px].
 
     Args:
         runs: The runs.

@@ -1,4 +1,7 @@
-"""What the slave of a wrist device knows before the first frame: device and hand, and the LEDs that light it."""
+"""Knowledge of the slave of a wrist device before the first frame.
+
+Device and hand, and the LEDs that light it.
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,6 @@
-"""Where in the image the laser can meet each finger, and where what it meets there is beside the palm.
+"""Regions of the image in which the laser can meet each finger.
+
+And where what it meets there is beside the palm.
 
 A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
 """
@@ -74,11 +76,16 @@ class LaserWorkspace:
         )
 
     def beyond_m(self, uv: Float) -> Float:
-        """How far (N,) the plane at pixels (N, 2) is beyond the skin of the thumb's MCP, from the thumb's root [m]."""
+        """Return how far (N,) the plane at pixels is beyond the skin of the thumb's MCP.
+
+        At pixels (N, 2), from the thumb's root [m].
+        """
         return self.palm.beyond_m(self._before_palm(uv))
 
     def on_plane(self, uv: Float) -> tuple[Float, Float]:
-        """`beyond_m` (N,) of pixels (N, 2), and beside whose axis the plane is there (N,): 1 index ... 4 little.
+        """Return `beyond_m` (N,) of pixels (N, 2), and the finger axis there.
+
+        The latter states beside whose axis the plane is there (N,): 1 index ... 4 little.
 
         Between and beyond them by their distances.
         """
@@ -86,7 +93,10 @@ class LaserWorkspace:
         return self.palm.beyond_m(points), self.palm.place(points)
 
     def on_palm(self, uv: Float) -> Bool:
-        """Whether at pixels (N, 2) a bent wrist has brought the palm itself into the plane."""
+        """Return whether at pixels (N, 2) the palm itself is in the laser's plane.
+
+        A bent wrist has brought it there.
+        """
         if not self.flexed:
             return np.zeros(len(uv), np.bool_)
         points = self._before_palm(uv)
@@ -101,7 +111,10 @@ class LaserWorkspace:
         return (beyond_m > _NO_THUMBS_M) & (place > _OUTSIDE_PALM)
 
     def metres_per_px(self, uv: Float) -> Float:
-        """How much of the plane one pixel shows [m] at pixels (N, 2); 0 where they are NaN, or show none of it."""
+        """Return how much of the plane one pixel shows [m] at pixels (N, 2).
+
+        0 where they are NaN, or show none of it.
+        """
         column, row = self._cell(np.nan_to_num(uv))
         return np.where(np.isnan(uv[:, 0]), 0.0, self.plane_m[row, column, 2] / self.focal_px)
 
@@ -135,7 +148,9 @@ class Palm:
     radius_m: Float
 
     def beyond_m(self, points: Float) -> Float:
-        """How far points (N, 3) are (N,) beyond the skin over the thumb's MCP, from the thumb's root [m].
+        """Return how far points (N, 3) are beyond the skin over the thumb's MCP.
+
+        As (N,), from the thumb's root [m].
 
         However the thumb is turned, that skin lies about as far from its root (CMC); so it is a sphere about the root,
         and for one way the palm lies a fixed line in the image.
@@ -143,7 +158,9 @@ class Palm:
         return np.linalg.norm(points - self.root_m, axis=1) - self.border_m
 
     def place(self, points: Float) -> Float:
-        """Beside whose axis, from index 1 to little 4, points (N, 3) are (N,), seen from before the palm.
+        """Return beside whose axis points (N, 3) are (N,), seen from before the palm.
+
+        From index 1 to little 4.
 
         Between two axes, and beyond the outer ones, by their distances.
         """
@@ -154,7 +171,9 @@ class Palm:
         return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
 
     def surface(self, points: Float, place: Float) -> Bool:
-        """Whether points (N, 3) of these places (N,) are on the palm's skin: before the knuckles, near their bones.
+        """Return whether points (N, 3) of these places (N,) are on the palm's skin.
+
+        That is before the knuckles, near their bones.
 
         A finger that is folded to it lies on it, and is thicker than that.
         """
@@ -184,7 +203,9 @@ def workspace_of(view: WristView) -> LaserWorkspace:
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
-    """1 in the cells (H / 8, W / 8) where the skin about points (P, K, 3) of bones, palm frame, can meet the plane.
+    """Return the cells (H / 8, W / 8) where the skin can meet the plane, as 1.
+
+    The skin is about points (P, K, 3) of bones, palm frame.
 
     Args:
         view: The rig.
@@ -213,7 +234,10 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
 
 @lru_cache(maxsize=8)
 def _plane(optics: CameraModel, x: float, y: float, z: float, offset_m: float) -> Float32:
-    """What every pixel (H, W, 3) shows of the plane of normal (x, y, z), camera frame [m]; 0: nothing."""
+    """Return the point of a plane that every pixel shows (H, W, 3).
+
+    The plane has the normal (x, y, z), camera frame [m]; 0: nothing.
+    """
     u, v = np.meshgrid(np.arange(optics.width_px), np.arange(optics.height_px))
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
     points = intersect_plane(_ORIGIN, rays, np.array([x, y, z]), offset_m)

@@ -13,7 +13,10 @@ _PIP, _DIP = 2, 3
 
 
 def finger_postures(view: WristView, *counts: int) -> Float:
-    """Postures (P, 5, 4) [rad] of index ... little in their limits: so many abductions, flexions, PIP flexions."""
+    """Return postures (P, 5, 4) [rad] of index ... little in their limits.
+
+    With so many abductions, flexions, PIP flexions.
+    """
     low, high = view.model.limits_rad[1].T
     out = _all(*[_spread(low[k], high[k], n) for k, n in enumerate(counts)], np.zeros(1))
     out[..., _DIP] = _DIP_PER_PIP * out[..., _PIP]
@@ -21,7 +24,10 @@ def finger_postures(view: WristView, *counts: int) -> Float:
 
 
 def thumb_postures(view: WristView, *counts: int) -> Float:
-    """Postures (P, 5, 4) [rad] of the thumb in its limits: so many values of each of its four angles."""
+    """Return postures (P, 5, 4) [rad] of the thumb in its limits.
+
+    With so many values of each of its four angles.
+    """
     low, high = view.model.limits_rad[0].T
     return _all(*(_spread(low[k], high[k], n) for k, n in enumerate(counts)))
 
@@ -32,13 +38,19 @@ def _spread(low: float, high: float, count: int) -> Float:
 
 
 def _all(*values: Float) -> Float:
-    """All combinations (P, 5, 4) of the given values of the four angles [rad], the same for every finger."""
+    """Return all combinations (P, 5, 4) of given values of the four angles [rad].
+
+    The same for every finger.
+    """
     grid = np.stack(np.meshgrid(*values, indexing="ij"), axis=-1).reshape(-1, 1, 4)
     return np.broadcast_to(grid, (len(grid), 5, 4)).copy()
 
 
 def along_bones(view: WristView, angles: Float) -> Float:
-    """Points (P, 5, 3 PER_BONE, 3) [m] along the fingers' bones of postures (P, 5, 4), palm frame, root first."""
+    """Return points along the fingers' bones of postures (P, 5, 4).
+
+    The points (P, 5, 3 PER_BONE, 3) [m] are in the palm frame, root first.
+    """
     joints = view.model.chains(angles).position_m
     return _between(joints[:, :, :, None, :]).reshape(*joints.shape[:2], -1, 3)
 
@@ -49,13 +61,19 @@ def radius_along(view: WristView) -> Float:
 
 
 def _between(ends: Float) -> Float:
-    """Values (..., 3, PER_BONE, K) along three bones of those (..., 4, 1, K) at their ends."""
+    """Interpolate values (..., 3, PER_BONE, K) along three bones.
+
+    From those (..., 4, 1, K) at their ends.
+    """
     share = np.linspace(0.0, 1.0, PER_BONE, dtype=np.float64)[:, None]
     return ends[..., :-1, :, :] * (1.0 - share) + ends[..., 1:, :, :] * share
 
 
 def in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
-    """Pixels (..., 2) and depths (...) [m] of points (..., 3) in the palm frame; what is too near is held off."""
+    """Project points (..., 3) in the palm frame to pixels and depths.
+
+    Pixels (..., 2) and depths (...) [m]; what is too near is held off.
+    """
     camera = palm_m @ view.T_camera_palm[:3, :3].T + view.T_camera_palm[:3, 3]
     depth = camera[..., 2]
     held = np.concatenate([camera[..., :2], np.maximum(depth, NEAREST_M)[..., None]], axis=-1)

@@ -1,1 +1,4 @@
-"""The wrist device simulated: what its camera sees of the hand by ambient light, by its laser and by its LEDs."""
+"""Simulation of the wrist device.
+
+What its camera sees of the hand by ambient light, by its laser and by its LEDs.
+"""

@@ -1,4 +1,6 @@
-"""The flesh of one simulated hand: round cones on its bones, which differ from every plain model of it.
+"""Flesh of one simulated hand: round cones on its bones.
+
+They differ from every plain model of the hand.
 
 A solver models a finger as cones with the radii of the profile. Real fingers are not that: so each seed draws other
 radii, adds the pads on the palmar side of every phalanx and the pulp at its tip, and gives the thumb its thenar. What
@@ -81,8 +83,11 @@ class HandCapsules:
         )
 
     def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Capsules:
-        """Where they are, in the frame of the joints; of a bent wrist `R_straight` (3, 3) is the rotation that the
-        wrist's joint had if it was straight: that of the forearm."""
+        """Return the bodies of the flesh in the frame of the joints.
+
+        For a flexed wrist, `R_straight` (3, 3) is the rotation that the wrist's joint would have if it were straight:
+        that of the forearm.
+        """
         rotation, position = joints.rotation[self.joint], joints.position_m[self.joint]
         if R_straight is not None:
             rotation[self.forearm] = R_straight
@@ -91,7 +96,10 @@ class HandCapsules:
         return Capsules(start, stop, self.start_radius_m, self.stop_radius_m)
 
     def same_palm(self, bodies: Capsules, others: Capsules) -> bool:
-        """Whether the palm lies alike in two sets of bodies, to the last bit: what is true of one is of both."""
+        """Check whether the palm is identical in two sets of bodies, to the last bit.
+
+        If so, what is true of one is true of both.
+        """
         palm = slice(self.still)
         return np.array_equal(bodies.start_m[palm], others.start_m[palm]) and np.array_equal(
             bodies.stop_m[palm], others.stop_m[palm]
@@ -103,7 +111,9 @@ class HandCapsules:
         return np.where(body > last, THING_GROUP, self.group[np.minimum(body, last)])
 
     def parts(self, bodies: Capsules, body: Int, points: Float) -> tuple[Int, Int]:
-        """Group and segment (N,) of what is lit at points (N, 3) [m] of bodies (N,); a thing has segment 0.
+        """Return the group and segment of lit points.
+
+        Both (N,), at points (N, 3) [m] of bodies (N,); a thing has segment 0.
 
         Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts them.
         """
@@ -117,14 +127,20 @@ class HandCapsules:
         return group, np.where(near, np.where(beyond, THUMB_SEGMENTS[1], THUMB_SEGMENTS[0]), segment)
 
     def tips(self, bodies: Capsules) -> Float:
-        """The outermost points of the skin along the last bones of the five fingers (5, 3) [m]."""
+        """Return the outermost skin points along the last bones of the five fingers.
+
+        Shape (5, 3) [m].
+        """
         along = bodies.stop_m[self.tip] - bodies.start_m[self.tip]
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         return bodies.stop_m[self.tip] + self.stop_radius_m[self.tip, None] * along
 
 
 class _Part(NamedTuple):
-    """One body: its joint, its ends (3,) in that frame [m], radii [m], group, segment."""
+    """One body of the flesh.
+
+    Its joint, its ends (3,) in the frame of that joint [m], radii [m], group, segment.
+    """
 
     joint: int
     start: Float
@@ -136,7 +152,10 @@ class _Part(NamedTuple):
 
 
 def _finger(model: HandModel, radius: list[float], finger: int, rng: np.random.Generator) -> list[_Part]:
-    """Cones along the phalanges with a pad each; the last phalanx's own cone comes last."""
+    """Return the cones along the phalanges, with a pad each.
+
+    The last phalanx's own cone comes last.
+    """
     segments = FINGER_SEGMENTS if finger else THUMB_SEGMENTS
     out: list[_Part] = []
     for k in range(3):
@@ -170,7 +189,10 @@ def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> 
 
 
 def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> list[_Part]:
-    """Metacarpals and what fills the gaps between them, the mounds before the fingers, the heel, the forearm."""
+    """Return the bodies of the palm and forearm.
+
+    Metacarpals and what fills the gaps between them, the mounds before the fingers, the heel, the forearm.
+    """
     place, wrist_rotation, s = model.rest_position_m, model.rest_rotation[WRIST], model.side_sign
     roots = CHAINS[1:, 0]
     heads, bases = place[roots], place[list(METACARPALS)]

@@ -1,4 +1,6 @@
-"""The laser line, exact: where the sheet of light first meets the hand, and which of that the camera sees.
+"""Exact laser line on the hand.
+
+Where the sheet of light first meets the hand, and which of that the camera sees.
 
 The sheet is a fan of rays from the laser's origin. What each ray meets first is lit, so shadows need no thought; a lit
 point is seen where the ray from the camera meets nothing before it. Consecutive rays that meet the same part of the
@@ -27,7 +29,7 @@ LEAST_M = 2e-4  # of visible line, for a centroid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserCurve:
-    """The lit points of one instant, ray by ray (K,).
+    """Lit points at one time, ray by ray (K,).
 
     Attributes:
         rays: Unit directions (K, 3) from the laser's origin, along the fan.
@@ -104,7 +106,10 @@ class LaserSheet:
         return cls(origin, normal, offset, forward, across, angle, capsules, still, near, body)
 
     def cross(self, bodies: Capsules) -> LaserCurve:
-        """Where it meets the hand whose flesh is at `bodies`, and the things that follow it there."""
+        """Intersect the laser sheet with the hand and the things that follow it.
+
+        The flesh of the hand is at `bodies`; the things come after it in that list.
+        """
         capsules, first = self.capsules, self.capsules.still
         rays = _fan(self.forward, self.across, self.angle_rad)
         if capsules.same_palm(bodies, self.still):
@@ -132,8 +137,11 @@ class LaserSheet:
         return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
 
     def _meet(self, bodies: Capsules, rays: Float, first: int = 0) -> tuple[Float, Int]:
-        """How far along rays (N, 3) of the sheet the nearest of the bodies from `first` on begins (N,) [m], and which
-        that is (N,); only those that the sheet passes through are asked."""
+        """Return where rays of the sheet meet the nearest body, and which body that is.
+
+        Distances (N,) [m] along rays (N, 3) and body indices (N,), of the bodies from `first` on; only those that the
+        sheet passes through are tested.
+        """
         middle = 0.5 * (bodies.start_m + bodies.stop_m)
         reach = 0.5 * np.linalg.norm(bodies.stop_m - bodies.start_m, axis=1)
         reach += np.maximum(bodies.start_radius_m, bodies.stop_radius_m)
@@ -152,7 +160,10 @@ class LaserSheet:
         return near, which[body]
 
     def seen(self, bodies: Capsules, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
-        """Which of points (K, 3) [m] nothing hides from the camera that is more than `within_m` before them (K,)."""
+        """Check which points are visible to the camera.
+
+        Result (K,) for points (K, 3) [m]: nothing hides them that is more than `within_m` in front of them.
+        """
         far = np.linalg.norm(points, axis=1)
         front = points[:, 2] > 0.0
         reach = distances(bodies, np.zeros(3), points / far[:, None])
@@ -183,7 +194,10 @@ class LineTruth:
 
     @classmethod
     def of(cls, curve: LaserCurve, optics: CameraModel, sheet: LaserSheet) -> "LineTruth":
-        """Sum up the chords on the hand; those with both ends in the image and seen count as visible."""
+        """Sum up the chords on the hand.
+
+        Those with both ends in the image and seen count as visible.
+        """
         uv = optics.project(curve.points)
         size = np.array([optics.width_px, optics.height_px])
         seen = curve.seen & ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)

@@ -1,4 +1,6 @@
-"""The light on the scene: the room and its window behind the hand, LEDs and laser, and the sensor that takes it.
+"""Light on the scene and the sensor that records it.
+
+The room and its window behind the hand, LEDs and laser.
 
 Brightness is in levels of the sensor above black, at the exposure of the camera's file: 253 saturates. The rooms differ
 by what falls on the hand, by how bright they are behind it, by how far the window saturates, and by sunlight on skin.
@@ -59,14 +61,19 @@ class Room:
         return cls(*_LEVELS[name], sky / np.linalg.norm(sky), sun / np.linalg.norm(sun), seed)
 
     def on_surface(self, normals: Plane) -> Plane:
-        """Levels (N,) of plain skin with normals (N, 3): light from all sides, more from above, and the sun."""
+        """Return the levels of plain skin with the given normals.
+
+        Levels (N,), normals (N, 3): light from all sides, more from above, and the sun.
+        """
         shade: Plane = self.hand * (0.75 + 0.25 * (normals @ self.to_sky.astype(np.float32)))
         if self.sun > 0.0:
             shade += self.sun * np.maximum(normals @ self.to_sun.astype(np.float32), 0.0)
         return shade
 
     def backdrop(self, size: tuple[int, int], step: float) -> Plane:
-        """What is seen where no hand is (H, W), `size` = (W, H): a wall, things out of focus, a bright window.
+        """Return the background, seen where there is no hand.
+
+        Shape (H, W), `size` = (W, H): a wall, things out of focus, a bright window.
 
         `step` is how many pixels of the camera one of the backdrop is.
         """
@@ -104,7 +111,9 @@ class Leds:
         self._led = led_m.astype(np.float32)
 
     def on_surface(self, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
-        """Levels (N,) of plain skin at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
+        """Return the levels of plain skin at points lit by the LEDs.
+
+        Levels (N,) at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
 
         Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
         """
@@ -120,7 +129,10 @@ class Leds:
 
 
 def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
-    """Whether light from an origin (3,) [m] meets a body on its way to points (N, 3) [m], `square` (N,) [m^2] far."""
+    """Check whether a body blocks the light from an origin to points.
+
+    Origin (3,) [m], points (N, 3) [m], `square` (N,) [m^2]: their squared distances.
+    """
     far = np.sqrt(square)
     ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)
     known = terms(before, origin.astype(np.float64), np.float32)
@@ -139,7 +151,10 @@ class Sensor:
         self._sigma = np.sqrt(_READ_VARIANCE + _SHOT_VARIANCE * np.maximum(level - BLACK_LEVEL, 0.0))
 
     def bytes_of(self, level: Plane, key: int) -> Image:
-        """Image (H, W) of levels (H, W), black at BLACK_LEVEL; the same key, the same noise."""
+        """Convert levels to an image, black at BLACK_LEVEL.
+
+        Levels and image (H, W); the same key gives the same noise.
+        """
         height, width = level.shape
         mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
         mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF

@@ -58,7 +58,10 @@ def _alone(finger: int, share: float) -> Posture:
 
 
 def _swung(degrees: float) -> Posture:
-    """Half-bent fingers swung sideways together, towards the thumb for positive degrees."""
+    """Return half-bent fingers abducted sideways together.
+
+    Towards the thumb for positive degrees.
+    """
     return tuple((row[0] + (degrees if finger else 0.0), *row[1:]) for finger, row in enumerate(_HALF_BENT))
 
 
@@ -88,7 +91,10 @@ _SPREAD: tuple[Posture, ...] = (
 
 
 class Stations:
-    """Postures one after another, in 60 s. The state it holds is its script, fixed by the constructor."""
+    """Sequence of postures in 60 s.
+
+    The state it holds is its script, fixed by the constructor.
+    """
 
     def __init__(
         self, model: HandModel, postures: tuple[Posture, ...], seed: int, period_s: float = PERIOD_S
@@ -132,7 +138,10 @@ class GuidedCurl:
     """
 
     def __init__(self, model: HandModel) -> None:
-        """Of one hand; its limits do not cut what the ratios say."""
+        """Create the motion for one hand.
+
+        The limits of the hand do not clip what the ratios give.
+        """
         self._model = model
         self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
 
@@ -153,7 +162,9 @@ class GuidedCurl:
 
 
 class GuidedSubject:
-    """What `calibrate wrist subject` asks for: flat hand, straight fingers bent at their knuckles, fist, and back.
+    """Motion that `calibrate wrist subject` asks for.
+
+    Flat hand, straight fingers flexed at their knuckles, fist, and back.
 
     Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
     little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.
@@ -192,10 +203,16 @@ class GuidedSubject:
 
 
 class RandomPoses:
-    """Poses whose joints know nothing of each other, one after another. The state it holds is its script."""
+    """Sequence of poses whose joints are independent of each other.
+
+    The state it holds is its script.
+    """
 
     def __init__(self, model: HandModel, seed: int) -> None:
-        """Draw them, in the ranges of `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits."""
+        """Draw the random poses.
+
+        In the ranges of `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits.
+        """
         rng = np.random.default_rng([seed, 14])
         self._model = model
         self._angles = np.empty((RANDOM_POSES, 5, 4))
@@ -212,7 +229,10 @@ class RandomPoses:
         return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
-        """The hand at time `t_s` [s]; before 0 the pose of 0. The second half of each pose's time it stands still."""
+        """Return the hand at time `t_s`.
+
+        In [s]; before 0 the pose of 0. In the second half of each pose's time the hand stands still.
+        """
         t = max(t_s, 0.0) % PERIOD_S
         each_s = PERIOD_S / RANDOM_POSES
         place = min(int(t / each_s), RANDOM_POSES - 1)
@@ -223,7 +243,10 @@ class RandomPoses:
 
 
 class OnForearm:
-    """A motion as the forearm makes it: where the palm would be if the wrist was straight. It holds the motion."""
+    """Motion of the forearm: where the palm would be if the wrist were straight.
+
+    It holds the motion.
+    """
 
     def __init__(self, motion: HandMotion) -> None:
         """Of a hand."""

@@ -1,4 +1,6 @@
-"""Write a simulated wrist sequence as a recording of raw frames with its exact truth; and spoil its order.
+"""Export of a simulated wrist sequence as raw frames with exact truth.
+
+It is written as a recording; the order of the frames can be spoiled.
 
 The form is that of every recording of a wrist device: strobed triples in the order ambient, laser, LED, and a truth
 with one row per triple, under the keys of rendered recordings.
@@ -33,7 +35,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One frame to be taken: frame number, stamp [ns], scene time [s], what lights it."""
+    """One frame to be taken: frame number, stamp, scene time and illumination.
+
+    Stamp in [ns], scene time in [s].
+    """
 
     seq: int
     t_ns: int
@@ -44,7 +49,9 @@ class Shot:
 def with_faults(
     frames: Sequence[T], rng: np.random.Generator, drop: float = 0.0, double: float = 0.0, swap: float = 0.0
 ) -> list[T]:
-    """Frames as a bad camera or link delivers them: each with these probabilities lost, twice, or after the next one.
+    """Return frames as a faulty camera or link delivers them.
+
+    With these probabilities, each frame is lost, delivered twice, or delivered after the next one.
 
     A frame suffers at most one of the three; the frame that another one was swapped with suffers none.
     """
@@ -74,7 +81,7 @@ def record_wrist(
     step: int = 1,
     rig: RigCalibration | None = None,
 ) -> int:
-    """Render a scene as its camera takes it; return the number of triples.
+    """Render a scene as its camera takes it and return the number of strobe cycles.
 
     Args:
         folder: New or empty.
@@ -96,7 +103,10 @@ def record_wrist(
 
 
 class WristTake:
-    """What the camera of a wrist device takes of a scene, and its exact truth. It holds what is to be taken."""
+    """Frames that a wrist camera takes of a scene, with the exact truth.
+
+    It holds what is to be taken.
+    """
 
     def __init__(
         self,
@@ -124,7 +134,10 @@ class WristTake:
         return self._shots[0].t_s, self._shots[-1].t_s
 
     def manifest(self, rig: RigCalibration | None = None) -> Manifest:
-        """What is rendered, by a device of which is known what `rig` says; None: the truth."""
+        """Return the manifest of what is rendered.
+
+        The device is known as `rig` states; None: the truth.
+        """
         scene = self._scene
         return Manifest(
             version=1,
@@ -145,7 +158,10 @@ class WristTake:
             )
 
     def truth(self) -> Arrays:
-        """One row per triple: the hand and the line at its laser frame, the finger tips at its LED frame."""
+        """Return the ground truth, one row per strobe cycle.
+
+        The hand and the line at its laser frame, the finger tips at its LED frame.
+        """
         scene = self._scene
         lasers, leds = self._shots[1::3], self._shots[2::3]
         at_laser = [scene.truth(shot.t_s) for shot in lasers]
@@ -191,7 +207,10 @@ class WristTake:
 
 
 def _numbered(shots: list[Shot]) -> list[tuple[Shot, int]]:
-    """Shots with the number of their delivery: what is lost leaves a gap, what comes twice takes a frame."""
+    """Number the shots in the order of their delivery.
+
+    What is lost leaves a gap, what comes twice takes a frame.
+    """
     out: list[tuple[Shot, int]] = []
     more = 0
     last: int | None = None

@@ -1,4 +1,6 @@
-"""Scene -> frames of the wrist camera: by the light of the room alone, with the laser, with the LEDs.
+"""Renderer from scene to wrist camera frames: ambient, laser and LED.
+
+Ambient is the light of the room alone.
 
 Skin is shaded on a coarser grid (rays against the flesh, then Lambert), and enlarged; the laser line is drawn from its
 exact curve, each piece as wide and as bright as the sheet of light is there, to parts of a pixel.
@@ -30,8 +32,10 @@ SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen ed
 
 
 class WristRenderer:
-    """Images of one scene. It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure
-    function of t."""
+    """Renderer of one wrist scene.
+
+    It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure function of t.
+    """
 
     def __init__(
         self, scene: WristScene, camera: str, step: int = SURFACE_STEP, wrist_step_rad: float = 0.0
@@ -63,7 +67,9 @@ class WristRenderer:
         }
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "WristRenderer":
-        """The same scene before a camera with other settings; shares all that was prepared.
+        """Return a renderer of the same scene for a camera with other settings.
+
+        It shares everything that was prepared.
 
         Args:
             exposure_us: Exposure [us]; so short that nothing smears.
@@ -74,7 +80,10 @@ class WristRenderer:
         return other
 
     def render(self, t_s: float, lit: Illumination) -> Image:
-        """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
+        """Render the frame at mid-exposure at scene time `t_s`.
+
+        Image (H, W), grey; `t_s` in [s]; lit by the room and by `lit`.
+        """
         state = self._scene.motion.at(t_s)
         bodies = self._scene.bodies_of(state)
         palm = self._surface.palm(bodies, state.wrist_angles_rad)
@@ -102,7 +111,10 @@ class WristRenderer:
     def _shaded(
         self, behind: Plane, surface: SurfaceView, lit: Illumination, things: Capsules | None = None
     ) -> Plane:
-        """Levels on the coarse grid: `behind` with skin before it, and things in the light of the LEDs."""
+        """Return the shaded levels on the coarse grid.
+
+        `behind` with skin in front of it, and things in the light of the LEDs.
+        """
         shade = self._room.on_surface(surface.normals)
         if lit is Illumination.LED:
             shade += (
@@ -115,6 +127,9 @@ class WristRenderer:
 
 
 def _sharp(coarse: Plane, size: tuple[int, int]) -> Plane:
-    """Levels on the full grid; edges of skin before a window are as soft as the lens makes them, not as the grid."""
+    """Upsample levels to the full grid with edges as soft as the lens makes them.
+
+    This concerns edges of skin in front of a window; they are not as coarse as the grid.
+    """
     cut = cv2.GaussianBlur(np.minimum(coarse, SATURATED), (3, 3), 0.6)
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)

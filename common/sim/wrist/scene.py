@@ -1,4 +1,7 @@
-"""A wrist scene: hand, motion, light and device, as exact truth for every instant. Nothing in it remembers."""
+"""Wrist scene of hand, motion, light and device, exact at every time.
+
+It keeps no state.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,7 +34,9 @@ WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMB
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristTruth:
-    """Everything true of one instant, in the frame of the wrist camera; groups palm, thumb ... little, thenar.
+    """Complete ground truth of a wrist scene at one time.
+
+    In the frame of the wrist camera; groups palm, thumb ... little, thenar.
 
     Attributes:
         t_s: The instant [s], scene time.
@@ -65,7 +70,9 @@ class WristTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristScene:
-    """Hand, motion, light and the device that looks at it. The frame of the rig is that of its camera.
+    """Hand, motion, light and the device that looks at the hand.
+
+    The frame of the rig is that of its camera.
 
     Attributes:
         rig: Laser, LEDs, palm pose.
@@ -126,7 +133,9 @@ class WristScene:
         hand: HandProfile,
         seed: int = STANDARD_SEED,
     ) -> "WristScene":
-        """The scene called MOTION or MOTION@AMBIENT; a motion of `TOGETHER` is also that of a marker rig.
+        """Create the scene called MOTION or MOTION@AMBIENT.
+
+        A motion of `TOGETHER` is also that of a marker rig.
 
         Raises:
             PhalanxError: No such motion or light; a rig, camera or hand that does not fit.
@@ -153,7 +162,10 @@ class WristScene:
         return self._joints(self.motion.at(t_s))
 
     def bodies_at(self, t_s: float) -> Capsules:
-        """All that camera and laser meet at scene time `t_s` [s], camera frame: the flesh, after it the things."""
+        """Return all bodies that camera and laser meet at scene time `t_s`.
+
+        In [s], camera frame: the flesh, after it the things.
+        """
         return self.bodies_of(self.motion.at(t_s))
 
     def bodies_of(self, state: HandState) -> Capsules:
@@ -165,7 +177,10 @@ class WristScene:
         return self.capsules.bodies(self._straight)
 
     def flexed_bodies(self, wrist_angles_rad: Float) -> Capsules:
-        """The flesh of straight fingers while the wrist is bent by that (2,), camera frame."""
+        """Return the flesh of straight fingers while the wrist is flexed.
+
+        Flexed by `wrist_angles_rad` (2,), camera frame.
+        """
         return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), wrist_angles_rad))
 
     def truth(self, t_s: float) -> WristTruth:

@@ -1,4 +1,6 @@
-"""Draws the laser line: its exact curve widened by the thickness of the sheet, with the glow of the skin beside it.
+"""Renderer of the laser line.
+
+Its exact curve widened by the thickness of the sheet, with the glow of the skin beside it.
 
 A lit point moves along its ray by s where the sheet is looked at h off its middle: the point stays on the skin when
 n . (h m + s r) = 0, with n the normal of the skin, m that of the sheet, r the ray. So each piece between two rays is a
@@ -23,8 +25,11 @@ _EDGE_PX = 40
 
 
 def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) -> None:
-    """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), a coarser grid: what skin
-    gives back, about 1, and 0 where none is. Things glow as little as they give back, so not at all here."""
+    """Add the laser line to the levels in place.
+
+    Levels (H, W); the line glows where skin is, by `hand` (h, w), a coarser grid: what skin gives back, about 1, and
+    0 where none is. Things glow as little as they give back, so not at all here.
+    """
     sheet, optics = scene.sheet, scene.optics
     curve = sheet.cross(bodies)
     chords = np.flatnonzero(curve.joined)
@@ -49,7 +54,10 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) 
 
 
 def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
-    """Add light at places (N, 2) [px], each shared by four pixels, blurred as the lens and skin do."""
+    """Add light at image places, blurred as the lens and skin do.
+
+    Places (N, 2) [px], each shared by four pixels.
+    """
     height, width = level.shape
     inside = ((place > 1.0) & (place < np.array([width - 2.0, height - 2.0]))).all(axis=1)
     place, amount = place[inside], amount[inside]
@@ -74,7 +82,10 @@ def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
 
 
 def _glow(line: Plane, hand: Plane, box: tuple[int, int, int, int], width: int) -> Plane:
-    """What the skin about a line gives back, at a quarter of its size; none where no skin is."""
+    """Return the glow of the skin around a line, at a quarter of its size.
+
+    None where there is no skin.
+    """
     h, w = line.shape
     size = -(-w // 4), -(-h // 4)
     coarse = cv2.resize(line, size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""What skin the camera sees where: rays of a grid against the flesh, and what the skin there looks like.
+"""Visible skin surface: rays of a grid against the flesh, and its appearance.
 
 While the wrist is straight the palm stands still in the picture: it is looked at once, and its gaps between bones are
 filled up. Of a bent wrist that is done for every picture. Each part of a finger is looked for only inside the box of
@@ -45,14 +45,19 @@ class SurfaceView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Palm:
-    """The palm where no finger is before it: what is seen of it, and how far along each ray it begins (H * W,) [m]."""
+    """Palm with no finger in front of it: its visible surface and depth.
+
+    The depth is how far along each ray it begins (H * W,) [m].
+    """
 
     seen: SurfaceView
     depth: Plane
 
 
 class HandSurface:
-    """The grid and the palm of one scene. Holds what was prepared by the constructor, and the last palm by its bend.
+    """Grid and palm of one scene.
+
+    It holds what was prepared by the constructor, and the last palm by its flexion.
 
     Attributes:
         size: Of the grid, (W, H).
@@ -79,8 +84,10 @@ class HandSurface:
         self._rotated = [body for body in range(scene.capsules.still) if body not in outside]
 
     def palm(self, bodies: Capsules, wrist_angles_rad: Float) -> Palm:
-        """The palm of a hand whose flesh is at `bodies`, of a wrist bent by that (2,); `straight` itself while it is
-        straight."""
+        """Return the palm of a hand whose flesh is at `bodies`.
+
+        The wrist is flexed by `wrist_angles_rad` (2,); `straight` itself while the wrist is straight.
+        """
         if self._scene.capsules.same_palm(bodies, self._straight_bodies):
             return self.straight
         if self._wrist_step_rad <= 0.0:
@@ -92,7 +99,10 @@ class HandSurface:
         return self._flexed[1]
 
     def appearance(self, bodies: Capsules, palm: Palm) -> SurfaceView:
-        """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""
+        """Return the visible surface of fingers, thumb and things in front of the palm.
+
+        The flesh of the hand is at `bodies`.
+        """
         depth = palm.depth.copy()
         hit = self._cast(bodies, range(self._scene.capsules.still, len(bodies.start_m)), depth)
         return self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)
@@ -109,7 +119,10 @@ class HandSurface:
         return SurfaceView(pixel, points, normals, self._albedo(bodies, body, points, normals))
 
     def _cast(self, bodies: Capsules, which: Iterable[int], depth: Plane) -> Int:
-        """Bring nearer `depth` (H * W,) [m] along the rays; say by which body (H * W,), -1: by none of them."""
+        """Update the depth along the rays where a body is nearer, and return the bodies.
+
+        `depth` (H * W,) [m]; the result (H * W,) is the body, -1: none of them.
+        """
         low, high = self._boxes(bodies)
         known = terms(bodies, _ORIGIN, np.float32)
         shape = self.size[::-1]
@@ -152,7 +165,10 @@ class HandSurface:
         return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
 
     def _albedo(self, bodies: Capsules, body: Int, points: Plane, normals: Plane) -> Plane:
-        """Skin is never even: blotches that stay on their body, dark lines across it where a joint is. Things are."""
+        """Return the albedo of skin and things.
+
+        Skin is never even: blotches that stay on their body, dark lines across it where a joint is. Things are even.
+        """
         axis = bodies.stop_m - bodies.start_m
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         aside = np.eye(3)[0] - axis[:, :1] * axis  # across the body, whichever way it is bent
@@ -191,14 +207,20 @@ class HandSurface:
 
 
 def _flat_field(scene: WristScene, rays: Float) -> Float:
-    """What the rig's file says of the brightness across the image, at rays (N, 3); 1 where it says nothing."""
+    """Return the rig file's brightness across the image along the given rays.
+
+    Rays (N, 3); 1 where the file states nothing.
+    """
     if scene.rig.flat_field is None:
         return np.ones(len(rays))
     return flat_of(scene.rig.flat_field, rays[:, :2] / rays[:, 2:])
 
 
 def _texture(rng: np.random.Generator) -> Plane:
-    """Brightness of skin (256, 256) about 1, half a millimetre a texel, closed at its edges."""
+    """Return a brightness texture of skin.
+
+    Shape (256, 256), about 1, half a millimetre a texel, closed at its edges.
+    """
     out = np.ones((256, 256), dtype=np.float32)
     for sigma, depth in ((1.0, 0.03), (5.0, 0.03), (20.0, 0.04)):
         noise = np.tile(rng.standard_normal((256, 256), dtype=np.float32), (2, 2))

@@ -1,4 +1,6 @@
-"""What the hand holds, before the wrist camera: bodies that follow those of the flesh, matt and dark.
+"""Things that the hand holds in front of the wrist camera.
+
+Bodies that follow those of the flesh, matt and dark.
 
 They hide what is behind them from the camera, and keep the laser and the LEDs from it.
 """
@@ -15,7 +17,9 @@ ALBEDO = 0.05  # of matt black paint or rubber in the near infrared, against usu
 
 
 def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:
-    """Round cones of equal radii that stand for closed cylinders, in the camera's frame.
+    """Return round cones of equal radii that stand for closed cylinders.
+
+    In the camera's frame.
 
     Their round ends hold as much as the flat ones: a hand that holds one in its middle touches none of them.
 

@@ -1,4 +1,7 @@
-"""One camera by itself: its lens, where the board was, and which of its images are wrong. The start of every fit."""
+"""Calibration of one camera by itself, the start of every fit.
+
+Its lens, where the board was, and which of its images are wrong.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -115,7 +118,10 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
 def _robust(
     good: list[int], seen: list[tuple[Int, Float]], drawn: Float, lens: Float, *, first: bool
 ) -> tuple[Float, float]:
-    """Lens fitted with Cauchy's loss, its scale three times the robust standard deviation of the residuals."""
+    """Fit a lens with Cauchy's loss.
+
+    The scale of the loss is three times the robust standard deviation of the residuals.
+    """
     observations = [Observation(0, view, *seen[i]) for view, i in enumerate(good)]
     places = np.stack([place_board(drawn[seen[i][0]], seen[i][1], lens)[0] for i in good])
     bundle = Bundle(lens[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn))

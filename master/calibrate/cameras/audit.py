@@ -1,4 +1,4 @@
-"""What a calibration is worth, measured from the values as they are written to the files."""
+"""Accuracy of a calibration, measured from the values as written to the files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -80,7 +80,10 @@ def audit_pair(
 
 
 def _epipolar(essential: Float, a: Float, b: Float) -> Float:
-    """Distances (2n,) of normalized points (n, 2) from the lines of their partners, in both images."""
+    """Return the distances of normalized points from their epipolar lines.
+
+    Distances (2n,) of points (n, 2) from the lines of their partners, in both images.
+    """
     a1, b1 = np.column_stack([a, np.ones(len(a))]), np.column_stack([b, np.ones(len(b))])
     in_b, in_a = a1 @ essential.T, b1 @ essential
     product = (b1 * in_b).sum(axis=1)

@@ -8,7 +8,10 @@ from master.calibrate.cameras.options import board_of
 
 
 def board(options: Namespace) -> None:
-    """Draw a board at true scale, with a ruler of 100 mm and the options to calibrate with it."""
+    """Draw a board at true scale.
+
+    With a ruler of 100 mm and the options to calibrate with it.
+    """
     from master.calibrate.cameras.board_print import print_board  # matplotlib takes a second to import
 
     marker = None

@@ -1,4 +1,7 @@
-"""Draws a board at true scale: a vector page, a ruler to check the printer by, and the options to calibrate with it."""
+"""Drawing of a board at true scale.
+
+A vector page, a ruler to check the printer by, and the options to calibrate with it.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +99,9 @@ def _marker_rectangles(board: Charuco) -> list[Rectangle]:
 
 
 def print_board(path: Path, board: Board, paper: str) -> None:
-    """Write the page; the ending of the file says whether PDF or SVG.
+    """Write the page as PDF or SVG.
+
+    The ending of the file decides which.
 
     Raises:
         CalibrationError: It does not fit, the ending is another, or the file cannot be written.

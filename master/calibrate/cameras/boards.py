@@ -43,7 +43,9 @@ class Checkerboard:
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """A ChArUco board, OpenCV's present pattern (first square dark); its corners are told apart by markers.
+    """ChArUco board whose corners are identified by markers.
+
+    OpenCV's present pattern (first square dark).
 
     Attributes:
         columns, rows: Squares along x and y, at least 3.
@@ -105,7 +107,10 @@ def board_corners(board: Board) -> Float:
 
 
 def grid_edges(board: Board) -> Int:
-    """Pairs (E, 2) of corner numbers that are one square apart: along the rows first, then down the columns."""
+    """Return pairs of corner numbers that are one square apart.
+
+    Shape (E, 2): along the rows first, then down the columns.
+    """
     rows, columns = grid_shape(board)
     n = np.arange(rows * columns).reshape(rows, columns)
     along = np.stack([n[:, :-1].ravel(), n[:, 1:].ravel()], axis=1)
@@ -114,7 +119,9 @@ def grid_edges(board: Board) -> Int:
 
 
 def orderings(board: Board) -> tuple[Int, ...]:
-    """Turns of the pattern that look the same: orders (N,) of corner numbers, the unturned one first.
+    """Return the rotations of the pattern that look the same.
+
+    Orders (N,) of corner numbers, the unrotated one first.
 
     A ChArUco board has one. A checkerboard with an odd sum of columns and rows has one too, because its colours tell
     its ends apart; other checkerboards look the same after half a turn, square ones also after a quarter.

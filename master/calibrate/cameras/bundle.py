@@ -1,4 +1,6 @@
-"""Least squares over lenses, places of cameras, places of the board and the board's own shape, all at once.
+"""Bundle adjustment of lenses, camera poses, board poses and the board's shape.
+
+Least squares over all of these at once.
 
 Every image sees corners i of the board through  X_rig = T_rig_board (c_i + s_i),  X = T_camera_rig X_rig,  pixel =
 lens(X), where c_i is the drawn corner and s_i how far it lies from there on the real, never quite flat board. Poses of
@@ -102,7 +104,10 @@ class Solution:
         return np.sqrt(np.diag(self.covariance)[9 * camera : 9 * camera + 9])
 
     def place_sd(self, camera: int) -> Float:
-        """Standard deviations (6,) of a camera's place: rotation vector [rad], translation [m]; 0: held."""
+        """Return the standard deviations of a camera's pose.
+
+        Shape (6,): rotation vector [rad], translation [m]; 0: held.
+        """
         at = 9 * len(self.bundle.lenses) + 6 * camera
         return np.sqrt(np.diag(self.covariance)[at : at + 6])
 
@@ -114,7 +119,9 @@ def solve(
     cauchy_px: float | None = None,
     sigma_px: float = 0.2,
 ) -> Solution:
-    """Minimise the sum of squared residuals, or with `cauchy_px` the sum of Cauchy losses per corner.
+    """Minimise the sum of squared residuals or of Cauchy losses.
+
+    With `cauchy_px` it is the sum of Cauchy losses per corner.
 
     Args:
         observations: At least one; every view of `start` is in one of them.
@@ -156,7 +163,10 @@ def predict(bundle: Bundle, seen: Observation) -> Float:
 
 
 def rms(residuals: Sequence[Float]) -> float:
-    """Root mean square distance [px] of corners (OpenCV's measure: both coordinates under one root)."""
+    """Return the root mean square distance [px] of corners.
+
+    OpenCV's measure: both coordinates under one root.
+    """
     return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals]))))
 
 
@@ -189,8 +199,10 @@ def _skews(vectors: Float) -> Float:
 
 
 def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
-    """Residuals (n, 2) and the derivatives of the prediction: lens (n, 2, 9), place of the camera and of the board
-    (n, 2, 6) each, shape (n, 2, 3). A place turns by exp(w) on its left and moves by t.
+    """Return the residuals and the derivatives of the prediction.
+
+    Residuals (n, 2); derivatives by lens (n, 2, 9), pose of the camera and of the board (n, 2, 6) each, shape (n, 2,
+    3). A pose rotates by exp(w) on its left and moves by t.
     """
     on_board, in_rig, points = _camera_points(bundle, seen)
     lens = bundle.lenses[seen.camera]
@@ -252,7 +264,10 @@ def _normal_equations(
 
 
 def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, Float, Float]:
-    """The equations of what is free and shared, and what leads back to the views' own."""
+    """Return the reduced (Schur) equations of the free shared parameters.
+
+    Also what leads back to the views' own parameters.
+    """
     shared, mixed, own, right, right_own = normal
     shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
     # A board that wrong corners drove far away no longer moves any pixel; its equations must stay solvable.
@@ -265,7 +280,10 @@ def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, 
 
 
 def _step(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float] | None:
-    """Marquardt's step: shared (S,) and per view (V, 6); None: not determined, more damping is needed."""
+    """Return Marquardt's step, or None where it is not determined.
+
+    Shared (S,) and per view (V, 6); None: more damping is needed.
+    """
     schur, right, by_shared, by_right = _reduced(normal, mask, damping)
     step = np.zeros(len(mask))
     if mask.any():

@@ -1,4 +1,6 @@
-"""Takes the pictures for a calibration from running slaves: whole frames over the bus, on a person's pace.
+"""Image capture for a calibration from running slaves.
+
+Whole frames over the bus, on a person's pace.
 
 While it runs it *is* the rig's master: it gives the start and keeps the clocks, so that slaves need not know that
 nobody tracks. Nothing is calibrated here; its folder is what `calibrate cameras intrinsics` and `stereo` read.
@@ -107,7 +109,10 @@ class StillTaker:
         self._next_round: Subscription = bus.subscribe("still", depth=4 * len(sizes))
 
     def take(self) -> Round:
-        """One round: ask all, then wait until all that answered have sent, at most a second."""
+        """Take one round of images.
+
+        Ask all, then wait until all that answered have sent, at most a second.
+        """
         while self._next_round.get(0.0) is not None:
             pass  # what came too late for its own round
         askers = [threading.Thread(target=self._ask, args=(name,), daemon=True) for name in self._cameras]

@@ -1,4 +1,7 @@
-"""`phalanx calibrate cameras capture`: pictures of a board from the running slaves, for `intrinsics` and `stereo`."""
+"""Command `phalanx calibrate cameras capture`: board images from running slaves.
+
+They are for `intrinsics` and `stereo`.
+"""
 
 import os
 import threading
@@ -28,7 +31,10 @@ _HINT_ROUNDS = 50  # ten seconds
 
 
 def capture_views(options: Namespace) -> None:
-    """Keep a picture whenever the board is held still somewhere new; all running slaves of the rig at once."""
+    """Keep an image whenever the board is held still somewhere new.
+
+    All running slaves of the rig at once.
+    """
     ends = address(options.beacon, "--beacon"), address(options.bind, "--bind")
     cameras = cameras_of(options.calibration, options.rig)
     sizes = _sizes(options.calibration, cameras)
@@ -68,13 +74,16 @@ def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
 
 
 def _sizes(calibration: Path, cameras: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Width and height [px] that the camera files say."""
+    """Return the image sizes that the camera files state.
+
+    Width and height [px].
+    """
     files = (load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in cameras)
     return {file.name: (file.width_px, file.height_px) for file in files}
 
 
 def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> None:
-    """Until the start was given; says whom it waits for.
+    """Wait until the start is given, and print whom it waits for.
 
     Raises:
         CalibrationError: Called with to stop before.

@@ -1,4 +1,7 @@
-"""`phalanx calibrate cameras intrinsics | stereo`: lenses, and where the cameras stand, from pictures of a board."""
+"""Calibration of lenses and camera poses from images of a board.
+
+`phalanx calibrate cameras intrinsics | stereo`.
+"""
 
 from argparse import Namespace
 from collections.abc import Iterable
@@ -58,7 +61,10 @@ def intrinsics(options: Namespace) -> None:
 
 
 def stereo(options: Namespace) -> None:
-    """Measure where all cameras of a rig stand, and their lenses, in one bundle; two cameras or more."""
+    """Calibrate the poses and lenses of all cameras of a rig in one bundle.
+
+    Two cameras or more.
+    """
     rig_known = known_rig(options.rig, options.calibration, options.out)
     views = _views(
         options.source,
@@ -108,7 +114,9 @@ def stereo(options: Namespace) -> None:
 
 
 def _bent(*, flat: bool, bent: bool) -> bool | None:
-    """What the options say of the board; None: views held out decide.
+    """Return whether the options declare the board bent.
+
+    None: views held out decide.
 
     Raises:
         FitError: It is both.
@@ -152,7 +160,10 @@ def _only(views: BoardViews, camera: str) -> BoardViews:
 
 
 def _source_name(source: Path) -> str:
-    """The folder as data are named in provenance: its own name, not where this machine keeps it."""
+    """Return the folder's name as data are named in provenance.
+
+    Its own name, not where this machine keeps it.
+    """
     return source.resolve().name
 
 

@@ -1,4 +1,7 @@
-"""How well a camera's views cover what its lens can do, and which view is missing most."""
+"""Coverage of a camera's views, and the view that is missing most.
+
+How well they cover what its lens can do.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

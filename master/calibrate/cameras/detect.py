@@ -43,7 +43,10 @@ class ImageObservation:
 
 
 def find_board(board: Board, image: Image) -> ImageObservation | None:
-    """The board in an image (H, W) or (H, W, 3) BGR; None where it is not found whole (ChArUco: 8 corners of it)."""
+    """Detect the board in an image.
+
+    Image (H, W) or (H, W, 3) BGR; None where it is not found whole (ChArUco: 8 corners of it).
+    """
     grey = image if image.ndim == 2 else cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
     if corners is None:
@@ -68,7 +71,10 @@ def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:
 
 
 def _upright(board: Checkerboard, grey: Image, corners: Float) -> Float:
-    """The same corners in the board's own order: never mirrored, and square (0, 0) dark where that is a choice."""
+    """Return the same corners in the board's own order.
+
+    Never mirrored, and square (0, 0) dark where that is a choice.
+    """
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
@@ -98,7 +104,10 @@ def _charuco(board: Charuco, grey: Image) -> Float | None:
 
 
 def _refine(board: Board, grey: Image, corners: Float) -> Float:
-    """Sub-pixel places of rough corners; one that moves by more than its window was none and becomes NaN."""
+    """Refine rough corners to sub-pixel positions.
+
+    One that moves by more than its window was none and becomes NaN.
+    """
     half = _windows(board, corners)
     refined = np.full_like(corners, np.nan)
     for i in np.flatnonzero(np.isfinite(half)):
@@ -115,7 +124,10 @@ def _refine(board: Board, grey: Image, corners: Float) -> Float:
 
 
 def _windows(board: Board, corners: Float) -> Float:
-    """Half side [px] of each corner's window (N,); NaN where no square beside the corner is complete."""
+    """Return half the side of each corner's window.
+
+    Shape (N,) [px]; NaN where no square beside the corner is complete.
+    """
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)
     along, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
@@ -137,7 +149,9 @@ def _windows(board: Board, corners: Float) -> Float:
 
 
 def _blur(board: Board, grey: Image, corners: Float) -> float:
-    """Standard deviation [px] of the blur across the board's edges, the worse of its two directions.
+    """Return the blur across the board's edges.
+
+    Standard deviation [px], the worse of its two directions.
 
     A step blurred by a Gaussian has the steepest slope step / (sigma sqrt(2 pi)).
     """

@@ -1,4 +1,7 @@
-"""Into the calibration tree: lenses into cameras/NAME.json, places into rigs/RIG.json, each with its provenance."""
+"""Writing calibrations into the calibration tree, each with its provenance.
+
+Lenses into cameras/NAME.json, poses into rigs/RIG.json.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +23,10 @@ NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not me
 
 
 def known_camera(name: str, calibration: Path, out: Path | None) -> CameraCalibration | None:
-    """The camera's file: that of `out`, else that of `calibration`; None: there is none."""
+    """Return the camera's file, or None if there is none.
+
+    The file of `out`, else that of `calibration`.
+    """
     for tree in (out, calibration):
         if tree is not None and (path := tree / "cameras" / f"{name}.json").exists():
             return load(path, CameraCalibration)
@@ -51,7 +57,10 @@ def check_size(camera: CameraCalibration, size_px: tuple[int, int]) -> None:
 def camera_with_lens(
     known: CameraCalibration | None, name: str, size_px: tuple[int, int], lens: Intrinsics, how: Provenance
 ) -> CameraCalibration:
-    """The camera's file with a new lens; a new one with neutral settings where there is none."""
+    """Return the camera's file with a new lens.
+
+    A new file with neutral settings where there is none.
+    """
     if known is None:
         how = msgspec.structs.replace(how, note=f"{how.note}; new file: {NEUTRAL}")
         return CameraCalibration(
@@ -73,7 +82,9 @@ def camera_with_lens(
 def rig_with_places(
     known: RigCalibration | None, name: str, places: dict[str, Matrix4], how: Provenance
 ) -> RigCalibration:
-    """The rig's file with new places; everything else in it stays, and so does its frame.
+    """Return the rig's file with new camera poses.
+
+    Everything else in it stays, and so does its frame.
 
     Args:
         known: The rig so far; None: a new marker rig.

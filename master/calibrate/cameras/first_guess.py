@@ -1,4 +1,7 @@
-"""Where a bundle starts from: a lens by trial of focal lengths, boards by PnP; bad views do not mislead it."""
+"""Initial guess of a bundle.
+
+A lens by trial of focal lengths, boards by PnP; bad views do not mislead it.
+"""
 
 from collections.abc import Sequence
 
@@ -12,7 +15,9 @@ _FOCAL = np.geomspace(0.35, 6.0, 24)  # of the image's width: 110 to 10 degrees 
 
 
 def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
-    """A lens (9,) without distortion, by the focal length under which the middle image fits best.
+    """Return an initial lens without distortion.
+
+    Shape (9,), by the focal length under which the middle image fits best.
 
     The middle one: up to half of the images may be wrong altogether.
 

@@ -1,4 +1,6 @@
-"""All cameras that saw a board in one bundle: lenses, places, and the board's shape; what is wrong is left out.
+"""Fit of all cameras that saw a board in one bundle.
+
+Lenses, poses, and the board's shape; what is wrong is rejected.
 
 every camera alone -> links between them -> robust bundle <-> judge images and views -> plain least squares,
 with the board as drawn and with a shape of its own -> the one that predicts views held out better
@@ -60,7 +62,10 @@ class CamerasFit:
         return tuple(i for i, shot in enumerate(self.shots) if shot.camera == camera)
 
     def shared(self) -> tuple[int, ...]:
-        """Indices of the accepted images in whose place of the board another camera has one too."""
+        """Return the indices of accepted images whose board pose another camera shares.
+
+        The other camera has an accepted image of the same place of the board.
+        """
         places = [shot.place for shot in self.shots]
         return tuple(i for i, place in enumerate(places) if places.count(place) > 1)
 
@@ -144,7 +149,10 @@ def _fit(
 
 
 def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
-    """Everything but what is held, the place of the first camera, and the last term of the distortion."""
+    """Return the free parameters of the bundle.
+
+    Everything but what is held, the pose of the first camera, and the last term of the distortion.
+    """
     lenses = np.array([[camera not in held and term < 8 for term in range(9)] for camera in views.cameras])
     return Free(lenses, np.arange(len(views.cameras)) > 0, shape=False)
 
@@ -152,7 +160,10 @@ def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
 def _robust(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle, free: Free, sigma: float, *, bent: bool
 ) -> tuple[Bundle, float]:
-    """The bundle by Cauchy's loss, its scale three robust standard deviations, first flat and then with its shape."""
+    """Solve the bundle with Cauchy's loss, first flat and then with its shape.
+
+    The scale of the loss is three robust standard deviations.
+    """
     observations = seen.observations(shots)
     bundle = place_boards(observations, bundle)
     for shape in (False, True) if bent else (False,):
@@ -194,7 +205,10 @@ def _bare(lenses: Float) -> Float:
 
 
 def _determined(solution: Solution, lenses: Bool) -> Bool:
-    """The free terms (C, 9), less the next one of each camera that may as well be zero."""
+    """Return the free terms without the next insignificant one of each camera.
+
+    Terms (C, 9); the removed term may as well be zero.
+    """
     kept = lenses.copy()
     for camera, lens in enumerate(solution.bundle.lenses):
         for term in _TERMS:

@@ -1,4 +1,6 @@
-"""Whether the board is flat or bent, decided by views that were held out of the fit (cross validation).
+"""Decision whether the board is flat or bent, by cross validation.
+
+Views that were held out of the fit decide.
 
 A shape of its own always lowers the residuals of the views that it is fitted to: three numbers a corner see to that.
 So the views are dealt into folds. Lenses, places of the cameras and shape are fitted to all folds but one; in the
@@ -62,7 +64,9 @@ class Model:
 
 
 def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> BoardChoice:
-    """The board that predicts the corners of held-out views better; the flat one where that is not certain.
+    """Choose the board that predicts the corners of held-out views better.
+
+    The flat one where that is not certain.
 
     Args:
         seen: What was seen.
@@ -93,7 +97,10 @@ def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> Board
 
 
 def _folds(shots: Sequence[Shot]) -> Iterator[tuple[list[Shot], list[Shot]]]:
-    """Images to fit and images held out, in turn; views that the same cameras saw are dealt evenly."""
+    """Yield images to fit and images held out, in turn.
+
+    Views that the same cameras saw are dealt evenly.
+    """
     cameras: dict[str, tuple[str, ...]] = {}
     for shot in shots:
         cameras[shot.place] = (*cameras.get(shot.place, ()), shot.camera)
@@ -115,7 +122,10 @@ def _lacking(seen: Seen, training: Sequence[Shot], free: Free) -> str:
 
 
 def _errors(seen: Seen, training: Sequence[Shot], held_out: Sequence[Shot], model: Model) -> Float:
-    """Rms distance (V,) [px] of the corners of each view held out; NaN: too few to place the board by half of them."""
+    """Return the rms corner distance of each held-out view.
+
+    Shape (V,) [px]; NaN: too few to place the board by half of them.
+    """
     observations = seen.observations(training)
     start = place_boards(observations, model.bundle)
     fitted = solve(observations, start, model.free, sigma_px=model.sigma_px).bundle
@@ -133,7 +143,10 @@ def _errors(seen: Seen, training: Sequence[Shot], held_out: Sequence[Shot], mode
 def _predicted(
     observations: Sequence[Observation], fitted: Bundle, is_odd: Bool, *, odd: bool
 ) -> Iterator[tuple[int, Float]]:
-    """Views whose boards the odd corners place (or the even ones), and squared distances (n,) of the other corners."""
+    """Yield views and squared corner distances, with boards placed by one half.
+
+    The odd corners place the boards (or the even ones); squared distances (n,) are of the other corners.
+    """
     halves: dict[int, list[Observation]] = {}
     for o in observations:
         half = _only(o, is_odd[o.corners] == odd)
@@ -159,6 +172,9 @@ def _only(seen: Observation, which: Bool) -> Observation:
 
 
 def _odd(board: Board) -> Bool:
-    """Corners (N,) of the one half: every second along and down, so that either half spans the board."""
+    """Return one half of the corners, as a mask.
+
+    Shape (N,): every second along and down, so that either half spans the board.
+    """
     row, column = np.indices(grid_shape(board))
     return np.asarray((row + column) % 2 == 1, dtype=np.bool_).ravel()

@@ -1,4 +1,7 @@
-"""Where images of a board come from: a folder of files, a folder per camera, or a recording of ours."""
+"""Sources of board images.
+
+A folder of files, a folder per camera, or a recording of ours.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -20,7 +23,9 @@ MOST_VIEWS = 60  # of a recording: more of the same motion adds time, not knowle
 
 
 def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, ImageSet]]:
-    """Views of a folder, by name: each the images of all cameras taken at one instant.
+    """Return the views of a folder, by name.
+
+    Each is the images of all cameras taken at one epoch.
 
     Args:
         folder: Holds `recording.json`; or one sub-folder of images per camera, views matched by file name; or images
@@ -107,8 +112,11 @@ def _load(file: Path) -> Image:
 
 
 def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
-    """The frames that show a board: of strobed ones those with the LEDs on, which are there in the dark too, and no
-    second frame of the same moment; never those with a laser's line across the corners."""
+    """Return the frames that show a board.
+
+    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same moment;
+    never those with a laser's line across the corners.
+    """
     lit = {row.illumination for row in rows}
     for best in (Illumination.LED, Illumination.AMBIENT):
         if best in lit:
@@ -117,7 +125,10 @@ def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
 
 
 def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, ImageSet]]:
-    """Views evenly over a recording: frames of the first camera, with those of the others nearest in time."""
+    """Return views spread evenly over a recording.
+
+    Frames of the first camera, with those of the others nearest in time.
+    """
     recording = open_recording(folder)
     names = list(cameras) or list(recording.manifest.cameras)
     rows = {name: _showing(recording.frames_of(name)) for name in names}

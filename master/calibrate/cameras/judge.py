@@ -44,7 +44,10 @@ class Seen:
     corner_order: Mapping[str, Mapping[str, Int]]
 
     def observations(self, shots: Sequence[Shot]) -> tuple[Observation, ...]:
-        """The corners of the shots; views are numbered by the shots' places, in order of appearance."""
+        """Return the corners of the shots.
+
+        Views are numbered by the shots' places, in order of appearance.
+        """
         cameras = self.views.cameras
         number = {place: i for i, place in enumerate(dict.fromkeys(shot.place for shot in shots))}
         by_name = {view.name: view for view in self.views.views}
@@ -113,7 +116,10 @@ def judge(
 def _judge_images(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle
 ) -> tuple[tuple[Shot, ...], tuple[Rejection, ...], Float]:
-    """Good shots, reasons against the others, and each camera's robust standard deviation (C,) [px]."""
+    """Return good shots, rejections, and each camera's robust standard deviation.
+
+    Reasons are given for the rejections; the standard deviation is (C,) [px].
+    """
     residuals = _settled(seen, [replace(shot, place=f"{shot.view} {shot.camera}") for shot in shots], bundle)
     errors = np.array([rms([r]) for r in residuals])
     dof = np.array([2.0 * len(r) - 6.0 for r in residuals])
@@ -149,7 +155,10 @@ def _none(bundle: Bundle) -> Bool:
 
 
 def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, sigma: Float) -> Float:
-    """Rms residual (V,) [px] of each view, as if all cameras were as good as the middle one."""
+    """Return the rms residual of each view.
+
+    Shape (V,) [px], as if all cameras were as good as the middle one.
+    """
     shots = [shot for own in views for shot in own]
     residuals = iter(_settled(seen, shots, bundle))
     cameras = seen.views.cameras
@@ -159,7 +168,10 @@ def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, si
 
 
 def _to_part(seen: Seen, own: Sequence[Shot], bundle: Bundle, sigma: Float, bound: float) -> set[str]:
-    """The cameras to part from a view: the one without which the others agree, or else all."""
+    """Return the cameras to separate from a view.
+
+    The one without which the others agree, or else all.
+    """
     if len(own) < 3:
         return {shot.camera for shot in own}
     without = [[shot for shot in own if shot != rejected] for rejected in own]

@@ -1,4 +1,7 @@
-"""Lenses and places between the fits' arrays and the calibration files' types; numbers rounded as they are written."""
+"""Conversion of lenses and poses between fit arrays and calibration file types.
+
+Numbers are rounded as they are written.
+"""
 
 import numpy as np
 

@@ -1,4 +1,7 @@
-"""How the cameras stand to each other, from views that two of them share; wrong views are outvoted."""
+"""Relative poses of the cameras, from views that two of them share.
+
+Wrong views are outvoted.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,14 +61,20 @@ def _relative(
     of: Mapping[str, Float],
     views: list[str],
 ) -> Float:
-    """T_to_of (4, 4) [m]: of all views' estimates, the one from which the others are least far in the middle."""
+    """Return the view estimate of T_to_of with the least median distance.
+
+    Shape (4, 4) [m]: of all views' estimates, the one with the least median distance from the others.
+    """
     candidates = [
         np.stack([to[view] @ rotation @ invert(of[view]) for _, rotation in turns]) for view in views
     ]
     points = [transform(of[view], drawn) for view in views]
 
     def distance(T: Float) -> float:
-        """Median over views of how far [m] the board is from where T puts it, in the ordering that suits."""
+        """Return the median distance of the board from where T puts it.
+
+        Median over views in [m], in the ordering that suits.
+        """
         off = [
             min(float(np.linalg.norm(transform(T, p) - transform(other, p), axis=1).mean()) for other in own)
             for own, p in zip(candidates, points, strict=True)
@@ -78,7 +87,10 @@ def _relative(
 def _corner_orders(
     drawn: Float, turns: list[tuple[Int, Float]], known: Mapping[str, Float], places: Places
 ) -> dict[str, dict[str, Int]]:
-    """For each view the order of each camera's corners that agrees best with the first camera of the view."""
+    """Return the order of each camera's corners for each view.
+
+    The order that agrees best with the first camera of the view.
+    """
     corner_order: dict[str, dict[str, Int]] = {}
     for view in sorted(set[str]().union(*places.values())):
         first: Float | None = None

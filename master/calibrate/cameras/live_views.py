@@ -1,4 +1,6 @@
-"""Which pictures of a hand-held board are worth keeping: held still, in focus of the fit, and unlike those kept before.
+"""Selection of images of a hand-held board that are worth keeping.
+
+Held still, in focus of the fit, and unlike those kept before.
 
 Cameras that are not synchronised see a moving board in two places, so a view counts only where every camera that
 sees the board sees it where it was in the round before. Rounds are a fraction of a second apart and cameras less, so
@@ -34,7 +36,10 @@ class Verdict:
 
 
 class LiveViews:
-    """Push machine. Holds the views kept so far and where each camera saw the board in the last round."""
+    """Push machine for live views.
+
+    It holds the views kept so far and where each camera saw the board in the last round.
+    """
 
     def __init__(self, board: Board, cameras: tuple[str, ...]) -> None:
         """Begin without views."""
@@ -66,7 +71,10 @@ class LiveViews:
         return BoardViews(self.board, dict(self._sizes), tuple(self.views))
 
     def missing(self) -> str:
-        """The view that would help most now, for the camera that needs one most; what to do once none is missing."""
+        """Return the view that would help most now.
+
+        For the camera that needs one most; what to do once none is missing.
+        """
         views = self.board_views()
         for name in sorted(self.cameras, key=lambda name: len(views.of(name))):
             if wish := advice_so_far(views, name):
@@ -79,7 +87,10 @@ class LiveViews:
         return "nothing is missing any more; more views make it more certain"
 
     def _is_new(self, seen: Mapping[str, ImageObservation]) -> bool:
-        """Whether some camera sees the board as in no view before; a set of cameras that is new is news as well."""
+        """Check whether some camera sees the board as in no view before.
+
+        A set of cameras that is new counts as new as well.
+        """
         for view in self.views:
             if not set(seen) <= set(view.observations):
                 continue
@@ -93,7 +104,10 @@ class LiveViews:
 
 
 def _moved(now: ImageObservation, then: ImageObservation) -> float:
-    """How far the corners seen both times moved [px]: root mean square; inf where there are none."""
+    """Return how far the corners seen both times moved.
+
+    Root mean square [px]; inf where there are none.
+    """
     step: Float = now.corners_px - then.corners_px
     both = np.isfinite(step[:, 0])
     return float(np.sqrt((step[both] ** 2).sum(axis=1).mean())) if both.any() else float("inf")

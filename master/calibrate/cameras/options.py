@@ -22,7 +22,10 @@ def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: s
 
 
 def options_of(board: Board) -> str:
-    """The options that say `board`: `board_of` of them is that board again."""
+    """Return the options that specify `board`.
+
+    `board_of` of them is that board again.
+    """
     text = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
     if isinstance(board, Charuco):
         text += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"

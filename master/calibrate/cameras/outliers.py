@@ -11,7 +11,9 @@ _LEAST_SPREAD = 0.1  # of log rms: below it, views of one camera hardly ever agr
 
 
 def limit(errors: Float, dof: Float) -> float:
-    """The error above which a view does not belong to the others; infinite below four views.
+    """Return the error above which a view is an outlier.
+
+    Infinite below four views.
 
     The logarithms of good views' rms errors scatter about a common middle, more than chi-square alone would have it
     (light, blur and tilt differ). Middle and spread are the median and the median absolute deviation of all views, so

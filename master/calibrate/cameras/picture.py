@@ -1,4 +1,7 @@
-"""Picture of a calibration of cameras: where corners were seen, what is left of them, and which views fit how well."""
+"""Plot of a camera calibration.
+
+Where corners were seen, their residuals, and which views fit how well.
+"""
 
 from pathlib import Path
 
@@ -17,7 +20,9 @@ _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
 def draw_views(path: Path, fit: CamerasFit) -> None:
-    """Write the picture as PNG, one row per camera: corners, residuals enlarged, rms of each view.
+    """Write the plot as PNG, one row per camera.
+
+    Corners, residuals enlarged, rms of each view.
 
     Raises:
         RecordingError: The file cannot be written.

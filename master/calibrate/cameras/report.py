@@ -1,4 +1,7 @@
-"""The table that a person reads after a calibration of cameras, and the same numbers for a machine."""
+"""Report table of a camera calibration.
+
+A person reads it after the calibration; the same numbers are given for a machine.
+"""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,7 @@
-"""What the fits of cameras say: lenses and places with their uncertainty, or why the views are not enough."""
+"""Results of the camera fits.
+
+Lenses and poses with their uncertainty, or why the views are not enough.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -165,7 +168,9 @@ def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: in
 
 
 def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
-    """Standard deviations of a camera's centre (3,) [m] and turn (3,) [rad], and of its distance from the first [m].
+    """Return the standard deviations of a camera's position, rotation and distance.
+
+    Centre (3,) [m] and rotation (3,) [rad]; the distance is from the first camera [m].
 
     The centre is -R' t of T_camera_rig; turning by w on the left and moving by d moves it by -R' (d + t x w).
     """

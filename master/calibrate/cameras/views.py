@@ -14,7 +14,7 @@ ImageSet = Mapping[str, Callable[[], Image]]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The board in one place, as seen by one or more cameras at the same instant.
+    """Board in one place, as seen by one or more cameras at the same epoch.
 
     Attributes:
         name: How the view is called in reports, such as "07".
@@ -47,7 +47,7 @@ class BoardViews:
         return tuple(self.sizes_px)
 
     def of(self, camera: str) -> tuple[tuple[str, ImageObservation], ...]:
-        """Name and sighting of every view that `camera` has."""
+        """Return the name and observation of every view that `camera` has."""
         return tuple(
             (view.name, view.observations[camera]) for view in self.views if camera in view.observations
         )
@@ -111,7 +111,10 @@ def _advice(board: Board, images: list[Image]) -> str:
 
 
 def _likely_mistakes(board: Board) -> Iterator[Board]:
-    """Boards a user may mean who asked for `board`: squares counted for corners, sides swapped, another family."""
+    """Yield boards that a user may mean who asked for `board`.
+
+    Squares counted for corners, sides swapped, another family.
+    """
     c, r = board.columns, board.rows
     if isinstance(board, Checkerboard):
         # The larger first: a part of a board can be taken for a smaller one.

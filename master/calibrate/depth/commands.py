@@ -1,4 +1,7 @@
-"""`phalanx calibrate depth`: the published session, from known distances to the two laws of raw disparity."""
+"""Command `phalanx calibrate depth`: two laws of raw disparity.
+
+The published session, from known distances to the two laws.
+"""
 
 import os
 from argparse import Namespace
@@ -35,7 +38,10 @@ _SWEEP = "1.00:0.20:-0.05"  # the published one
 
 
 def depth(options: Namespace) -> None:
-    """Fit depth to disparity from a target at known distances: the power law D = k x^z, and x = a/D + x0."""
+    """Fit depth to disparity from a target at known distances.
+
+    The power law D = k x^z, and x = a/D + x0.
+    """
     outline = parse_target(options.target)
     _refuse_idle(
         "--live", source=options.live and options.source, detections=options.live and options.detections
@@ -136,7 +142,10 @@ def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
 
 
 def _refuse_idle(where: str, **given: object) -> None:
-    """Refuse options that `where` does not use, rather than to leave them out silently."""
+    """Reject options that `where` does not use.
+
+    They are not ignored silently.
+    """
     for name, value in given.items():
         if value:
             option = "a recording or a table" if name == "source" else f"--{name}"

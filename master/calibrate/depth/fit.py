@@ -1,4 +1,6 @@
-"""Laws of raw disparity from a sweep of known distances: pure fits, (disparity, distance) -> (law, residual).
+"""Fits of the laws of raw disparity from a sweep of known distances.
+
+Pure fits, (disparity, distance) -> (law, residual).
 
 What is made small is the *relative* error of depth, every distance alike. Two errors add up in a sweep: that of the
 disparity, s_x, costs s_x D / a of the depth and grows with the distance; that of the ruler,
@@ -49,7 +51,9 @@ def fit_power_law(disparity: Float, distance: Float) -> tuple[PowerLaw, Float]:
 
 
 def fit_affine_disparity(disparity: Float, distance: Float) -> tuple[AffineDisparity, Float]:
-    """x = a / D + x0 by least squares in relative depth: an error dx of x is dx D / a of D.
+    """Fit x = a / D + x0 by least squares in relative depth.
+
+    An error dx of x is dx D / a of D.
 
     Args and returns as `fit_power_law`.
     """
@@ -63,12 +67,18 @@ FITS: dict[str, Fit] = {"power_law": fit_power_law, "affine_disparity": fit_affi
 
 
 def relative_error(law: DepthLaw, disparity: Float, distance: Float) -> Float:
-    """(depth by the law - distance) / distance, (N,); NaN where the law has no depth for the disparity."""
+    """Return the relative depth error of a law.
+
+    (depth by the law - distance) / distance, (N,); NaN where the law has no depth for the disparity.
+    """
     return law.depth(disparity) / distance - 1.0
 
 
 def leave_one_out(fit: Fit, disparity: Float, distance: Float) -> Float:
-    """Relative error (N,) of each point by the law of all the others: what the law is worth for a new distance."""
+    """Return the leave-one-out relative error of each point.
+
+    Shape (N,), by the law of all the other points: how accurate the law is for a new distance.
+    """
     out = np.empty_like(distance)
     for i in range(distance.size):
         others = np.arange(distance.size) != i
@@ -91,7 +101,10 @@ def outliers(disparity: Float, distance: Float) -> Bool:
 
 
 def ideal_of(left: CameraModel, right: CameraModel) -> AffineDisparity:
-    """What two perfectly parallel pinhole cameras of this focal length and baseline would have (eq. 13)."""
+    """Return the law of two perfectly parallel pinhole cameras.
+
+    Of this focal length and baseline (eq. 13).
+    """
     baseline_m = float(np.linalg.norm(right.centre - left.centre))
     return ideal_law(baseline_m, 2.0 * atan(0.5 * left.width_px / left.matrix[0, 0]), left.width_px)
 
@@ -104,7 +117,10 @@ def _line(x: Float, y: Float, weight: Float) -> tuple[float, float]:
 
 
 def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
-    """Slope and offset of the line through two of the points that leaves the least median of weighted residuals."""
+    """Return the line through two points with the least median weighted residual.
+
+    Slope and offset.
+    """
     i, j = np.triu_indices(x.size, 1)
     some = slice(None, None, -(-i.size // _MAX_PAIRS))
     i, j = i[some], j[some]
@@ -116,6 +132,9 @@ def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
 
 
 def _beyond(error: Float) -> Bool:
-    """Which relative errors (N,) are gross; robust scale with the small sample factor of Rousseeuw & Leroy 1987."""
+    """Return which relative errors are gross.
+
+    Shape (N,); robust scale with the small sample factor of Rousseeuw & Leroy 1987.
+    """
     scale = 1.4826 * (1.0 + 5.0 / max(error.size - 2, 1)) * float(np.median(error))
     return error > max(_SCALES * scale, _GROSS)

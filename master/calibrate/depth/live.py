@@ -1,4 +1,7 @@
-"""A sweep with the slaves that run: opens the link as a master does, and a person at the keyboard."""
+"""Depth sweep with the running slaves.
+
+It opens the link as a master does, and a person is at the keyboard.
+"""
 
 import sys
 from pathlib import Path

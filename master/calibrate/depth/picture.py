@@ -1,4 +1,7 @@
-"""Pictures of a sweep: error of depth by distance, one line for each law or model, with the band to be expected."""
+"""Plots of a sweep: depth error by distance.
+
+One line for each law or model, with the band to be expected.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +31,9 @@ def draw_errors(
     used: Bool | None = None,
     band: Float | None = None,
 ) -> None:
-    """Write the picture as PNG: all models above, the good ones enlarged below where there are bad ones.
+    """Write the plot as PNG.
+
+    All models above, the good ones enlarged below where there are bad ones.
 
     Args:
         path: The file; replaced only by a complete one.

@@ -1,4 +1,6 @@
-"""A sweep from a recording: its detections, and the distances that belong to them.
+"""Depth sweep from a recording.
+
+Its detections, and the distances that belong to them.
 
 The frames of the two cameras are paired by time. The target stands still while a distance is measured, so neither
 interpolation nor the rolling shutter matters; what does matter is that no frame of its way from one place to the next
@@ -52,7 +54,9 @@ class Pairs:
 def read_pairs(
     recording: FrameRecording, detections: Path, cameras: tuple[str, str], marker: str | None
 ) -> tuple[Pairs, str]:
-    """The frame pairs of two cameras of a recording, and the name of the marker that is the target.
+    """Return the frame pairs of two cameras of a recording and the target's name.
+
+    The name is that of the marker that is the target.
 
     Args:
         recording: The recording.
@@ -86,7 +90,9 @@ def read_pairs(
 
 
 def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
-    """Each pair at the distance that truth.npz of a rendered recording gives; None where it has no `depth`.
+    """Return each pair at its true distance from truth.npz of a rendered recording.
+
+    None where truth.npz has no `depth`.
 
     Raises:
         RecordingError: truth.npz is broken, leads out of the folder, or has another number of frames.
@@ -113,7 +119,9 @@ def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
 
 
 def by_list(pairs: Pairs, distances: Float) -> Sweep:
-    """Distances (N,) in the order of the recording: one for each pair, or else one for each still stretch.
+    """Assign the given distances to the pairs of the recording.
+
+    Distances (N,) in the order of the recording: one for each pair, or else one for each still stretch.
 
     Raises:
         CalibrationError: The numbers fit neither.
@@ -131,7 +139,9 @@ def by_list(pairs: Pairs, distances: Float) -> Sweep:
 
 
 def by_file(pairs: Pairs, path: Path) -> Sweep:
-    """Distances from a CSV: `distance_m`, and one of `t_s` (since the first pair), `frame` (pair, from 0), `seq`.
+    """Read the distances of the pairs from a CSV.
+
+    Columns: `distance_m`, and one of `t_s` (since the first pair), `frame` (pair, from 0), `seq`.
 
     A time takes the pairs within a quarter of a second of it.
 
@@ -185,7 +195,10 @@ def still_runs(pairs: Pairs) -> list[Int]:
 
 
 def _near(pairs: Pairs, run: Int, new: int | Int) -> bool:
-    """Whether all of the pairs `new` lie at the mean of the pairs `run`; false where one is not seen."""
+    """Return true if all pairs `new` lie at the mean position of the pairs `run`.
+
+    False where one is not seen.
+    """
     off = np.abs(pairs.uv[:, new] - pairs.uv[:, run].mean(axis=1).reshape(2, *([1] * np.ndim(new)), 2))
     sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], _NOISE_PX), _UNSURE_PX)[..., None]
     return bool((off <= STILL_SIGMAS * sigma).all())
@@ -234,7 +247,10 @@ def _target(messages: Sequence[MarkerDetections], names: tuple[str, ...]) -> int
 def _together(
     first: Sequence[MarkerDetections], second: Sequence[MarkerDetections], limit_ns: int
 ) -> list[tuple[MarkerDetections, MarkerDetections]]:
-    """Each message of the first camera with the nearest of the second, not farther than `limit_ns`."""
+    """Match each message of the first camera with the nearest one of the second.
+
+    Matches are not farther apart than `limit_ns`.
+    """
     if not second:
         return []
     times = np.array([message.t_ns for message in second], np.int64)

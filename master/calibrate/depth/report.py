@@ -1,4 +1,7 @@
-"""What the fitted laws are worth: every law at every distance, before and after, and which one is best."""
+"""Accuracy of the fitted depth laws.
+
+Every law at every distance, before and after the fit, and which one is best.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,7 +49,10 @@ class DepthReport:
         return min(self.rejected, key=lambda name: float(np.abs(self.rejected[name]).mean()))
 
     def mean_max(self, name: str) -> tuple[float, float]:
-        """Mean and largest |error| of a law over the used distances, as a share of the distance."""
+        """Return the mean and largest |error| of a law over the used distances.
+
+        Errors are a share of the distance.
+        """
         error = np.abs(self.errors[name][self.used])
         return float(error.mean()), float(error.max())
 
@@ -86,7 +92,10 @@ def fit_depth(sweep: Sweep, before: Mapping[str, DepthLaw]) -> DepthReport:
 
 
 def report_lines(report: DepthReport) -> list[str]:
-    """The table that a person reads: relative errors in per cent, by distance and by law."""
+    """Format a readable table of relative errors by distance and by law.
+
+    Errors are in per cent.
+    """
     names = list(report.errors)
     widths = [max(len(name), 9) for name in names]
     lines = [

@@ -1,4 +1,7 @@
-"""Into the rig file: the fitted laws with date, data and residual, and what is to be said about it."""
+"""Writing of the fitted depth laws into the rig file.
+
+With date, data and residual, and the notes to print about it.
+"""
 
 from pathlib import Path
 
@@ -18,7 +21,9 @@ from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
 
 
 def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
-    """The rig file that gets the new laws: the one in `out` where there is one, else the one in use.
+    """Return the rig file that receives the new laws.
+
+    The one in `out` where there is one, else the one in use.
 
     Raises:
         CalibrationError: No rig is known, it has not two cameras, or other ones than the file in `out`.
@@ -39,7 +44,9 @@ def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
 def write_laws(
     out: Path, rig: RigCalibration | None, report: DepthReport, measured: Measured, use: str | None
 ) -> Path:
-    """Write the rig file with both laws, their provenance and, if asked for, the depth model.
+    """Write the rig file with both laws and their provenance.
+
+    Includes the depth model if asked for.
 
     Raises:
         CalibrationError: The file cannot be written; the old one is untouched.

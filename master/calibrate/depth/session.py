@@ -1,4 +1,6 @@
-"""A sweep by hand: the target is put at one distance after another, and measured there while it stands still.
+"""Manual depth sweep with a target that is moved by hand.
+
+The target is put at one distance after another, and measured there while it stands still.
 
 Nothing is paired: the target stands still, so each camera's centroids are averaged on their own.
 """
@@ -42,10 +44,16 @@ class Reading:
 
 
 class Meter:
-    """Push machine: averages one marker in two cameras. Holds the frames of the last `seconds`, and why it waits."""
+    """Push machine that averages one marker in two cameras.
+
+    Holds the frames of the last `seconds`, and the reason why it waits.
+    """
 
     def __init__(self, cameras: tuple[str, str], marker: int, frames: int, seconds: float) -> None:
-        """Wait for `frames` frames of each camera over `seconds` during which the marker stands still."""
+        """Wait for `frames` frames of each camera while the marker stands still.
+
+        The marker must stand still over `seconds`.
+        """
         self._cameras, self._marker = cameras, marker
         self._frames, self._span_ns = max(frames, 2 * _QUARTERS), round(seconds * 1e9)
         self._kept: tuple[deque[tuple[int, Float]], ...] = (deque(), deque())

@@ -1,4 +1,7 @@
-"""Everything a depth command works on, read from the files that the user names: the sweep, the pair, the rig."""
+"""Inputs of the depth commands: the sweep, the camera pair and the rig.
+
+Read from the files that the user names.
+"""
 
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
@@ -198,7 +201,10 @@ def parse_target(text: str) -> Float:
 
 
 def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
-    """The sweep with the images of the target's centre for its centroids, and what is to be said about it."""
+    """Replace the sweep's centroids by the projections of the target's centre.
+
+    Also return the note to print about it.
+    """
     if pair.models is None or np.isnan(sweep.area_px2).all():
         return sweep, ""
     uv = np.stack(

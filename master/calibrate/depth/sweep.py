@@ -1,4 +1,6 @@
-"""A sweep: one target at known distances, as both cameras of a pair saw it; and what makes a sweep unfit for a fit.
+"""Depth sweep: one target at known distances, as both cameras of a pair saw it.
+
+Also checks what makes a sweep unfit for a fit.
 
 Refused is what would give a law that looks well and is not: see `checked`. Every refusal names the points and says
 what to do.
@@ -99,7 +101,9 @@ def checked(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | N
 
 
 def check_places(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | None = None) -> Sweep:
-    """The sweep by distance, nearest first, each place for itself: seen, wholly, and in the right order of cameras.
+    """Sort the sweep by distance, nearest first, and check each place on its own.
+
+    The target must be seen, be wholly in the image, and appear in the right order of cameras.
 
     Raises:
         FitError: As `checked`, without what concerns all places together.
@@ -112,7 +116,9 @@ def check_places(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
 
 
 def check_enough(sweep: Sweep) -> None:
-    """Refuse points that do not determine a law over a range: too few, too near each other, or all at one end.
+    """Refuse points that do not determine a law over a range.
+
+    Too few, too near each other, or all at one end.
 
     Raises:
         FitError: Says what is missing.
@@ -179,7 +185,10 @@ def _check_signs(sweep: Sweep, cameras: tuple[str, str]) -> None:
 
 
 def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int]) -> None:
-    """A target cut by the border of an image is too small for its distance, and its centroid lies inward."""
+    """Refuse targets that are cut by the border of an image.
+
+    A cut target is too small for its distance, and its centroid lies inward.
+    """
     nominal = sweep.area_px2 * sweep.distance_m**2
     if sweep.size == 0 or not np.isfinite(nominal).all():
         return

@@ -16,7 +16,9 @@ _MORE = "\0"  # key of what a row has beyond its columns; no name of a column
 
 
 def read_table(path: Path) -> Sweep:
-    """A sweep from a CSV with the columns distance_m and disparity_px, or u_left_px and u_right_px.
+    """Read a sweep from a CSV.
+
+    Columns: distance_m and disparity_px, or distance_m, u_left_px and u_right_px.
 
     With v_left_px and v_right_px beside the u, the full stereo model can be verified on it too; area_left_px2 and
     area_right_px2 let a target be found out that is not wholly in the picture.
@@ -69,7 +71,9 @@ def write_table(path: Path, sweep: Sweep) -> None:
 
 
 def parse_distances(text: str) -> Float:
-    """Distances [m] of `1.00:0.20:-0.05` (first, last, step), or of a list `1.0,0.8,0.6`.
+    """Parse distances [m] from a range or a list.
+
+    Range such as `1.00:0.20:-0.05` (first, last, step), or list such as `1.0,0.8,0.6`.
 
     Raises:
         CalibrationError: Neither of the two, a step that does not lead from the first to the last, or no metres.

@@ -1,4 +1,6 @@
-"""How right a rig is: the published table of 20...100 cm for every depth model it has, and what was to be expected.
+"""Verification of a rig's depth accuracy.
+
+The published table of 20...100 cm for every depth model that the rig has, and the error that was to be expected.
 
 Three things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target
 stood; what *noise and time* cost by the derivatives of the ideal law (`master.fabrik.depth.error_budget`); and what a
@@ -61,7 +63,10 @@ class Verified:
         return self.error_m[model] / self.sweep.distance_m
 
     def figures(self, model: str) -> dict[str, float]:
-        """Mean and largest |error| where the model gives a depth, in mm and per cent of the distance; else NaN."""
+        """Return the mean and largest |error| of a depth model.
+
+        In mm and in per cent of the distance, where the model gives a depth; else NaN.
+        """
         known = np.isfinite(self.error_m[model])
         if not known.any():
             return dict.fromkeys(("mean_mm", "max_mm", "mean_percent", "max_percent"), float("nan"))
@@ -110,7 +115,10 @@ def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, 
 
 
 def stereo_points(cameras: Cameras, uv: Float) -> Float:
-    """Points (N, 3) [m] in the first camera's frame, from centroids (2, N, 2) [px]; NaN: not determined."""
+    """Triangulate centroids (2, N, 2) [px] in the first camera's frame.
+
+    Returns points (N, 3) [m]; NaN: not determined.
+    """
     found = triangulate(CameraArrays.of(cameras), uv)
     return transform(invert(cameras[0].T_rig_camera), found.points_m)
 
@@ -125,7 +133,9 @@ def middle(cameras: Cameras) -> Float:
 
 
 def off_axis(law: DepthLaw, cameras: Cameras, distance_m: Float, angle_deg: Float) -> Float:
-    """Relative error of depth (A, N) that a law makes at angles (A,) to the side and distances (N,).
+    """Return the relative depth error (A, N) of a law for off-axis targets.
+
+    At angles (A,) to the side and distances (N,).
 
     The angle is that of `middle`, in the plane of the first camera's rows; the points are noiseless, seen by the
     calibrated pair. NaN: outside an image.

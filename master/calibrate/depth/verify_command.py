@@ -1,4 +1,7 @@
-"""`phalanx calibrate verify`: the published table for this rig, measured and predicted."""
+"""`phalanx calibrate verify`: measured and predicted depth error of this rig.
+
+Prints the published table.
+"""
 
 from argparse import Namespace
 
@@ -29,7 +32,10 @@ _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
 def verify_command(options: Namespace) -> None:
-    """Report how right a rig is: error of each depth model at known distances, and the budget of what to expect."""
+    """Report the error of each depth model at known distances.
+
+    Also prints the error budget, that is, what to expect of the rig.
+    """
     noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
     numbers: dict[str, object] = {}
     found: Verified | None = None
@@ -101,7 +107,10 @@ def _measured(measured: Measured, noise: Noise) -> Verified:
 
 
 def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[str, object]:
-    """Print budget and off-axis table where the cameras are known, and return them as numbers."""
+    """Print the error budget and the off-axis table, and return them as numbers.
+
+    Only where the cameras are known.
+    """
     if pair.models is None or pair.rig is None:
         echo("no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)")
         return {}

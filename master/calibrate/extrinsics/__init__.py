@@ -1,1 +1,4 @@
-"""How a wrist device sits on its forearm, and how late its clocks are, from a motion that marker rig and device see."""
+"""Extrinsics of a wrist device on its forearm, and the latency of its clocks.
+
+Estimated from a motion that both marker rig and device see.
+"""

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def extrinsics(options: Namespace) -> None:
-    """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are."""
+    """Measure the mounting of the wrist device on the forearm.
+
+    Also how its IMU lies, and how late both clocks are.
+    """
     # Imported here: scipy.optimize takes a second.
     from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
 
@@ -84,7 +87,9 @@ def marker_poses(setup: RigSetup, detections: Path) -> list[HandPose]:
 
 
 def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequence[ImuSample]:
-    """What the IMU measured, with the orientation that a slave's filter makes of it where the file has none.
+    """Return the IMU samples with orientations.
+
+    Where the file has no orientation, it is the one that a slave's filter computes from the samples.
 
     Raises:
         RecordingError: imu.csv is broken.

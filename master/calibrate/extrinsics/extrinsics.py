@@ -1,4 +1,6 @@
-"""How a wrist device sits on its forearm, from ten seconds that marker rig and device see together.
+"""Mounting of a wrist device on its forearm.
+
+Estimated from ten seconds that marker rig and device see together.
 
 What is made of it is in `start`, `fit` and `unknown`, what is told of it in `report`; here are what goes in and out.
 """
@@ -151,7 +153,9 @@ def _cycles(
 
 
 def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
-    """(T,) which triples count: those whose hand both sensors see, at most 200.
+    """Select the strobe cycles (T,) whose hand both sensors see.
+
+    At most 200.
 
     Raises:
         FitError: There are too few of them, or the IMU was silent.
@@ -211,7 +215,10 @@ def _documented(
 
 
 def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
-    """R_rig_world (3, 3) of the world that the IMU's samples name: the mean of its vertical, the first heading."""
+    """Return the rotation R_rig_world (3, 3) of the IMU samples' own world.
+
+    Mean of its vertical, and the first heading.
+    """
     orientations = imu.mended(fit.unknown.gyro).at(imu.t_s)
     rig_world = fit.unknown.R_rig_world @ orientations.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
     known = np.isfinite(rig_world[:, 0, 0])

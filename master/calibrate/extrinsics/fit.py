@@ -1,4 +1,7 @@
-"""The most probable mounting: first looks from some guesses at a part of the motion, then all of it from the best."""
+"""Maximum a posteriori estimate of the mounting.
+
+First fits a part of the motion from several guesses, then all of it from the best one.
+"""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,6 @@
-"""The hands of all instants: their cost and normal equations given markers and habits, batched over instants.
+"""Hand poses of all epochs: cost and normal equations, batched over epochs.
+
+Given markers and posture priors.
 
 The residuals are the markers' distances, whitened by their covariances; habits add a quadratic of the free angles.
 The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.body_points` has it.
@@ -17,13 +19,19 @@ from master.estimator.priors import PosturePrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hands:
-    """Hands of all instants: palms (T, 4, 4), palm frame -> rig frame, and free angles (T, n) [rad]."""
+    """Hand poses of all epochs.
+
+    Palms (T, 4, 4), palm frame -> rig frame, and free angles (T, n) [rad].
+    """
 
     T_rig_palm: Float
     x: Float
 
     def retracted(self, step: Float) -> "Hands":
-        """The hands after steps (T, 6 + n) of turn [rad], shift [m], both in rig axes, and angles [rad]."""
+        """Return the hands after the given steps.
+
+        Steps (T, 6 + n): rotation [rad] and shift [m], both in rig axes, and angles [rad].
+        """
         T = self.T_rig_palm.copy()
         T[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
         T[:, :3, 3] += step[:, 3:6]
@@ -32,7 +40,10 @@ class Hands:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Gradient (T, L) and Gauss-Newton normal matrix (T, L, L) of the cost at a place; L = 6 + n."""
+    """Linearisation of the cost at a point.
+
+    Gradient (T, L) and Gauss-Newton normal matrix (T, L, L); L = 6 + n.
+    """
 
     gradient: Float
     normal: Float
@@ -40,7 +51,7 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandProblem:
-    """What markers and habits say of the hands.
+    """Constraints on the hands from markers and posture priors.
 
     Attributes:
         model: The hand.
@@ -62,7 +73,7 @@ class HandProblem:
         return arm + hands.T_rig_palm[:, None, :3, 3]
 
     def cost(self, hands: Hands) -> Float:
-        """Half the sum of squares (T,) of the whitened distances and of the habits."""
+        """Return half the sum of squares (T,) of whitened distances and posture priors."""
         arm = self._arm(hands, self.markers.place(self._chains(hands)))
         residual = self._residual(hands, arm)
         pushed = self._pushed(hands)
@@ -98,5 +109,5 @@ class HandProblem:
         return (self.whiten @ off[..., None]).reshape(len(off), -1)
 
     def _pushed(self, hands: Hands) -> Float:
-        """The habits' information times the free angles (T, n)."""
+        """Return the posture priors' information times the free angles (T, n)."""
         return (hands.x[:, None] @ self.posture_prior.normal)[:, 0]

@@ -1,4 +1,6 @@
-"""What a wrist device sees of a hand: laser points and tips of four fingers, and how they move with what is unknown.
+"""Measurement model of a wrist device: laser points and tips of four fingers.
+
+Also their derivatives by the unknowns.
 
 The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_intersection`,
 `common.fingertips`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
@@ -26,7 +28,10 @@ _STEPS = np.repeat([_ROTATION_STEP, _SHIFT_M, _ROTATION_STEP, _THICK], (3, 3, 4,
 
 
 class LinesOfSight:
-    """LinesOfSight of one device and hand. What it holds was prepared by the constructor."""
+    """Measurement model for one device and one hand.
+
+    Its state was prepared by the constructor.
+    """
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
@@ -83,7 +88,10 @@ class LinesOfSight:
         return seen[0], np.nan_to_num(out)
 
     def _local(self, angles: Float, thick: Float, reach_m: Float) -> tuple[Float, Float, Float]:
-        """Spheres (T, 4, K, 3) [m], their radii (4, K), and tips (T, 4, 3) [m], palm frame."""
+        """Return the finger surface spheres and the tips in the palm frame.
+
+        Spheres (T, 4, K, 3) [m], their radii (4, K), and tips (T, 4, 3) [m].
+        """
         chains = self._setup.model.chains(angles)
         factor = np.ones((5, 1))
         factor[FINGERS, 0] = np.exp(thick)

@@ -1,4 +1,7 @@
-"""The normal equations of a mounting: unknowns that all instants share, and the hand of each, which is eliminated."""
+"""Normal equations of a mounting.
+
+Unknowns that all epochs share, and the hand of each epoch, which is eliminated.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +18,9 @@ _NOTHING = 1e-9  # information of what nothing tells
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations of unknowns that all instants share (U = UNKNOWN) and of the hand in each (L = 6 + n).
+    """Normal equations of the shared unknowns and of the hand in each epoch.
+
+    Shared by all epochs: U = UNKNOWN; each hand: L = 6 + n.
 
     Attributes:
         own: (T, L, L) information of the hands.
@@ -57,7 +62,7 @@ class Normal:
         )
 
     def shared_out(self, share: float, off: Float, sigma: Float) -> "Normal":
-        """Instants counted by this share, and with what is believed of the shared unknowns."""
+        """Weight the epochs by a share and add the prior of the shared unknowns."""
         return Normal(
             share * self.own,
             share * self.mixed,
@@ -77,7 +82,11 @@ class Normal:
         return replace(self, own=own, mixed=self.mixed * moves[..., None], own_pull=self.own_pull * moves)
 
     def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
-        """Information (U, U) and pull (U,) without the hands, and what gives their steps from that of the rest."""
+        """Eliminate the hands and return the reduced normal equations.
+
+        Information (U, U) and gradient (U,) without the hands, and what gives the hands' steps from the step of the
+        rest.
+        """
         own = self.own.copy()
         diagonal = np.einsum("tii->ti", own)
         diagonal[...] = (1.0 + damping) * diagonal + _NOTHING

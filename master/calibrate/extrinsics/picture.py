@@ -1,4 +1,7 @@
-"""Picture of a mounting: laser points and tips seen and fitted, and how the wrist was bent meanwhile."""
+"""Plot of a mounting: laser points and tips, seen and fitted.
+
+Also how the wrist was flexed meanwhile.
+"""
 
 from pathlib import Path
 
@@ -10,7 +13,9 @@ from master.calibrate.wrist.picture import BLUE, FINGER_COLOURS, GREY, ORANGE, f
 
 
 def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
-    """Laser points on their plane, fingertips in the image, seen (dots) and fitted (rings); the wrist over time. PNG.
+    """Draw observed and fitted points of a mounting, and the wrist over time, as PNG.
+
+    Laser points on their plane and fingertips in the image, seen (dots) and fitted (rings).
 
     Raises:
         RecordingError: The file cannot be written.

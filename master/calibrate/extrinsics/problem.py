@@ -1,4 +1,6 @@
-"""The most probable mounting, given what marker rig, wrist camera and IMU saw of one motion: one least-squares problem.
+"""Most probable mounting as one least-squares problem.
+
+Given what marker rig, wrist camera and IMU saw of one motion.
 
 Unknown in each instant is the hand, palm and fingers, as markers and the loosest habits have it (`hands`); all instants
 share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
@@ -65,7 +67,7 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Output:
-    """What the tracks say while the clocks' errors are near to `about`: markers, turns."""
+    """Output of the tracks for clock errors near `about`: markers and rotations."""
 
     about: Unknown
     markers: Markers
@@ -74,7 +76,10 @@ class _Output:
 
 
 class Problem:
-    """Residuals and steps. Holds what the tracks say about the last guess of the clocks."""
+    """Residuals and steps of the mounting problem.
+
+    Holds the output of the tracks for the last estimate of the clocks.
+    """
 
     def __init__(
         self,
@@ -128,7 +133,7 @@ class Problem:
         return Hands(self._hand.T_rig_palm[near], x)
 
     def update_observations(self, unknown: Unknown, hands: Hands) -> None:
-        """Ask the tracks where the clocks and the errors of the gyroscope are believed to be."""
+        """Sample the tracks at the estimated clock offsets and gyroscope errors."""
         self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
         at = self._cycles.t_s + unknown.camera_late_s
         markers = self._hand.markers(at)
@@ -158,7 +163,10 @@ class Problem:
         self._data = np.where(self._known[:, None, None], data, np.nan)
 
     def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
-        """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
+        """Return the tips (T, 4, 2) [px] at the time when the laser shone.
+
+        Moved back by how the hand moved meanwhile.
+        """
         late_s, t_s = self._cycles.tip_late_s, self._cycles.t_s
         at = t_s + unknown.camera_late_s
         orientations = self._mended.at(at - unknown.imu_late_s)
@@ -194,7 +202,7 @@ class Problem:
         return unknown, hands, taken
 
     def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
-        """What is told of the end."""
+        """Return the fit with what is reported at the end."""
         covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
         shown, wrist_angles = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
@@ -250,7 +258,10 @@ class Problem:
         return unknown.R_forearm_imu @ palm
 
     def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
-        """LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
+        """Return the predicted observations and the angles of the wrist.
+
+        LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad].
+        """
         orientations = self._orientations(unknown)
         R = self._camera_rig(unknown, orientations) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
@@ -258,13 +269,16 @@ class Problem:
         return seen, wrist_rotation_angles(self._wrists(unknown, hands, orientations))
 
     def _off(self, shown: Float) -> Float:
-        """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
+        """Return fitted minus seen (T, 4, SEEN) in standard deviations.
+
+        0 where not seen; a finger that the laser misses is far.
+        """
         off = (shown - self._data) / self.sigma
         missed = np.isnan(shown) & np.isfinite(self._data)
         return np.where(missed, _FARTHEST, np.nan_to_num(off))
 
     def cost(self, unknown: Unknown, hands: Hands) -> float:
-        """Sum of squares, strays weighed down."""
+        """Return the sum of squares with outliers down-weighted."""
         shown, wrist_angles = self._shown(unknown, hands)
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
@@ -294,7 +308,10 @@ class Problem:
     def _line_of_sight_rows(
         self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
     ) -> tuple[Float, Float, Float]:
-        """Residuals (T, 16), and derivatives by own (T, 16, 6 + n) and shared unknowns (T, 16, UNKNOWN)."""
+        """Return the line-of-sight residuals (T, 16) and their derivatives.
+
+        By own unknowns (T, 16, 6 + n) and by shared unknowns (T, 16, UNKNOWN).
+        """
         camera_rig = self._camera_rig(unknown, orientations)
         R = camera_rig @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
@@ -343,7 +360,9 @@ class Problem:
     def _world_columns(
         self, shared: Float, by_imu: Float, unknown: Unknown, orientations: ImuOrientations
     ) -> None:
-        """Fill what turns the IMU in the rig: its world, the errors of its gyroscope, and clocks.
+        """Fill the derivatives by everything that rotates the IMU in the rig.
+
+        Its world, the errors of its gyroscope, and clocks.
 
         Args:
             shared: (T, R, UNKNOWN) which is changed.

@@ -1,4 +1,4 @@
-"""How well a mounting is known, what is left of the sights, what is refused, and the lines for a person."""
+"""Report on a mounting: uncertainty, residuals, refusals and printed lines."""
 
 import numpy as np
 
@@ -12,7 +12,10 @@ _MOST_RMS, _STRAYS = 1.8, 0.35
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
-    """Standard deviations by quantity with its unit; of vectors that of the worst direction."""
+    """Return standard deviations by quantity with its unit.
+
+    Of vectors, that of the worst direction.
+    """
     unknown, cov = fit.unknown, fit.covariance
     by = np.zeros((3, len(cov)))  # turn of the straight palm, camera axes
     by[:, CAMERA_IMU], by[:, FOREARM_IMU] = np.eye(3), -unknown.T_camera_palm[:3, :3]
@@ -31,7 +34,7 @@ def sigmas(fit: Fit) -> dict[str, float]:
 
 
 def refuse(fit: Fit, sigma: dict[str, float]) -> None:
-    """Refuse what the motion does not tell, and what no mounting explains.
+    """Refuse what the motion does not constrain, and what no mounting explains.
 
     Raises:
         FitError: With what to do.

@@ -1,4 +1,4 @@
-"""What was seen of a motion from the wrist, and the mounting that was fitted to it."""
+"""Observations of a motion from the wrist, and the mounting fitted to them."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,9 @@ STRAYS = 2.5  # standard deviations from which a sight is believed less
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrobeCycles:
-    """What the device saw (T triples) of index ... little; NaN: not seen.
+    """Observations of the device over T strobe cycles.
+
+    Fingers index ... little; NaN: not seen.
 
     Attributes:
         t_s: (T,) stamps [s], rising.
@@ -69,7 +71,7 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """Of `off`, strays at their limit."""
+        """Return the root mean square of `off`, with outliers clipped at their limit."""
         return float(np.sqrt(np.nanmean(np.minimum(np.abs(self.off), 2.0 * STRAYS) ** 2)))
 
     @property

@@ -1,4 +1,6 @@
-"""Where the search for a mounting begins: how the IMU lies, and by how much clocks differ, to some degrees and ms.
+"""Initial guess of a mounting: how the IMU lies, and the clock offsets.
+
+To some degrees and ms.
 
 **Turns.** With a wrist that is about straight the palm's turn is R_rig_palm = R_rig_world R_world_imu R_imu_palm with
 two constant turns. In quaternions the sum of the cosines of half of what is left is bilinear in the two,
@@ -89,7 +91,10 @@ def started(
 
 
 def _aligned(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
-    """How well the tracks agree (1: exactly), R_rig_world and R_imu_palm, if the IMU's samples are so late."""
+    """Align the hand's and the IMU's orientations for a given latency of the samples.
+
+    Returns how well the tracks agree (1: exactly), R_rig_world and R_imu_palm.
+    """
     held = imu.held_at(hand.t_s - late_s)
     known = np.isfinite(held[:, 0, 0])
     if known.sum() < _FEWEST:

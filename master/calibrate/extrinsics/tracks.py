@@ -1,4 +1,6 @@
-"""What marker rig and IMU say at any instant: the hand's markers with how they move, the IMU's turn with its rate.
+"""Tracks of marker rig and IMU, interpolated at any time.
+
+The hand's markers with how they move, and the IMU's rotation with its rate.
 
 Cameras, IMU and marker rig have no instants in common, and by how much their clocks differ is to be found. So markers
 and orientations are asked for at instants that shift while the fit goes on: each answer comes with its derivatives.
@@ -25,7 +27,7 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """The markers at instants (T).
+    """Markers at times (T).
 
     Attributes:
         points_m: (T, M, 3) cap centroids, rig frame; NaN: not seen, or a gap nearby.
@@ -46,7 +48,7 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandTrack:
-    """The hand as the marker rig alone saw it (N instants).
+    """Track of the hand as the marker rig alone saw it (N epochs).
 
     Attributes:
         t_s: (N,) [s], rising.
@@ -63,7 +65,10 @@ class HandTrack:
 
     @classmethod
     def of(cls, poses: Sequence[HandPose], model: HandModel, zero_ns: int) -> "HandTrack":
-        """From poses of the markers' line, those that are valid; times count from `zero_ns`."""
+        """Build the track from the valid poses of the markers' pipeline.
+
+        Times count from `zero_ns`.
+        """
         known = [pose for pose in poses if pose.valid[WRIST] and np.isfinite(pose.angles_rad).all()]
         cov = np.array([pose.markers_cov_m2 for pose in known])
         poor = ~(np.einsum("tmii->tm", cov) < _POOR_M**2)
@@ -82,12 +87,14 @@ class HandTrack:
         )
 
     def nearest(self, t_s: Float) -> Int:
-        """Numbers (T,) of the instants nearest to times (T,) [s]."""
+        """Return the indices (T,) of the epochs nearest to times (T,) [s]."""
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         return after - (t_s - self.t_s[after - 1] < self.t_s[after] - t_s)
 
     def markers(self, t_s: Float) -> Markers:
-        """The markers at times (T,) [s], by a cubic through what was seen within 80 ms of each.
+        """Interpolate the markers at times (T,) [s].
+
+        By a cubic through what was seen within 80 ms of each time.
 
         One through four neighbours would pass on their noise to the speed, and both to the clock's error: triples are
         often taken at the same share of the time between two frames.
@@ -115,7 +122,7 @@ class HandTrack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuOrientations:
-    """The IMU at instants (T), in a world of its own.
+    """Orientations of the IMU at times (T), in a world of its own.
 
     Attributes:
         R_world_imu: (T, 3, 3); NaN: no sample nearby.
@@ -147,7 +154,10 @@ class ImuTrack:
     """
 
     def __init__(self, samples: Sequence[ImuSample], zero_ns: int) -> None:
-        """Of samples in order, those with rates and an orientation; times count from `zero_ns`."""
+        """Keep the samples, given in order, that have rates and an orientation.
+
+        Times count from `zero_ns`.
+        """
         valid = [one for one in samples if np.isfinite([*one.orientation_wxyz, *one.gyro_rad_s]).all()]
         times = np.array([1e-9 * (one.t_ns - zero_ns) for one in valid])
         rising = np.diff(times, prepend=-np.inf) > 0.0
@@ -203,14 +213,20 @@ class ImuTrack:
         return ImuOrientations(R, rate, drift)
 
     def held_at(self, t_s: Float) -> Float:
-        """(T, 3, 3) IMU axes -> a world whose z axis is up, as the samples say themselves; NaN: none nearby."""
+        """Return the orientations that the samples themselves report.
+
+        (T, 3, 3) IMU axes -> a world whose z axis is up; NaN: none nearby.
+        """
         after, share, known = self._between(t_s)
         R = self._held[after - 1] @ _share_of_arc(self._held[after - 1], self._held[after], share)
         R[~known] = np.nan
         return R
 
     def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
-        """The sample after each time, the share (T, 1) of the way to it, and whether both are near (T,)."""
+        """Find the samples around each time.
+
+        Returns the sample after each time, the share (T, 1) of the way to it, and whether both are near (T,).
+        """
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         start, stop = self.t_s[after - 1], self.t_s[after]
         known = (t_s >= start) & (t_s <= stop) & (stop - start <= GAP_S)
@@ -218,5 +234,8 @@ class ImuTrack:
 
 
 def _share_of_arc(first: Float, second: Float, share: Float) -> Float:
-    """Turns (T, 3, 3) from the first to a share (T, 1) of the way to the second, axes of the first."""
+    """Interpolate rotations (T, 3, 3) by a share (T, 1) of the way.
+
+    From the first towards the second, in axes of the first.
+    """
     return rotation_vector_to_matrix(share * matrix_to_rotation_vector(np.swapaxes(first, 1, 2) @ second))

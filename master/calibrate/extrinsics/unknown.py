@@ -1,4 +1,4 @@
-"""What is unknown of a mounting, as a point of its manifold and as steps on it, and what is believed before."""
+"""Unknowns of a mounting: a point on a manifold, steps on it, and its prior."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -21,7 +21,7 @@ _REACH_M = 2e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknown:
-    """What all instants share.
+    """Unknowns that all epochs share.
 
     Camera and IMU are one body, so their turn against each other is told by every motion; how both are turned against
     the palm of a straight wrist, by what the wrist does.
@@ -66,7 +66,10 @@ class Unknown:
         )
 
     def off(self, first: Self) -> Float:
-        """(UNKNOWN,) how far this is from what is believed; turns, of which nothing is, are 0."""
+        """Return the deviation (UNKNOWN,) from the prior.
+
+        Rotations, which have no prior, are 0.
+        """
         out = np.zeros(UNKNOWN)
         out[SHIFT], out[ZERO], out[GAIN] = self.shift_m - first.shift_m, self.gyro[:3], self.gyro[3:]
         out[CAMERA_LATE] = self.camera_late_s - first.camera_late_s
@@ -76,7 +79,7 @@ class Unknown:
 
 
 def prior_sigma() -> Float:
-    """(UNKNOWN,) standard deviations of what is believed before."""
+    """Return the prior standard deviations (UNKNOWN,)."""
     sigma = np.full(UNKNOWN, ANY_RAD)
     sigma[SHIFT], sigma[ZERO], sigma[[CAMERA_LATE, IMU_LATE]] = ANY_M, _ZERO_RAD_S, ANY_S
     sigma[THICK], sigma[REACH], sigma[GAIN] = SPREAD, _REACH_M, _GAIN

@@ -1,4 +1,7 @@
-"""How a wrist is bent: by two angles, and by a third that no wrist has; and how that changes with a turn."""
+"""Wrist angles: two anatomical ones, and a third that no wrist has.
+
+Also how they change with a rotation.
+"""
 
 import numpy as np
 
@@ -15,7 +18,10 @@ def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
 
 
 def bends_by_rotation(R_forearm_palm: Float) -> Float:
-    """Derivatives (T, 3, 3) of `wrist_rotation_angles` by a turn of the palms (T, 3, 3), forearm axes."""
+    """Return the derivatives (T, 3, 3) of `wrist_rotation_angles`.
+
+    By a rotation of the palms (T, 3, 3), forearm axes.
+    """
     here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
         rotated = rotation_vector_to_matrix(_DIFFERENCE_STEP * np.eye(3)[k]) @ R_forearm_palm

@@ -1,4 +1,6 @@
-"""When did the user do what? The routine as it was asked for, laid over what was seen.
+"""Temporal alignment of the scripted routine with what was seen.
+
+Answers when the user did what.
 
 Users begin late, hurry and dawdle. So the markers are compared with those of a template hand that does the routine,
 and the two are matched monotonously in time (dynamic time warping: Sakoe & Chiba, 1978). The palm of the template is
@@ -157,7 +159,10 @@ def _gridded(observed: Observed) -> tuple[Float, Float]:
 
 
 def _still(points: Float) -> list[Float]:
-    """Mean places (M, 3) of every stretch in which all that is seen rests; four tips at least."""
+    """Return the mean places (M, 3) of every still stretch.
+
+    All that is seen rests there; four tips at least.
+    """
     length = round(_STILL_S / GRID_S)
     out: list[Float] = []
     for start in range(0, len(points) - length, 2):
@@ -185,7 +190,10 @@ def _flat_poses(points: Float, flat: Float) -> list[Float]:
 
 
 def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: Float) -> Alignment:
-    """The cheapest way through the table of distances between N observed and S scripted instants."""
+    """Find the cheapest path through the table of observed and scripted distances.
+
+    N observed and S scripted epochs.
+    """
     asked = transform(pose, template)
     square = ((points[:, None] - asked[None]) ** 2).sum(axis=-1)  # (N, S, M)
     seen = np.isfinite(square)

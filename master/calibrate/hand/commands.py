@@ -1,4 +1,7 @@
-"""`phalanx calibrate hand`: a hand file from its length alone, or from the guided routine."""
+"""`phalanx calibrate hand`: makes a hand file.
+
+From its length alone, or from the guided routine.
+"""
 
 import sys
 from argparse import Namespace
@@ -24,7 +27,10 @@ _RATIO_SD = 0.03  # of one that was measured, with a goniometer or in a picture
 
 
 def hand_command(options: Namespace) -> None:
-    """Make a hand file: from the hand's length, measured by a guided routine of 20 s, or from motion capture."""
+    """Make a hand file.
+
+    From the hand's length, measured by a guided routine of 20 s, or from motion capture.
+    """
     if options.steps:
         for line in step_lines():
             echo(line)
@@ -122,7 +128,9 @@ def step_lines() -> list[str]:
 
 
 def template_of(base: Path | None, side: str, name: str) -> HandProfile:
-    """What a measurement begins with: a file, mirrored if it is of the other hand, or the generated profile.
+    """Return the hand profile that a measurement begins with.
+
+    A file, mirrored if it is of the other hand, or the generated profile.
 
     Raises:
         CalibrationError: The file is missing or broken.

@@ -1,4 +1,6 @@
-"""Least squares over smooth curves and a few constants: cubic B-splines in time, normal equations with a border.
+"""Least squares over smooth curves and a few constants.
+
+Cubic B-splines in time, normal equations with a border.
 
 All angles and the palm's pose are uniform cubic B-splines (trajectory estimation in continuous time: Furgale, Barfoot
 & Sibley, ICRA 2012), so frames need no common rate and no averaging. The normal matrix is a band of blocks for the
@@ -18,7 +20,7 @@ _WIDTH = 4  # coefficients that one instant depends on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knots:
-    """Uniform cubic B-splines over T instants.
+    """Uniform cubic B-splines over T epochs.
 
     Attributes:
         spacing_s: Between coefficients [s].
@@ -34,7 +36,7 @@ class Knots:
 
     @classmethod
     def over(cls, t_s: Float, spacing_s: float) -> "Knots":
-        """Knots that cover rising instants (T,) [s]."""
+        """Return knots that cover rising times (T,) [s]."""
         x = (t_s - t_s[0]) / spacing_s
         first = np.floor(x).astype(np.int64)
         u = x - first
@@ -50,7 +52,10 @@ class Knots:
         return np.einsum("tw,twn->tn", self.weight, picked)
 
     def gathered(self, distance: int) -> csr_array:
-        """(K, T): products of the weights of coefficients k and k + distance at each instant."""
+        """Return the weight products (K, T) of coefficients k and k + distance.
+
+        At each epoch.
+        """
         rows = self.first[:, None] + np.arange(_WIDTH - distance)
         value = self.weight[:, : _WIDTH - distance] * self.weight[:, distance:]
         return self._sparse(rows, value)
@@ -66,7 +71,9 @@ class Knots:
 
 
 class BorderedNormal:
-    """Normal equations of K * n coefficients and g constants. Holds what was added so far.
+    """Normal equations of K * n coefficients and g constants.
+
+    Holds what was added so far.
 
     Attributes:
         band: (K, 4, n, n) blocks: [k, d] couples coefficients k + d (row) and k (column).
@@ -84,7 +91,7 @@ class BorderedNormal:
         self.pull_constants: Float = np.zeros(constants)
 
     def add_epochs(self, knots: Knots, jacobian: Float, by_constants: Float, off: Float) -> None:
-        """Add residuals of every instant.
+        """Add residuals of every epoch.
 
         Args:
             knots: Where the instants lie.
@@ -126,7 +133,9 @@ class BorderedNormal:
         self.pull_constants += flat.T @ off.ravel()
 
     def solve(self, damping: float) -> tuple[Float, Float, Float]:
-        """Step of the coefficients (K, n), of the constants (g,), and the information (g, g) about the constants.
+        """Solve for the step of the coefficients (K, n) and of the constants (g,).
+
+        Also returns the information (g, g) about the constants.
 
         `damping` is added, as a share, to the diagonal (Marquardt).
         """
@@ -143,7 +152,10 @@ class BorderedNormal:
         return (own_step - across @ constants).reshape(count, n), constants, information
 
     def _blocks(self, damping: float) -> tuple[Float, Float]:
-        """The band as a block-tridiagonal matrix of threes of coefficients: (B, 3n, 3n) on and below the diagonal."""
+        """Return the band as a block-tridiagonal matrix of three coefficients per block.
+
+        (B, 3n, 3n) on and below the diagonal.
+        """
         count, _, n, _ = self.band.shape
         blocks = -(-count // 3)
         band = np.zeros((3 * blocks + 3, *self.band.shape[1:]))
@@ -171,7 +183,9 @@ def _padded(sides: Float, size: int) -> Float:
 
 
 def _solve_tridiagonal(on: Float, below: Float, sides: Float) -> Float:
-    """Solution (B, s, r) of a positive definite block-tridiagonal system, by block Cholesky.
+    """Solve a positive definite block-tridiagonal system by block Cholesky.
+
+    Returns the solution (B, s, r).
 
     Args:
         on: (B, s, s) diagonal blocks.

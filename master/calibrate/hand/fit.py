@@ -1,4 +1,7 @@
-"""The hand that best explains a routine: damped Gauss-Newton over the whole of it, and how sure each number is."""
+"""Hand that best explains a routine, with the uncertainty of each number.
+
+Damped Gauss-Newton over the whole routine.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,7 +80,9 @@ def fit_shape(
 
 
 def _spread(problem: HandRoutineProblem, residual_m: Float) -> tuple[float, float]:
-    """Root mean squared whitened residual, and by what factor it counts more because neighbours in time err alike.
+    """Return the root mean squared whitened residual and its correlation factor.
+
+    The factor is how much more the residual counts because neighbours in time err alike.
 
     Errors that last, such as a cap's hidden part, do not average out: with a correlation r from frame to frame, n
     frames tell as much as n (1 - r) / (1 + r) independent ones.

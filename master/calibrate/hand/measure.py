@@ -1,4 +1,6 @@
-"""From the markers of a routine to a hand: which lengths it tells, how well, and the profile with nothing made up.
+"""Measurement of a hand from the markers of a routine.
+
+Which lengths are measured, how well, and the profile with nothing made up.
 
 A length counts as measured when it is within 1 mm with 99 % certainty, and when the markers and not the beliefs say so.
 With caps on the tips alone the length of a finger is told, and often not its division: then the sum is measured, and
@@ -59,7 +61,7 @@ class Length:
 
     @property
     def measured(self) -> bool:
-        """Whether the markers tell it."""
+        """Return true if the markers determine the length."""
         return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= PRIOR_SHARE * self.before_m
 
     @property
@@ -71,7 +73,7 @@ class Length:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandMeasurement:
-    """What a routine tells of a hand.
+    """Measurement of a hand by a routine.
 
     Attributes:
         observed: What was seen.
@@ -93,7 +95,10 @@ class HandMeasurement:
         return float(np.sqrt(np.nanmean(self.fit.residual_m**2)))
 
     def parted(self, finger: int) -> tuple[Length, ...]:
-        """The measured lengths of a finger, as finely divided as they are measured; none overlap."""
+        """Return the measured lengths of a finger without overlap.
+
+        As finely divided as they are measured.
+        """
         found: list[Length] = []
         for length in (length for length in self.lengths if length.finger == finger and length.measured):
             if not any(set(length.bones) & set(other.bones) for other in found):
@@ -158,7 +163,10 @@ def problem_of(
 
 
 def whitening(cov_m2: Float, model_m: float) -> Float:
-    """(..., 3, 3) inverse square roots of covariances with the model's own error added; nought where NaN."""
+    """Return inverse square roots (..., 3, 3) of covariances plus the model's error.
+
+    Zero where NaN.
+    """
     known = np.asarray(np.isfinite(cov_m2).all(axis=(-2, -1)), np.bool_)
     filled = np.where(known[..., None, None], cov_m2, np.eye(3)) + model_m**2 * np.eye(3)
     value, vector = np.linalg.eigh(filled)
@@ -223,7 +231,10 @@ def _check_side(observed: Observed, template: HandProfile, alignment: Alignment)
 
 
 def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
-    """Curves that are smoothed by a belief stay within it, unless the palm really moved more than that."""
+    """Refuse a palm that moved far more than its prior expects.
+
+    Curves that are smoothed by a prior stay within it, unless the palm really moved more than that.
+    """
     priors, step_s = problem.priors, np.sqrt(problem.knots.spacing_s)
     expected_rms = np.repeat([priors.palm_rad_s, priors.palm_m_s], 3) * step_s
     wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / expected_rms

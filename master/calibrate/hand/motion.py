@@ -1,4 +1,6 @@
-"""A hand file from a motion capture: bones and hinges from its joints, couplings where it is long enough.
+"""Hand file from a motion capture.
+
+Bones and hinges from its joints, couplings where it is long enough.
 
 Bones are the mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
 (`common/hand_fitting.py`). What no motion capture tells is taken from the generated profile of the same length: radii,
@@ -109,7 +111,10 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
 
 
 def _good(palm: Palm) -> Bool:
-    """Frames (T,) with all joints, whose palm is one and whose bones are as long as usual."""
+    """Select the frames (T,) with all joints and a plausible hand.
+
+    The palm is no outlier and the bones are as long as usual.
+    """
     whole = np.asarray(known(palm.chains_m).all(axis=(1, 2)), np.bool_) & ~palm.outlier
     lengths = np.linalg.norm(np.diff(palm.chains_m, axis=2), axis=3)
     if not whole.any():

@@ -1,4 +1,6 @@
-"""How the joints of a person's fingers bend together, from a motion capture: the couplings of the hand file.
+"""Joint couplings of a person's fingers, from a motion capture.
+
+How the joints flex together: the couplings of the hand file.
 
     DIP = ratio . PIP,  MCP = ratio . PIP        index ... little, least squares through zero, with the weights of Huber
 
@@ -47,7 +49,7 @@ class Ratio:
 
 @dataclass(frozen=True, slots=True)
 class MotionCouplings:
-    """What a motion tells of couplings.
+    """Couplings measured from a motion.
 
     Attributes:
         moved_s: How long any PIP moved.
@@ -103,7 +105,9 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
 
 
 def _joint_noise(chains_m: Float) -> tuple[float, float, float]:
-    """Standard deviations [rad] of MCP, PIP and DIP by noise of the joints, mean square over index ... little.
+    """Return the standard deviations [rad] of MCP, PIP and DIP by joint noise.
+
+    Mean square over index ... little.
 
     A bone from a to b of length L turns by the noise across it; b moves both bones at an angle. The noise is that along
     the bones, whose length does not change in truth, alike in all directions.

@@ -1,4 +1,7 @@
-"""What was seen of a hand during the routine: places of its markers over time, checked, from a file of poses."""
+"""Observations of a hand during the routine, checked.
+
+Places of its markers over time, from a file of poses.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +39,7 @@ class Observed:
     def of(
         cls, t_ns: Int, points_m: Float, cov_m2: Float, names: Sequence[str], model: HandModel
     ) -> "Observed":
-        """Take the markers that sit on a hand's tips and back, in their order, and check them.
+        """Take the markers on a hand's tips and back, in their order, and check them.
 
         Raises:
             CalibrationError: A finger tip has no marker in `names`.

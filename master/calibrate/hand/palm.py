@@ -1,4 +1,4 @@
-"""The palm in a motion capture: its frame at every instant, and which hand it is.
+"""Palm in a motion capture: its frame at every epoch, and which hand it is.
 
 Wrist, knuckles and the thumb's root are one rigid body, whose shape is the mean of all frames laid on one another
 (generalised Procrustes analysis; Gower, 1975). The palm frame is that in which this shape lies nearest to the generated
@@ -51,7 +51,9 @@ class Palm:
 
 
 def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
-    """Find the palm frame of joints (T, 26, 3) [m], NaN: not seen; of that side, or of the side that they show.
+    """Find the palm frame of joints (T, 26, 3) [m].
+
+    NaN: not seen. Of the given side, or of the side that the joints show.
 
     Raises:
         FitError: The palm is never seen whole, or the fingers do not tell which side is the back.
@@ -85,7 +87,10 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
 
 
 def _mean_shape(body_m: Float) -> tuple[Float, Float, Float]:
-    """The mean shape (K, 3) of a body's points (T, K, 3), its poses (T, 4, 4) and their distances (T,) from it."""
+    """Return the mean shape (K, 3) of a body's points (T, K, 3).
+
+    Also its poses (T, 4, 4) and the points' distances (T,) from it.
+    """
     shape = body_m[len(body_m) // 2]
     T = np.zeros((len(body_m), 4, 4))
     for _ in range(_ROUNDS):
@@ -105,7 +110,9 @@ def palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
 
 
 def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
-    """The hand whose fingers bend towards -y, that is about +x, whatever the knuckles do.
+    """Return the side of the hand whose fingers flex towards -y.
+
+    That is about +x, whatever the knuckles do.
 
     Raises:
         FitError: They bend too little, or aside.

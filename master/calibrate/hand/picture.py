@@ -1,4 +1,7 @@
-"""Picture of a measured hand: lengths against the scaled ones with their certainty, and what is left of each marker."""
+"""Plot of a measured hand.
+
+Lengths against the scaled ones with their uncertainty, and the residuals of each marker.
+"""
 
 from pathlib import Path
 

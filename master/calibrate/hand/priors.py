@@ -1,4 +1,6 @@
-"""What is believed before a marker is seen: of hands in general, and of a user who follows the routine roughly.
+"""Priors before a marker is seen.
+
+Of hands in general, and of a user who follows the routine roughly.
 
 None of it is exact, and all of it is wide: where the markers do not overrule it, a bone is reported as undetermined.
 """
@@ -76,7 +78,10 @@ class RoutineTargets:
 
     @classmethod
     def of(cls, script_s: Float) -> "RoutineTargets":
-        """At routine times (K,) [s]; what may be moving by then counts as moving, since times are known roughly."""
+        """Return the targets at routine times (K,) [s].
+
+        What may be moving by then counts as moving, since times are known roughly.
+        """
         around = [[move_at(t + d) for d in (-_COARSE_S, 0.0, _COARSE_S)] for t in script_s.tolist()]
         return cls(
             np.radians([posture_at(t) for t in script_s.tolist()]),

@@ -1,4 +1,6 @@
-"""The whole routine as one least-squares problem: one shape, and curves of 26 numbers (palm pose and angles).
+"""Hand routine as one least-squares problem.
+
+One shape, and curves of 26 numbers (palm pose and angles).
 
 Channels of the curves: palm turn (3, rotation vector about the palm's middle, against the first pose), palm shift (3),
 then the angles (20). Deviations from what the routine asks for are Ornstein-Uhlenbeck processes: they live for about a
@@ -33,7 +35,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRoutineProblem:
-    """What was seen and what is believed.
+    """Observations and priors of the routine.
 
     Attributes:
         model: Template.
@@ -60,7 +62,7 @@ class HandRoutineProblem:
     priors: Priors
 
     def guess(self) -> State:
-        """The routine as it is asked for, by the believed shape."""
+        """Return the scripted routine with the prior shape as the initial state."""
         coefficients = np.zeros((len(self.knots.time_s), CHANNELS))
         angles = coefficients[:, _PALM:].reshape(-1, 5, 4)
         angles[..., :3] = self.targets.posture_rad
@@ -102,15 +104,18 @@ class HandRoutineProblem:
         return self.points_m - self._predicted(state)[0]
 
     def angles(self, state: State) -> Float:
-        """(T, 5, 4) [rad] at the instants."""
+        """Return the joint angles (T, 5, 4) [rad] at the epochs."""
         return self.knots.at(state.coefficients)[:, _PALM:].reshape(-1, 5, 4)
 
     def shape_sd(self) -> Float:
-        """(size,) of the believed shape."""
+        """Return the standard deviations (size,) of the prior shape."""
         return 1.0 / self._shape_prior(self.prior)[0]
 
     def _predicted(self, state: State) -> tuple[Float, Float, Float]:
-        """Markers (T, M, 3), their Jacobians by the curves (T, M, 3, 26) and the shape (T, M, 3, size)."""
+        """Predict the markers (T, M, 3) and their Jacobians.
+
+        By the curves (T, M, 3, 26) and by the shape (T, M, 3, size).
+        """
         curves = self.knots.at(state.coefficients)
         count, markers = self.points_m.shape[:2]
         caps = caps_of(self.model, self.cap_m, state.shape, curves[:, _PALM:].reshape(-1, 5, 4))
@@ -142,7 +147,10 @@ class HandRoutineProblem:
         return self.whiten @ by_curve, self.whiten @ by_shape, (self.whiten @ off[..., None])[..., 0]
 
     def _links(self, state: State) -> tuple[Float, Float, Float]:
-        """Rows between neighbouring coefficients: palm, angles about the routine, DIPs about their PIPs."""
+        """Return the residual rows between neighbouring coefficients.
+
+        Palm, angles about the routine, DIPs about their PIPs.
+        """
         x, shape = state.coefficients, state.shape
         change, mean, level = self._widths()
         dip = _PALM + np.arange(5) * 4 + _DIP
@@ -172,7 +180,10 @@ class HandRoutineProblem:
         return jacobian, by_shape, off
 
     def _widths(self) -> tuple[Float, Float, Float]:
-        """Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26)."""
+        """Return the prior widths and means of the coefficients.
+
+        Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26).
+        """
         b, h = self.priors, self.knots.spacing_s
         count = len(self.knots.time_s) - 1
         moving = (self.targets.moving[1:] | self.targets.moving[:-1]).reshape(count, 5, 3)
@@ -192,7 +203,10 @@ class HandRoutineProblem:
         return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
 
     def _shape_prior(self, shape: Shape) -> tuple[Float, Float]:
-        """Inverse sd (size,) and how far a shape (size,) is from the believed one."""
+        """Return the inverse sd (size,) and the deviation from the prior shape.
+
+        Deviation of a shape (size,).
+        """
         b, prior = self.priors, self.prior
         sd, away = np.empty(shape.size), np.empty(shape.size)
         own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
@@ -227,7 +241,10 @@ def _rotation_between(rotation: Float, other: Float) -> Float:
 
 
 def _left_jacobian(vector: Float) -> Float:
-    """(T, 3, 3): turns of rotation_vector_to_matrix(vector) by changes of the vector (Barfoot, 2017, eq. 7.77)."""
+    """Return the left Jacobian (T, 3, 3) of rotation vectors.
+
+    Rotations of rotation_vector_to_matrix(vector) by changes of the vector (Barfoot, 2017, eq. 7.77).
+    """
     angle = np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[:, None, None]
     k = skew(vector)
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)

@@ -1,4 +1,7 @@
-"""Into the hand file: measured lengths, scaled ones where nothing was measured, and which are which."""
+"""Writing of measured lengths into the hand file.
+
+Scaled lengths where nothing was measured, and which are which.
+"""
 
 from itertools import pairwise
 
@@ -18,7 +21,9 @@ _QUICK = "rest_joints"  # says of a whole hand that it is only scaled
 def measured_profile(
     measurement: HandMeasurement, name: str, data: str, dip_per_pip: float | None = None
 ) -> HandProfile:
-    """The template with every measured length; the parts of a measured sum keep the template's proportions.
+    """Return the template with every measured length inserted.
+
+    The parts of a measured sum keep the template's proportions.
 
     Args:
         measurement: What the routine told.
@@ -52,7 +57,10 @@ def measured_profile(
 
 
 def bone_factors(measurement: HandMeasurement) -> Float:
-    """(5, 3) by what each bone of the template is stretched; 1 where nothing was measured."""
+    """Return the stretch factors (5, 3) of the template's bones.
+
+    1 where nothing was measured.
+    """
     factor = np.ones((5, 3))
     for finger in range(5):
         for length in measurement.parted(finger):
@@ -61,7 +69,10 @@ def bone_factors(measurement: HandMeasurement) -> Float:
 
 
 def stretched(model: HandModel, factor: Float) -> dict[str, RestJoint]:
-    """Rest joints with the bones of the chains stretched by (5, 3), roots and orientations kept."""
+    """Stretch the bones of the chains of the rest joints by (5, 3).
+
+    Roots and orientations are kept.
+    """
     rest = dict(model.profile.rest_joints)
     for chain, own in zip(CHAINS, factor, strict=True):
         at = model.rest_position_m[chain[0]]

@@ -1,4 +1,6 @@
-"""The routine with a person: steps are told one by one, and a step whose markers were not seen is done again.
+"""Guided hand routine with a person.
+
+Steps are announced one by one, and a step whose markers were not seen is repeated.
 
 What was seen in a step that is done again is dropped and its time taken out, so that the rest is one routine.
 """

@@ -1,4 +1,6 @@
-"""The shape of a hand as numbers to be found, and where it puts the caps for given angles, with derivatives.
+"""Shape of a hand as numbers to be estimated.
+
+Also where it puts the caps for given angles, with derivatives.
 
 Of each finger: three bone lengths, the place and the rest orientation of its root (knuckle; thumb: CMC), and how its
 DIP follows its PIP. Directions of bones in their joints, rest turns and the caps' offsets from the tip joints stay
@@ -69,7 +71,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Caps:
-    """Where the caps of the tips are in the palm frame, for T instants.
+    """Positions of the fingertip caps in the palm frame, for T epochs.
 
     Attributes:
         place_m: (T, 5, 3).

@@ -1,4 +1,6 @@
-"""The places of beads on a rigid body, and its pose at every instant, from where they were: one least-squares problem.
+"""Bundle adjustment of bead positions on a rigid body and its pose per epoch.
+
+One least-squares problem, from where the beads were.
 
 Minimised over beads q_b and poses R_t, p_t, with the covariances C of the points, which hold what the cameras' pixels
 told (a bundle adjustment, linear in the points: Triggs et al. 2000):
@@ -50,12 +52,15 @@ class Bundle:
 
     @property
     def outlier(self) -> Bool:
-        """(T, B) which sightings the body does not explain."""
+        """Return the observations (T, B) that the body does not explain."""
         return self.seen.known & (self.weight < OUTLIER)
 
 
 def usable(seen: Seen) -> Bool:
-    """(T,) instants that say something of the body: three beads or more are known."""
+    """Select the epochs (T,) that constrain the body.
+
+    Three beads or more are known.
+    """
     return seen.known.sum(axis=1) >= 3
 
 
@@ -96,7 +101,9 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
 
 
 def first_body(seen: Seen) -> tuple[Float, Float]:
-    """Beads (B, 3) and poses (T, 4, 4) to begin with: from the instant that is known best, bead by bead by medians.
+    """Return initial beads (B, 3) and poses (T, 4, 4).
+
+    From the epoch that is known best, bead by bead by medians.
 
     Raises:
         FitError: A bead is never seen together with two others whose places are known.
@@ -126,7 +133,10 @@ def _medians(placed: Float, beads: Float) -> Float:
 
 
 def _pose(points: Float, beads: Float) -> Float:
-    """The pose (4, 4) of a body (B, 3) by points (B, 3); NaN where fewer than three are known of both."""
+    """Return the pose (4, 4) of a body (B, 3) from points (B, 3).
+
+    NaN where fewer than three are known of both.
+    """
     both = np.isfinite(points[:, 0] + beads[:, 0])
     return fit_rigid(points[both], beads[both]) if both.sum() >= 3 else np.full((4, 4), np.nan)
 
@@ -140,7 +150,9 @@ def _inverse(cov: Float) -> Float:
 
 
 def _scale_2(chi: Float, known: Bool) -> float:
-    """What the covariances are to be multiplied by, 1 at least, from chi squares (T, B) by their median.
+    """Return the factor by which the covariances are multiplied.
+
+    1 at least, from chi-squares (T, B) by their median.
 
     Of the 3 n numbers of an instant 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n numbers, whose
     median follows by Wilson and Hilferty (1931).
@@ -152,7 +164,10 @@ def _scale_2(chi: Float, known: Bool) -> float:
 
 
 def _solved(beads: Float, T: Float, off: Float, info: Float) -> tuple[Float, Float, Float]:
-    """One Gauss-Newton step: of the beads (B, 3), of the poses (T, 6: turn, place), and the beads' covariance."""
+    """Perform one Gauss-Newton step.
+
+    Of the beads (B, 3), of the poses (T, 6: rotation, position); also returns the beads' covariance.
+    """
     count = len(beads)
     R = T[:, :3, :3]
     by_pose = np.empty((len(T), count, 3, 6))

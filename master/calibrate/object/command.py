@@ -1,4 +1,7 @@
-"""`phalanx calibrate object`: where the beads of a new object sit, from its being moved before the cameras."""
+"""`phalanx calibrate object`: where the beads of a new object sit.
+
+Measured by moving it before the cameras.
+"""
 
 from argparse import Namespace
 from pathlib import Path
@@ -69,7 +72,9 @@ def object_command(options: Namespace) -> None:
 
 
 def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProfile | None, str]:
-    """The file whose frame and other parts are kept, and its name; None: there is none.
+    """Return the object file whose frame and other parts are kept, and its name.
+
+    None: there is none.
 
     Raises:
         CalibrationError: It is missing or broken.
@@ -83,7 +88,9 @@ def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProf
 def names_of(
     given: tuple[str, ...] | None, base: ObjectProfile | None, rig: RigCalibration
 ) -> tuple[str, ...]:
-    """The beads: as told, of the file, or all that sit on no hand.
+    """Return the names of the beads.
+
+    As given, of the file, or all that sit on no hand.
 
     Raises:
         CalibrationError: Fewer than three, one stands twice, or the rig does not have them.
@@ -99,7 +106,10 @@ def names_of(
 
 
 def radii(names: tuple[str, ...], radius_mm: float | None, base: ObjectProfile | None) -> dict[str, float]:
-    """Radius of each bead [m]: as told, as the file has it, or the usual."""
+    """Return the radius of each bead [m].
+
+    As given, as the file has it, or the usual.
+    """
     there = {} if base is None else {name: bead.radius_m for name, bead in base.markers.items()}
     return {
         name: there.get(name, 0.008) if radius_mm is None else round(1e-3 * radius_mm, 7) for name in names

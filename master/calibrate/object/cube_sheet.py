@@ -1,4 +1,6 @@
-"""A box of tags to print, cut out and fold: its five faces as one net at true scale, and the file of the object.
+"""Printable box of tags to cut out and fold.
+
+Its five faces as one net at true scale, and the file of the object.
 
 The top is in the middle of the net and the four sides stand about it, each with its upper edge at the top. The frame
 of the object is in the middle of the box: x to the right and y up on the top as it is printed, z out of it.
@@ -83,7 +85,10 @@ class TagBox:
 
 
 def dark_squares(box: TagBox) -> list[tuple[float, float, float]]:
-    """Left, lower edge and size [mm] of all black cells, from the middle of the net, x to the right, y up."""
+    """Return left edge, lower edge and size [mm] of all black cells.
+
+    From the middle of the net, x to the right, y up.
+    """
     cells = GRIDS[box.family].cells + 2
     cell = 1e3 * box.edge_m / cells
     found: list[tuple[float, float, float]] = []
@@ -99,7 +104,9 @@ def dark_squares(box: TagBox) -> list[tuple[float, float, float]]:
 
 
 def print_box(path: Path, box: TagBox) -> None:
-    """Write the net on an A4 page; the ending of the file says whether PDF or SVG.
+    """Write the net on an A4 page as PDF or SVG.
+
+    The extension of the file decides which.
 
     Raises:
         CalibrationError: Another ending, or the file cannot be written.

@@ -1,4 +1,7 @@
-"""In which frame the places of beads are written: the object's own, by the beads, or that of a file that there is."""
+"""Frame in which the positions of beads are written.
+
+The object's own, by the beads, or that of an existing file.
+"""
 
 import numpy as np
 
@@ -18,7 +21,9 @@ OWN = (
 
 
 def own_frame(beads_m: Float, names: tuple[str, ...]) -> Float:
-    """`T_own_body` (4, 4) for beads (B, 3) [m]: as `OWN` says; z is x times y.
+    """Return `T_own_body` (4, 4) for beads (B, 3) [m].
+
+    Axes as `OWN` defines; z is x times y.
 
     Raises:
         FitError: The beads lie in one line.
@@ -41,7 +46,9 @@ def own_frame(beads_m: Float, names: tuple[str, ...]) -> Float:
 def frame_of(
     beads_m: Float, names: tuple[str, ...], like: ObjectProfile, where: str
 ) -> tuple[Float, dict[str, float]]:
-    """`T_file_body` (4, 4) that lays beads (B, 3) onto those of a file as well as they go; by how much each misses [m].
+    """Return `T_file_body` (4, 4), the best fit of beads (B, 3) to those of a file.
+
+    Also by how much each bead misses [m].
 
     Raises:
         FitError: The file has fewer than three of them, in one line, or they lie elsewhere.

@@ -1,4 +1,7 @@
-"""Where the beads of an object sit: what was seen of its motion, checked, fitted, and refused with the cause."""
+"""Positions of the beads on an object, measured from its motion.
+
+The observations are checked, fitted, and refused with the cause.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,13 +59,16 @@ class Measurement:
 
     @property
     def rms_m(self) -> Float:
-        """(B,) by how much each misses the body, root of the mean square; strays left out."""
+        """Return the root mean square residual (B,) of each bead to the body.
+
+        Outliers are rejected.
+        """
         kept = np.where((self.bundle.weight > 0) & ~self.bundle.outlier, 1.0, np.nan)
         return np.sqrt(np.nanmean(kept * (self.bundle.off_m**2).sum(axis=-1), axis=0))
 
     @property
     def strays(self) -> Float:
-        """(B,) share of sightings of each that the body does not explain."""
+        """Return the share (B,) of each bead's observations that the body does not fit."""
         return self.bundle.outlier.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
 
 
@@ -119,7 +125,9 @@ def refuse_insufficient(seen: Seen) -> None:
 
 
 def refuse_loose(seen: Seen) -> None:
-    """Refuse beads that do not keep their distances: for the most part of the time, not for a moment.
+    """Refuse beads that do not keep their distances.
+
+    For the most part of the time, not for a moment.
 
     Raises:
         FitError: Which bead moved, where the others say so.
@@ -144,7 +152,10 @@ def refuse_loose(seen: Seen) -> None:
 
 
 def guilty_of(change: Mapping[tuple[int, int], tuple[float, float]], count: int) -> int | None:
-    """The bead without which the others keep their distances, if it is one; `change` as of `changes`."""
+    """Return the bead without which the others keep their distances.
+
+    If it is one; `change` as of `changes`.
+    """
     rest = [
         max((by / most for pair, (by, most) in change.items() if bead not in pair), default=0.0)
         for bead in range(count)
@@ -154,7 +165,10 @@ def guilty_of(change: Mapping[tuple[int, int], tuple[float, float]], count: int)
 
 
 def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
-    """Of each pair of beads by how much its distance changes, and what is allowed [m]; without those hardly seen."""
+    """Return the change of distance of each pair of beads and its limit [m].
+
+    Without pairs that were hardly seen.
+    """
     window: Int = (seen.t_s / _WINDOW_S).astype(np.int64)
     out = dict[tuple[int, int], tuple[float, float]]()
     for a, b in combinations(range(len(seen.names)), 2):
@@ -181,7 +195,10 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
 
 
 def looks_of(T: Float) -> int:
-    """In how many ways poses (T, 4, 4) differ enough that cameras see something else: greedily, the first ones kept."""
+    """Count the poses (T, 4, 4) that give cameras distinctly different views.
+
+    Greedily, the first ones are kept.
+    """
     kept = np.empty((0, 4, 4))
     for pose in T:
         rotation = np.linalg.norm(

@@ -1,4 +1,7 @@
-"""Picture of a measured object: its beads from three sides, and what is left of each over time."""
+"""Plot of a measured object: its beads from three sides.
+
+Also the residuals of each over time.
+"""
 
 from pathlib import Path
 
@@ -11,7 +14,9 @@ from master.calibrate.wrist.picture import FINGER_COLOURS, GREY, figure_of, save
 
 
 def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
-    """Beads with every sighting, object frame, from above, ahead and aside; distances left over time. PNG.
+    """Draw the beads with every observation, and the residuals over time, as PNG.
+
+    Object frame, from above, ahead and aside; the residuals are distances left over time.
 
     Raises:
         RecordingError: The file cannot be written.

@@ -1,4 +1,7 @@
-"""Into the object's file: measured beads in the frame asked for, the rest of an old file kept; and the report."""
+"""Writing of the measured beads into the object's file, and the report.
+
+In the frame asked for, the rest of an old file kept.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +29,7 @@ def measured_profile(
     like: ObjectProfile | None,
     like_where: str,
 ) -> tuple[ObjectProfile, dict[str, float]]:
-    """The object, and by how much each bead lies elsewhere than an old file says [m].
+    """Return the object and the displacement of each bead from an old file [m].
 
     Args:
         found: What was measured.

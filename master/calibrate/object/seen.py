@@ -1,4 +1,7 @@
-"""Where the beads of an object were over time, with covariances: from what cameras found or a master published."""
+"""Positions of an object's beads over time, with covariances.
+
+From what cameras found or a master published.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -64,7 +67,7 @@ def seen_by(
     messages: Iterable[MarkerDetections],
     names: Sequence[str],
 ) -> Seen:
-    """Bring the cameras to one instant each and place the beads there.
+    """Bring the cameras to common epochs and triangulate the beads there.
 
     What has a second place in a camera is left out of that instant: there is no pose yet that tells which is right.
 
@@ -119,7 +122,7 @@ def seen_in(poses: Sequence[HandPose], rig: RigCalibration, names: Sequence[str]
 
 
 def _clear(frames: FrameSet, uv: Float) -> Float:
-    """Pixels (C, M, 2) without those that have a rival."""
+    """Return the pixels (C, M, 2) without those that have an alternative."""
     if frames.alt_uv is None:
         return uv
     return np.where(np.isfinite(frames.alt_uv[..., :1]), np.nan, uv)

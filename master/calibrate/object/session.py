@@ -1,4 +1,7 @@
-"""The motion with a person: every second what is seen is told, and what is still wanting, until it is enough."""
+"""Guided object motion with a person.
+
+Every second reports what is seen and what is still missing, until it is enough.
+"""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,7 @@
-"""`phalanx calibrate time`: from a recording of a moving hand to the offsets of the cameras' stamps."""
+"""`phalanx calibrate time`: offsets of the cameras' time stamps.
+
+From a recording of a moving hand.
+"""
 
 from argparse import Namespace
 from collections.abc import Mapping
@@ -18,7 +21,10 @@ from master.summary import write_summary
 
 
 def time_command(options: Namespace) -> None:
-    """Measure how much later a camera's frames are than its stamps say, from a hand that moves."""
+    """Measure how much later a camera's frames are than its time stamps.
+
+    From a hand that moves.
+    """
     opened = open_recording(options.recording)
     used, cameras = geometry_of(opened, options.rig, options.calibration)
     base = rig_in_tree(options.out, options.rig or used.name, used)
@@ -119,7 +125,9 @@ def report_json(rig: RigCalibration, times: tuple[CameraTime, ...]) -> dict[str,
 def write_offsets(
     out: Path, file_name: str, rig: RigCalibration, times: tuple[CameraTime, ...], data: str
 ) -> Path:
-    """Write rigs/<file_name>.json with the offsets and their provenance; those within noise are written as 0.
+    """Write rigs/<file_name>.json with the offsets and their provenance.
+
+    Offsets within noise are written as 0.
 
     Raises:
         CalibrationError: The file cannot be written; the old one is untouched.

@@ -1,4 +1,6 @@
-"""How much later each camera's frames are than its stamps say, from a recording of a moving hand.
+"""Delay of each camera's frames relative to its time stamps.
+
+From a recording of a moving hand.
 
 The estimator is that of the running master (`master.monitor.timing`), over the whole recording and every frame. It is
 linear in the offset, so the recording is measured again, and a third time, with the stamps as they were found before.
@@ -29,7 +31,7 @@ _ADVICE = (
 
 @dataclass(frozen=True, slots=True)
 class CameraTime:
-    """What a recording says of one camera.
+    """Timing of one camera from a recording.
 
     Attributes:
         camera: Its name.
@@ -46,7 +48,10 @@ class CameraTime:
 
     @property
     def to_write_us(self) -> float:
-        """What belongs into the rig file [us]: nothing is corrected by a number that may be noise."""
+        """Return the offset for the rig file [us].
+
+        Nothing is corrected by a number that may be noise.
+        """
         return round(1e-3 * self.offset.offset_ns, 1) if self.significant else 0.0
 
 
@@ -84,7 +89,7 @@ def _pass(
     frame_rate_hz: Mapping[str, float],
     messages: Sequence[MarkerDetections],
 ) -> dict[str, TimeOffset]:
-    """Offsets of the cameras of which anything can be said."""
+    """Return the time offsets of the cameras for which they can be estimated."""
     machine = ResidualTiming(models, frame_rate_hz, kept_blocks=_KEPT_BLOCKS, rate_hz=np.inf)
     for message in messages:
         machine.push(message)
@@ -94,7 +99,10 @@ def _pass(
 
 
 def shifted(messages: Sequence[MarkerDetections], late_ns: Mapping[str, float]) -> list[MarkerDetections]:
-    """The messages by their true times, if the frames of a camera are `late_ns` later than its stamps."""
+    """Shift the messages to their true times.
+
+    For frames of a camera that are `late_ns` later than its stamps.
+    """
     late = {camera: round(ns) for camera, ns in late_ns.items()}
     moved = [
         msgspec.structs.replace(message, t_ns=message.t_ns + late[message.camera])
@@ -108,7 +116,7 @@ def shifted(messages: Sequence[MarkerDetections], late_ns: Mapping[str, float]) 
 def _refusal(
     reference: str, camera: str, offset: TimeOffset | None, messages: Sequence[MarkerDetections]
 ) -> str:
-    """Why a camera's time cannot be told, and what to do."""
+    """Explain why a camera's time offset cannot be estimated, and what to do."""
     known = "" if offset is None else f", only to {1e-6 * offset.sigma_ns:.1f} ms (standard deviation)"
     parts = ", ".join(
         f"{name}: {seconds:.1f} s, {speed:.0f} px/s"
@@ -120,7 +128,10 @@ def _refusal(
 def _motion(
     messages: Sequence[MarkerDetections], cameras: tuple[str, str]
 ) -> list[tuple[str, tuple[float, float]]]:
-    """Camera -> how long it saw markers [s], and their speed, root of mean square [px/s]."""
+    """Return how long each camera saw markers [s], and their rms speed [px/s].
+
+    Speed: root of the mean square.
+    """
     out: list[tuple[str, tuple[float, float]]] = []
     for camera in cameras:
         frames = [message for message in messages if message.camera == camera]

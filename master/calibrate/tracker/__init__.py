@@ -1,1 +1,4 @@
-"""Where a tracking system lies in the rig, and where its device sits on an object that the cameras see, too."""
+"""Registration of a tracking system to the rig and of its device to an object.
+
+The cameras see the object, too.
+"""

@@ -1,4 +1,7 @@
-"""`phalanx calibrate tracker`: where a tracking system lies in the rig, and its device on an object."""
+"""`phalanx calibrate tracker`: registration of a tracking system to the rig.
+
+Also of its device on an object.
+"""
 
 from argparse import Namespace
 from pathlib import Path
@@ -16,7 +19,7 @@ from master.summary import write_summary
 
 
 def tracker(options: Namespace) -> None:
-    """Find where a tracking system (Lighthouse) lies in the rig, and where its device sits on an object."""
+    """Register a tracking system (Lighthouse) to the rig and its device to an object."""
     if options.live == (options.motion is not None):
         raise CalibrationError("give --live, or --motion FILE of a motion that was kept")
     used = load_marker_rig(options.calibration, options.rig)

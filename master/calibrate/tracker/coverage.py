@@ -1,4 +1,7 @@
-"""Whether a motion tells a registration: turns about which of the object's axes, way, pace; and what is missing."""
+"""Check of whether a motion constrains a registration.
+
+Rotations about which of the object's axes, path, pace; and what is missing.
+"""
 
 from dataclasses import dataclass
 
@@ -79,7 +82,10 @@ class Coverage:
 
 
 def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Coverage:
-    """What cameras and tracker saw together, at a lag that is right to a tenth of a second."""
+    """Return what cameras and tracker saw together.
+
+    At a lag that is right to a tenth of a second.
+    """
     rows = shared_epochs(seen, tracker, late_s, len(seen))
     times = (_known_s(seen.t_s), _known_s(tracker.t_s), _known_s(seen.t_s[rows]))
     if len(rows) < 3:
@@ -94,7 +100,10 @@ def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Cov
 
 
 def _known_s(t_s: Float) -> float:
-    """How much time is between poses that follow each other [s]; gaps of a tenth of a second and more are none."""
+    """Return the total time between consecutive poses [s].
+
+    Gaps of a tenth of a second and more do not count.
+    """
     steps: Float = np.diff(t_s)
     return float(steps[steps < 0.1].sum())
 

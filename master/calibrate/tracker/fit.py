@@ -1,4 +1,6 @@
-"""The most probable registration: weighted least squares over all shared instants, strays weighed down.
+"""Most probable registration, by weighted least squares.
+
+Over all shared epochs, outliers down-weighted.
 
 Thirteen unknowns, as small changes of what is there: a turn a and shift d of the tracking system about the middle c of
 what was seen, a turn b and shift e of the device in the object's frame, and the lag. With P, R the foretold pose:
@@ -38,7 +40,7 @@ _PRIOR = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A registration, and what is left of what was seen (N instants).
+    """Registration and its residuals (N epochs).
 
     Attributes:
         placed: The registration.
@@ -66,7 +68,10 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """The equations at a registration: what is left (N, 6), how it follows the unknowns (N, 6, 13)."""
+    """Linearised equations at a registration.
+
+    Residuals (N, 6), and their derivatives by the unknowns (N, 6, 13).
+    """
 
     R: Float
     p_m: Float
@@ -75,7 +80,7 @@ class _Lines:
 
 
 class _Problem:
-    """What was seen at the instants that count."""
+    """Observations at the epochs that count."""
 
     def __init__(self, seen: PoseTrack, tracker: PoseTrack, rows: Int) -> None:
         self._tracker = tracker
@@ -113,7 +118,7 @@ class _Problem:
 
 
 def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
-    """Fit the registration to all instants that both know.
+    """Fit the registration to all epochs known to both cameras and tracker.
 
     Args:
         seen: The object, by the cameras.
@@ -145,7 +150,9 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
 
 
 def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
-    """How sure an object's pose by the tracker is at poses (T, 3, 3), (T, 3) of the rig: place [m], turn [rad].
+    """Return the uncertainty of an object's pose by the tracker.
+
+    At poses (T, 3, 3), (T, 3) of the rig: position [m], rotation [rad].
 
     Root of the mean square over the poses, all axes together.
     """
@@ -193,7 +200,10 @@ def _sizes(weight: Float, off: Float) -> Float:
 
 
 def _counts(sizes: Float) -> Float:
-    """(N,) how much an instant counts: Tukey's biweight, nothing where it strays by twice as much as strays do."""
+    """Return the weights (N,) of the epochs by Tukey's biweight.
+
+    Zero for a residual of twice the outlier limit or more.
+    """
     return np.clip(1.0 - (sizes / (2.0 * OUTLIER)) ** 2, 0.0, 1.0) ** 2
 
 
@@ -206,14 +216,17 @@ def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
 
 
 def _blocks(t_s: Float) -> list[Bool]:
-    """(N,) each: which instants are in a block of time."""
+    """Return one mask (N,) for each block of time: the epochs in it."""
     share = (t_s - t_s[0]) / (t_s[-1] - t_s[0] + 1e-9)
     number = (BLOCKS * share).astype(np.int64)
     return [number == k for k in range(BLOCKS) if (number == k).any()]
 
 
 def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:
-    """The change of the unknowns (13,) when a block is left out: one step from the whole."""
+    """Return the change of the unknowns (13,) when a block is left out.
+
+    One step from the whole.
+    """
     kept = np.where(block, 0.0, counts)
     normal = _normal(problem.weight, lines, kept) + np.diag(_PRIOR)
     return np.asarray(np.linalg.solve(normal, _pull(problem.weight, lines, kept)), np.float64)

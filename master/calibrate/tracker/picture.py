@@ -1,4 +1,7 @@
-"""Picture of a registration: the way of the object by cameras and by tracker, and what is left over time."""
+"""Plot of a registration: the object's path by cameras and by tracker.
+
+Also the residuals over time.
+"""
 
 from pathlib import Path
 
@@ -11,7 +14,9 @@ _GREEN = "#2f855a"
 
 
 def draw_registration(path: Path, found: Registration) -> None:
-    """From above and from the side (dots: cameras; lines: tracker), offsets of place and turn over time. PNG.
+    """Draw the object's path and the offsets of position and rotation, as PNG.
+
+    From above and from the side (dots: cameras; lines: tracker); offsets over time.
 
     Raises:
         RecordingError: The file cannot be written.

@@ -1,4 +1,6 @@
-"""Where a tracking system lies in the rig and where its device sits on an object, from one motion that both saw.
+"""Registration of a tracking system to the rig and of its device to an object.
+
+From one motion that both saw.
 
 The system's own frame is whatever it is: SteamVR's is y up, libsurvive's z up, both with a heading and an origin of
 their own. The registration takes that up, so none is turned beforehand; but a registration for one is none for the
@@ -86,7 +88,9 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
 
 
 def figures_of(fit: Fit) -> dict[str, float]:
-    """What is left of instants that do not stray, and how sure the result is, by quantity with its unit.
+    """Return the residuals of the inliers and the uncertainty of the result.
+
+    By quantity with its unit.
 
     `position_mm` and `rotation_deg` are roots of the mean square of the whole offset; sigmas are of an object's pose by
     the tracker, wherever it may be within the motion's reach, turned by up to 50 degrees, from the registration alone.
@@ -110,7 +114,10 @@ def figures_of(fit: Fit) -> dict[str, float]:
 
 
 def _reach(fit: Fit) -> tuple[Float, Float]:
-    """Poses (T, 3, 3), (T, 3) at which the result must be known: to all sides of the middle, turned about all axes."""
+    """Return the poses (T, 3, 3), (T, 3) at which the result must be known.
+
+    To all sides of the middle, rotated about all axes.
+    """
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     mean = fit.R[len(fit.R) // 2]
     rotated = np.concatenate([mean[None], rotation_vector_to_matrix(_ROTATION_RAD * ways) @ mean])
@@ -119,7 +126,7 @@ def _reach(fit: Fit) -> tuple[Float, Float]:
 
 
 def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
-    """Refuse what no registration explains, and what the motion does not tell.
+    """Refuse what no registration explains, and what the motion does not constrain.
 
     Raises:
         FitError: With what to do.

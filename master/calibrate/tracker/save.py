@@ -20,7 +20,9 @@ _FIX = "it needs t_ns, position_m and orientation_wxyz, each with object_ and tr
 
 
 def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> None:
-    """Keep a motion: what cameras and tracker said, as an .npz that `read_motion` takes.
+    """Save the cameras' and the tracker's poses of a motion as an .npz file.
+
+    `read_motion` reads it.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -43,7 +45,9 @@ def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[Tr
 
 
 def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], list[TrackerPose]]:
-    """What cameras and tracker said of one object, both on one clock. NaN: not seen, lost.
+    """Read the poses of one object from cameras and tracker, both on one clock.
+
+    NaN: not seen, lost.
 
     Raises:
         RecordingError: The file is missing or broken, or lacks a key; the text says which.
@@ -89,7 +93,9 @@ def _checked(path: Path, arrays: dict[str, Float], who: str) -> int:
 def write_registration(
     out: Path, rig_name: str, rig: RigCalibration, profile: ObjectProfile, found: Registration, source: str
 ) -> tuple[Path, Path]:
-    """Write rigs/<rig_name>.json and objects/<object>.json of the tree `out`; return their paths.
+    """Write rigs/<rig_name>.json and objects/<object>.json of the tree `out`.
+
+    Returns their paths.
 
     The files there are kept but for the new keys: T_rig_tracking; T_object_tracker, stamp_offset_us.
 

@@ -1,4 +1,6 @@
-"""The guided motion with a person: what was seen so far is told every second, and what is still missing.
+"""Guided tracker motion with a person.
+
+Every second reports what was seen so far and what is still missing.
 
 The machine that counts is `Session`; `guide` gives it what comes and talks.
 """
@@ -25,7 +27,10 @@ Receive = Callable[[float], ObjectPose | TrackerPose | None]
 
 
 class Session:
-    """Push machine. Holds all poses of the motion, and when each side was heard last."""
+    """Push machine of the guided motion.
+
+    Holds all poses of the motion, and when each side was last received.
+    """
 
     def __init__(self) -> None:
         """Begin."""
@@ -41,7 +46,10 @@ class Session:
             self.objects.append(message)
 
     def coverage(self) -> Coverage | None:
-        """What there is; None: one side has said nothing yet."""
+        """Return the coverage so far.
+
+        None: one side has sent nothing yet.
+        """
         if not (self.objects and self.tracked):
             return None
         zero_ns = min(self.objects[0].t_ns, self.tracked[0].t_ns)
@@ -54,7 +62,10 @@ class Session:
         return found
 
     def silent(self, now_ns: int) -> str:
-        """Who says nothing just now, and what to look at; empty: both speak."""
+        """Name the side that sends nothing just now, and what to look at.
+
+        Empty: both send.
+        """
         if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
             return (
                 "no tracker is heard: is `phalanx-slave run --tracker` running, and does the master know it?"

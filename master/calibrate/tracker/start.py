@@ -1,4 +1,6 @@
-"""A first registration from nothing: the lag by how fast both turn, the places in closed form, strays outvoted.
+"""Initial registration without a prior.
+
+The lag by how fast both rotate, the positions in closed form, outliers outvoted.
 
 Cameras and tracker sit in frames that nobody knows yet, but by how much the object turned within a fifth of a second
 is the same number in all frames. So the lag is where the two courses of that number differ least.
@@ -39,7 +41,10 @@ class Placed:
 
 
 def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
-    """How much later the tracker's poses hold than they say [s], to some milliseconds; None: they hardly overlap."""
+    """Return how much later the tracker's poses hold than their stamps [s].
+
+    To some milliseconds; None: they hardly overlap.
+    """
     begin = min(seen.t_s[0], tracker.t_s[0]) - MOST_LAG_S
     grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + MOST_LAG_S, _GRID_S)
     ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
@@ -66,7 +71,10 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
 
 
 def _rotated(track: PoseTrack, t_s: Float) -> Float:
-    """By how much it turned about each instant [rad]; NaN where that is not known."""
+    """Return the angle of rotation around each time [rad].
+
+    NaN where that is not known.
+    """
     first, _, known = track.at(t_s - 0.5 * _CHORD_S)
     last, _, also = track.at(t_s + 0.5 * _CHORD_S)
     angle = np.linalg.norm(matrix_to_rotation_vector(first.swapaxes(1, 2) @ last), axis=1)
@@ -74,7 +82,9 @@ def _rotated(track: PoseTrack, t_s: Float) -> Float:
 
 
 def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int = 0) -> Placed | None:
-    """A registration that most instants agree with; None: too few instants are shared.
+    """Return a registration that most epochs agree with.
+
+    None: too few epochs are shared.
 
     Args:
         seen: The object, by the cameras.
@@ -113,7 +123,10 @@ def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bo
 
 
 def predicted(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
-    """The object's turns (N, 3, 3) and places (N, 3) in the rig where the device is at (RB, pB): X B inv(Y)."""
+    """Predict the object's rotations (N, 3, 3) and positions (N, 3) in the rig.
+
+    Where the device is at (RB, pB): X B inv(Y).
+    """
     rotation = X[:3, :3] @ RB @ Y[:3, :3].T
     device = pB @ X[:3, :3].T + X[:3, 3]
     return rotation, device - rotation @ Y[:3, 3]
@@ -141,7 +154,10 @@ def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Floa
 
 
 def _rotation(stacked: Float) -> Float:
-    """The matrix (3, 3) whose columns were stacked, scaled to a determinant of 1 or -1."""
+    """Return the matrix (3, 3) whose columns were stacked.
+
+    Scaled to a determinant of 1 or -1.
+    """
     matrix = stacked.reshape(3, 3).T
     size = float(np.cbrt(np.linalg.det(matrix)))
     return matrix / (abs(size) if abs(size) > 1e-9 else 1.0)

@@ -1,4 +1,7 @@
-"""The poses that cameras and tracking system give of one object, as tracks that can be asked at any instant."""
+"""Pose tracks of one object from cameras and tracking system.
+
+They can be interpolated at any time.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,7 +18,7 @@ _NOT_ITS_OWN = (ObjectSource.TRACKER, ObjectSource.HELD, ObjectSource.NONE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
-    """Poses of one thing in one frame (N), as they were told.
+    """Poses (N) of one thing in one frame, as received.
 
     Attributes:
         t_s: (N,) [s], rising.
@@ -34,7 +37,10 @@ class PoseTrack:
         return len(self.t_s)
 
     def at(self, t_s: Float) -> tuple[Float, Float, Bool]:
-        """Turns (T, 3, 3) and places (T, 3) at times (T,) [s], on the way from pose to pose; (T,) which are known."""
+        """Interpolate rotations (T, 3, 3) and positions (T, 3) at times (T,) [s].
+
+        From pose to pose; also returns (T,) which are known.
+        """
         after, share, known = self._between(t_s)
         before = after - 1
         step = matrix_to_rotation_vector(self.R[before].swapaxes(1, 2) @ self.R[after])
@@ -50,7 +56,10 @@ class PoseTrack:
 
 
 def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
-    """What cameras measured of an object, rig frame; what was held, or told by the tracker itself, is left out."""
+    """Return the track of an object as measured by cameras, rig frame.
+
+    Poses that were held, or reported by the tracker itself, are left out.
+    """
     own = [one for one in poses if one.tracked and one.source not in _NOT_ITS_OWN]
     return _track(
         [one.t_ns - zero_ns for one in own],
@@ -61,7 +70,10 @@ def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
 
 
 def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
-    """Where the device said it was, in its system's frame; where it was lost is a gap."""
+    """Return the track of the device as reported, in its system's frame.
+
+    Where it was lost is a gap.
+    """
     every = list(poses)
     return _track(
         [one.t_ns - zero_ns for one in every],
@@ -72,7 +84,7 @@ def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
 
 
 def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: list[Float]) -> PoseTrack:
-    """Rising in time, each instant once, without what is NaN."""
+    """Build a track that rises in time, each time once, without NaN."""
     times = np.array(t_ns, np.int64)
     order = np.argsort(times, kind="stable")
     places = np.array(place, dtype=np.float64).reshape(-1, 3)
@@ -86,7 +98,9 @@ def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: li
 
 
 def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
-    """Which of the seen poses count: those at whose instants the tracker knows where it is; at most so many, spread.
+    """Select the seen poses at whose epochs the tracker knows where it is.
+
+    At most so many, spread.
 
     Args:
         seen: By the cameras.

@@ -1,1 +1,4 @@
-"""What is measured of a wrist device: laser plane, light of the LEDs, the palm before it, how each finger curls."""
+"""Calibration of a wrist device.
+
+Laser plane, light of the LEDs, the palm before it, how each finger curls.
+"""

@@ -1,4 +1,7 @@
-"""Where a board is before one camera, and how sure that is: the start of all that boards tell of a wrist device."""
+"""Pose of a board before one camera, and its uncertainty.
+
+The start of all that boards measure of a wrist device.
+"""
 
 from dataclasses import dataclass
 
@@ -45,7 +48,9 @@ def lens_of_model(optics: CameraModel) -> Float:
 
 
 def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
-    """The board of one view, at the middle of its triple where both of its ends show the board.
+    """Estimate the board pose of one view.
+
+    At the middle of its strobe cycle where both of its ends show the board.
 
     Raises:
         RecordingError: An image cannot be read.

@@ -1,4 +1,7 @@
-"""The line of each finger's laser point from a guided curl: strays are left out, then the principal axis is taken."""
+"""Line of each finger's laser point, from a guided curl.
+
+Outliers are rejected, then the principal axis is taken.
+"""
 
 from dataclasses import dataclass
 
@@ -78,7 +81,10 @@ def _curl(finger: str, laser_m: Float) -> FingerCurl:
 
 
 def _together(points: Float) -> Bool:
-    """Which points (N,) lie along the line that most of them share; the points of another finger do not."""
+    """Select the points (N,) that lie along the line that most of them share.
+
+    The points of another finger do not.
+    """
     rng = np.random.default_rng(0)
     a, b = points[rng.integers(0, len(points), (2, _PAIRS))]
     way = b - a

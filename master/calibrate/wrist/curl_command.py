@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist curl`: along which line the laser point of each finger moves, and how far."""
+"""`phalanx calibrate wrist curl`: the line of each finger's laser point.
+
+Along which line the point moves, and how far.
+"""
 
 from argparse import Namespace
 
@@ -16,7 +19,10 @@ from master.summary import write_summary
 
 
 def curl(options: Namespace) -> None:
-    """Measure along which line the laser point of each finger moves, from a guided curl of ten seconds."""
+    """Measure along which line the laser point of each finger moves.
+
+    From a guided curl of ten seconds.
+    """
     device = device_of(options.recording, options.rig, options.calibration, options.out)
     seen = read_curled(options.detections, device)
     try:

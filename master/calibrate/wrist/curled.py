@@ -1,4 +1,7 @@
-"""What a slave saw of a hand that curls: laser points on their plane and fingertips, triple by triple."""
+"""Observations of a curling hand by a slave.
+
+Laser points on their plane and fingertips, strobe cycle by strobe cycle.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +17,9 @@ from master.recorded import recorded_cycles
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curled:
-    """T triples, fingers thumb ... little; NaN: not seen.
+    """Observations of T strobe cycles, fingers thumb ... little.
+
+    NaN: not seen.
 
     Attributes:
         laser_m: (T, 5, 3) [m] on the laser plane, camera frame.
@@ -26,7 +31,9 @@ class Curled:
 
 
 def read_curled(detections: Path, device: Device) -> Curled:
-    """The triples of detections_<camera>.npz, put on the plane of the device.
+    """Read the strobe cycles of detections_<camera>.npz.
+
+    The laser points are put on the plane of the device.
 
     Raises:
         RecordingError: The file is missing or broken.

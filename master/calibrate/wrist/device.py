@@ -1,4 +1,7 @@
-"""The wrist device that a calibration is of: its rig and camera, from the recording or from a calib_json tree."""
+"""Wrist device that is calibrated: its rig and camera.
+
+From the recording or from a calib_json tree.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -80,7 +83,9 @@ def print_line(lines: Iterable[str]) -> None:
 
 
 def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: str) -> Path | None:
-    """Write the rig file with what was measured, and say so; None where no tree was given.
+    """Write the rig file with what was measured, and print that.
+
+    None where no tree was given.
 
     Raises:
         CalibrationError: It cannot be written; the old file is untouched.

@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist flat-field`: how the LEDs and the lens of a wrist device light its image."""
+"""`phalanx calibrate wrist flat-field`: the illumination of a wrist device.
+
+How the LEDs and the lens light its image.
+"""
 
 from argparse import Namespace
 from collections.abc import Mapping
@@ -33,7 +36,10 @@ class WhiteSeen:
 
 
 def flat_field(options: Namespace) -> None:
-    """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper."""
+    """Measure the flat field of a wrist device's LEDs.
+
+    From twenty views of a board on matt paper.
+    """
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LED)
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))

@@ -1,4 +1,6 @@
-"""The flat field of a wrist device's LEDs and lens, from the white squares of a board whose pose is known.
+"""Flat field of a wrist device's LEDs and lens.
+
+From the white squares of a board whose pose is known.
 
 White paper at X with normal n gets E = sum over LEDs of cos / r^2; what a pixel says beyond that is the flat field F:
 
@@ -84,7 +86,9 @@ class FlatFit:
 def white_samples(
     led: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel, led_m: Float
 ) -> tuple[Float, Float, Float]:
-    """Samples of the white squares of one view: xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
+    """Return samples of the white squares of one view.
+
+    xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
 
     Args:
         led, ambient: Frames (H, W).
@@ -119,7 +123,10 @@ def white_samples(
 
 
 def _squares(board: Board, placed: BoardPose, optics: CameraModel, led: Image) -> tuple[Float, Int]:
-    """Places (n, 3) on the board within its whole squares, and the numbers of those that are white."""
+    """Return positions (n, 3) within the whole squares of the board.
+
+    On the board; also the numbers of those that are white.
+    """
     rows, columns = grid_shape(board)
     j, i = np.mgrid[0 : rows - 1, 0 : columns - 1] + 0.5
     middles = np.stack([i.ravel(), j.ravel()], axis=1)
@@ -155,7 +162,7 @@ def gathered(views: Sequence[tuple[Float, Float, Float]]) -> WhiteSamples:
 
 
 def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
-    """The polynomial that the samples tell.
+    """Fit the flat-field polynomial to the samples.
 
     Args:
         samples: Of five views or more.
@@ -193,7 +200,10 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
 
 
 def _law(xy: Float, light: Float) -> Float:
-    """Coefficients of the logarithm of k F by least squares; samples that stray are weighed down (Huber)."""
+    """Fit the coefficients of the logarithm of k F by least squares.
+
+    Outlying samples are down-weighted (Huber).
+    """
     terms, wanted = _law_terms(xy), np.log(light)
     prior_information = np.diag(
         np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)]
@@ -215,7 +225,10 @@ def _law_terms(xy: Float) -> Float:
 
 
 def _polynomial(law: Float, grid: Float) -> Float:
-    """Coefficients (T,) of k F as a polynomial, from the law at `grid` (G, 2); dark corners weigh less."""
+    """Return the coefficients (T,) of k F as a polynomial.
+
+    From the law at `grid` (G, 2); dark corners weigh less.
+    """
     wanted = np.exp(_law_terms(grid) @ law)
     root = 1.0 / np.sqrt(wanted)
     terms = terms_of(grid, _DEGREE) * root[:, None]

@@ -1,4 +1,6 @@
-"""The guided motion of a subject, taken apart: flat hand, knuckles bent with straight fingers, flat hand, fist.
+"""Segmentation of a subject's guided motion.
+
+Flat hand, knuckles flexed with straight fingers, flat hand, fist.
 
 How far the laser points lie tells how open the hand is, whatever else is still unknown: they are farthest on a flat
 hand and come nearer with every joint that bends. So a motion falls into its openings and what lies between them, and
@@ -28,7 +30,7 @@ _EDGE = 0.02  # share of strays beyond the ends of a way
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guided:
-    """The triples that count (T), in order.
+    """Strobe cycles that count (T), in order.
 
     Attributes:
         row: (T,) their numbers.
@@ -40,7 +42,9 @@ class Guided:
 
 
 def guided(along_m: Float) -> Guided:
-    """Choose triples by how far the laser points (T, 4) of index ... little lie [m]; NaN: not seen.
+    """Choose strobe cycles by how far the laser points lie [m].
+
+    Laser points (T, 4) of index ... little; NaN: not seen.
 
     Raises:
         FitError: Fewer than three fingers bent, or the hand bent fewer than two times between openings.
@@ -62,7 +66,9 @@ def guided(along_m: Float) -> Guided:
 
 
 def openness(along_m: Float) -> Float:
-    """Share (T,) of their ways that the fingers' laser points have gone from the nearest to the farthest.
+    """Return the openness (T,) of the hand as a share of the laser points' ways.
+
+    The share that the points have gone from the nearest to the farthest.
 
     Raises:
         FitError: Fewer than three fingers are seen to bend.
@@ -86,7 +92,10 @@ def openness(along_m: Float) -> Float:
 
 
 def _bends(open_share: Float, flat: Bool) -> list[Int]:
-    """The triples of each bend: what lies between openings and goes at least half of the way."""
+    """Return the strobe cycles of each flexion.
+
+    What lies between openings and goes at least half of the way.
+    """
     bends: list[Int] = []
     known = np.flatnonzero(np.isfinite(open_share))
     edges = np.flatnonzero(np.diff(np.r_[True, flat[known], True]))
@@ -98,7 +107,10 @@ def _bends(open_share: Float, flat: Bool) -> list[Int]:
 
 
 def _flattest(rows: Int, open_share: Float) -> Int:
-    """Some of the more open half of the rows: a hand stays flat for longer than it passes by."""
+    """Pick some of the more open half of the rows.
+
+    A hand stays flat for longer than it passes by.
+    """
     half = rows[np.argsort(open_share[rows])][len(rows) // 2 :]
     return np.unique(half[np.linspace(0.0, len(half) - 1.0, _PER_FLAT).astype(np.int64)])
 

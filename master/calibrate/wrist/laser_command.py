@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist laser-plane`: the laser's plane in the wrist camera's frame, from views of a board."""
+"""`phalanx calibrate wrist laser-plane`: the laser plane in the camera frame.
+
+The frame is that of the wrist camera; from views of a board.
+"""
 
 from argparse import Namespace
 from collections.abc import Mapping
@@ -32,7 +35,10 @@ class LinesSeen:
 
 
 def laser_plane(options: Namespace) -> None:
-    """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses."""
+    """Measure the plane of a wrist device's laser.
+
+    From ten views of a board that the laser crosses.
+    """
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
     seen = lines_of(

@@ -1,4 +1,6 @@
-"""The laser's line across a board, to a fraction of a pixel: sought in the board's own plane, where it is straight.
+"""Laser line across a board, to a fraction of a pixel.
+
+Sought in the board's own plane, where it is straight.
 
 The difference (laser - ambient) is laid out flat by the pose of the board. Only what lies within the board's squares
 counts, so that a line on the table beside it cannot. The brightest straight line is found by consensus; then, in steps
@@ -81,7 +83,10 @@ def line_on_board(
 def _laid_flat(
     difference: Grey, T: Float, board: Board, pixel_m: float, optics: CameraModel
 ) -> tuple[Float, Float, float]:
-    """The board laid flat: values (n,), their places (n, 2) [m] on the board, and the side of a texel [m]."""
+    """Rectify the image onto the board's plane.
+
+    Values (n,), their places (n, 2) [m] on the board, and the side of a texel [m].
+    """
     rows, columns = grid_shape(board)
     side = board.square_m
     texel = max(_TEXEL_PX * pixel_m, max(columns + 1, rows + 1) * side / _MOST_TEXELS)
@@ -95,7 +100,10 @@ def _laid_flat(
 
 
 def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> tuple[Float, Float]:
-    """Point (2,) and direction (2,) of the straight line that gathers most light, by consensus of pairs."""
+    """Find the straight line that gathers most light, by consensus of pairs.
+
+    Returns its point (2,) and direction (2,).
+    """
     bright = values > max(_NOISE_TIMES * noise, 0.3 * float(np.percentile(values, 99.8)))
     if bright.sum() < _MIN_PROFILES:
         raise FitError("no laser line on the board: let the line cross it, in a room that is not too bright")
@@ -119,7 +127,10 @@ def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Centred:
-    """A line on the board from its centred profiles: point and direction (2,), points (n, 3) [m], how sure."""
+    """Line on the board fitted to its centred profiles.
+
+    Point and direction (2,), points (n, 3) [m], and its uncertainty.
+    """
 
     point: Float
     along: Float
@@ -138,7 +149,10 @@ def _profiles(
     board: Board,
     optics: CameraModel,
 ) -> _Centred:
-    """Centre the line in its profiles, a pixel apart, and lay a straight line through the centres."""
+    """Centre the line in its profiles and fit a straight line through the centres.
+
+    Profiles are a pixel apart.
+    """
     rows, columns = grid_shape(board)
     side = board.square_m
     across = np.array([-along[1], along[0]])
@@ -193,7 +207,10 @@ def _profiles(
 
 
 def _sampled(image: Grey, uv: Float) -> Float:
-    """Values (...) between pixels of a float image (H, W) at uv (..., 2); NaN outside."""
+    """Interpolate values (...) of a float image (H, W) at uv (..., 2).
+
+    NaN outside.
+    """
     height, width = image.shape
     u, v = np.moveaxis(uv.astype(np.float32), -1, 0)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)

@@ -1,4 +1,7 @@
-"""Strobed views of a thing held still: the frames of one moment by what lit them, from a recording or from images."""
+"""Strobed views of a thing held still.
+
+The frames of one moment by what lit them, from a recording or from images.
+"""
 
 import re
 from collections.abc import Callable, Mapping
@@ -42,7 +45,9 @@ class LitView:
 
 
 def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView, ...]:
-    """Views that have an ambient frame and one lit by `needed`, evenly over the source, at most 60.
+    """Return views with an ambient frame and one lit by `needed`.
+
+    Evenly over the source, at most 60.
 
     Args:
         folder: A recording whose frames.csv says what lit each frame, or images named VIEW_ambient.png, VIEW_laser.png,
@@ -67,7 +72,10 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
 
 
 def _recorded(folder: Path, camera: str) -> list[LitView]:
-    """One view for each ambient frame, with the frames lit otherwise that follow within a triple."""
+    """Return one view for each ambient frame.
+
+    With the frames lit otherwise that follow within a strobe cycle.
+    """
     rows = open_recording(folder).frames_of(camera)
     if not rows:
         raise RecordingError(f"{folder}: camera {camera!r} has no frame")
@@ -97,7 +105,10 @@ def _named(folder: Path) -> list[LitView]:
 
 
 def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
-    """Lines for a person: each reason once, after the views (name -> reason) it is of; of many the first."""
+    """Format the refused views (name -> reason) as lines grouped by reason.
+
+    Lines for a person: each reason once, after the views it is of; of many views the first.
+    """
     views: dict[str, list[str]] = {}
     for name, reason in refused.items():
         views.setdefault(reason, []).append(name)

@@ -31,7 +31,10 @@ _ROTATION_LIMIT_RAD, _SHIFT_LIMIT_M = np.radians(1.0), 1e-3  # how sure the pose
 
 @dataclass(frozen=True, slots=True)
 class BoardOffset:
-    """How the board lies, see above. `thumb_side`: +1 where the thumb is at +x of the palm (right hand), else -1."""
+    """Position of the board on the palm, as the module describes.
+
+    `thumb_side`: +1 where the thumb is at +x of the palm (right hand), else -1.
+    """
 
     wrist_m: float
     aside_m: float
@@ -115,7 +118,10 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
 
 
 def _upright(T_camera_board: Float, board: Board) -> Float:
-    """The same board with its first row towards the fingers, that is, away from the camera."""
+    """Return the same board with its first row towards the fingers.
+
+    That is, away from the camera.
+    """
     if T_camera_board[2, 1] <= 0.0:  # board y points from the fingers to the wrist
         return T_camera_board
     rows, columns = grid_shape(board)

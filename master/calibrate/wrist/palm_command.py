@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist palm`: where the palm is before the wrist camera, from a board that lies on it."""
+"""`phalanx calibrate wrist palm`: the palm pose before the wrist camera.
+
+From a board that lies on the palm.
+"""
 
 from argparse import Namespace
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Pictures of what was measured of a wrist device: lines on boards, light of the LEDs, curls of the fingers."""
+"""Plots of a wrist device's calibration.
+
+Lines on boards, light of the LEDs, curls of the fingers.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +24,9 @@ BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
 def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
-    """Lines in the image; from above, in the plane; and each view's distance from the plane. PNG.
+    """Draw the laser lines and each view's distance from the plane, as PNG.
+
+    Lines in the image; from above, in the plane.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -50,7 +55,9 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
 
 
 def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
-    """The flat field over the image, where white paper was seen, and what is left of it. PNG.
+    """Draw the flat field over the image and its residuals, as PNG.
+
+    Shown where white paper was seen.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -88,7 +95,9 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
 
 
 def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
-    """Laser points of the fingers from above, and their lines from straight (o) to bent (x). PNG.
+    """Draw the fingers' laser points from above, and their lines, as PNG.
+
+    Lines from straight (o) to bent (x).
 
     Raises:
         RecordingError: The file cannot be written.

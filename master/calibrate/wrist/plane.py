@@ -1,4 +1,6 @@
-"""The laser's plane through its lines on boards: weighted least squares over views, wrong ones left out.
+"""Laser plane through its lines on boards.
+
+Weighted least squares over views, wrong ones rejected.
 
 Every view gives one straight line in space; how far it lies off a plane is two numbers (two points of it with the
 spread of all its points). Their covariance is that of the board's pose, which all points of a view share, and of the
@@ -94,7 +96,10 @@ class PlaneFit:
 
     @property
     def normal_sigma_rad(self) -> float:
-        """Standard deviation of the normal in the direction in which it is least sure [rad]."""
+        """Return the largest standard deviation of the normal [rad].
+
+        In the direction in which it is least certain.
+        """
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     @property
@@ -138,7 +143,10 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
 
 
 def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
-    """Normal and offset of the plane through two of the lines with which most of the others agree."""
+    """Return normal and offset of the plane with the largest consensus.
+
+    Through two of the lines; most of the others agree with it.
+    """
     pairs: list[tuple[int, int]] = list(combinations(range(len(views)), 2))
     if len(pairs) > _MOST_PAIRS:
         chosen = np.random.default_rng(0).choice(len(pairs), _MOST_PAIRS, replace=False)
@@ -185,7 +193,10 @@ def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float
 
 
 def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, float, Float]:
-    """Normal, offset and their covariance (4, 4), by Gauss and Newton on the turn of the normal and the offset."""
+    """Return normal, offset and their covariance (4, 4).
+
+    By Gauss-Newton on the rotation of the normal and the offset.
+    """
     middle = np.concatenate([view.ends_m for view in views]).mean(axis=0)
     level = float(normal @ middle)
     tangents, cov3 = np.eye(3)[:, :2], np.eye(3)
@@ -219,7 +230,7 @@ def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, flo
 
 
 def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
-    """Refuse what does not tell the plane as well as it is needed.
+    """Refuse data that do not determine the plane as well as needed.
 
     Raises:
         FitError: All points on one line, or too uncertain.

@@ -70,7 +70,10 @@ class Subject:
 
     @property
     def knuckle_sigma_m(self) -> Float:
-        """(4, 3) of the knuckles in the camera's frame [m]: of palm and hand file together."""
+        """Return the standard deviations (4, 3) of the knuckles in the camera frame [m].
+
+        Of palm and hand file together.
+        """
         by_x = self.model.knuckle_derivatives(self.fit.x)
         return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
 
@@ -82,7 +85,9 @@ def calibrate_subject(
     hand: HandProfile,
     source: str = "a guided motion",
 ) -> Subject:
-    """Fit the subject of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
+    """Fit the subject of a wrist device to one guided motion.
+
+    Open hand, straight fingers bent at the knuckles, fist.
 
     Args:
         cycles: What the slave saw, in order.
@@ -114,7 +119,9 @@ def calibrate_subject(
 
 
 def _pose_sigma(rig: RigCalibration) -> Float:
-    """(6,) how far the palm's pose in the rig file may be off [rad, m]: turned about the wrist joint, and shifted.
+    """Return the prior uncertainty (6,) of the palm pose in the rig file [rad, m].
+
+    Rotated about the wrist joint, and shifted.
 
     A rig whose maker knows how differently it is worn says so in the residual of the pose's provenance.
     """
@@ -130,7 +137,10 @@ def _pose_sigma(rig: RigCalibration) -> Float:
 
 
 def _length_sigma(hand: HandProfile) -> Float:
-    """(4,) how far the lengths of the fingers may be off, shares: less where markers measured them."""
+    """Return the prior uncertainty (4,) of the finger lengths, as shares.
+
+    Less where markers measured them.
+    """
     how = [hand.provenance.get(name) for name in _NAMES]
     return np.array(
         [
@@ -162,7 +172,7 @@ def _check(fit: Fit, seen: ImageObservations) -> None:
 
 
 def _check_likely(fit: Fit) -> None:
-    """Refuse what neither skin nor belief explains.
+    """Refuse fits that neither skin nor prior explains.
 
     Raises:
         FitError: With what is most unlikely.
@@ -198,7 +208,10 @@ def _name(unknown: int) -> str:
 
 
 def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
-    """Before and after, for a person; knuckles across (to the thumb), up (to the back) and along the hand."""
+    """Format the values before and after the fit for a person.
+
+    Knuckles across (to the thumb), up (to the back) and along the hand.
+    """
     new, sigma = Unknown.of(fit.x), Unknown.of(np.sqrt(np.diag(fit.covariance)))
     rotation, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)

@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist subject`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
+"""`phalanx calibrate wrist subject`: palm pose, knuckles and fingers.
+
+Of the subject who wears the device, from a guided motion.
+"""
 
 from argparse import Namespace
 from pathlib import Path
@@ -46,7 +49,10 @@ def subject(options: Namespace) -> None:
 
 
 def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
-    """The rig's hand file: beside the rig in the tree of the results if that has it, as the rig itself."""
+    """Return the path of the rig's hand file.
+
+    Beside the rig in the tree of the results if that has it, as the rig itself.
+    """
     trees = [calibration] if out is None else [out, calibration]
     paths = [tree / "hands" / f"{name}.json" for tree in trees]
     return next((path for path in paths if path.exists()), paths[-1])

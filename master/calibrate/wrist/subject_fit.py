@@ -1,4 +1,6 @@
-"""The most probable subject of a device, given what was seen of a guided motion: one least-squares problem.
+"""Most probable subject of a device as one least-squares problem.
+
+Given what was seen of a guided motion.
 
 Laser point and tip give four numbers of a finger in a triple, its angles are three unknowns; so what is known of the
 subject comes from habits as well, and each is believed as far as people keep it. A flat hand is flat and a finger that
@@ -46,7 +48,9 @@ _KNUCKLES, _FIST = 0, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservations:
-    """Triples (T) of index ... little; NaN: not seen.
+    """Image observations of strobe cycles (T), fingers index ... little.
+
+    NaN: not seen.
 
     Attributes:
         laser_m: (T, 4, 2) on the plane, across and along [m].
@@ -91,13 +95,19 @@ class Fit:
 
     @property
     def prior_rms(self) -> float:
-        """Rms change in standard deviations of what was believed, by as many numbers as the motion told."""
+        """Return the rms change from the prior in standard deviations.
+
+        Over as many numbers as the motion determined.
+        """
         measured = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
         return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / measured))
 
 
 def prior_sigma(pose: Float, length: Float) -> Float:
-    """What is believed of a subject (26,), with the palm's pose (6,) [rad, m] and the lengths of fingers (4,)."""
+    """Return the prior standard deviations of a subject (26,).
+
+    With the palm's pose (6,) [rad, m] and the lengths of fingers (4,).
+    """
     return np.r_[pose, np.full(12, _KNUCKLE_M), np.full(4, SPREAD), length]
 
 
@@ -118,7 +128,10 @@ def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Guess:
-    """Angles (T, 4, 3), which triples (T,) are of a fist, and which sightings (T, 4) count."""
+    """Initial guess of angles, fists and inliers.
+
+    Angles (T, 4, 3), which strobe cycles (T,) are of a fist, and which observations (T, 4) count.
+    """
 
     angles: Float
     fist: Bool
@@ -126,7 +139,10 @@ class _Guess:
 
 
 class _Problem:
-    """Residuals, habits and steps. What it holds was prepared by the constructor."""
+    """Residuals, posture priors and steps of the subject fit.
+
+    Its state was prepared by the constructor.
+    """
 
     def __init__(self, model: SubjectModel, seen: ImageObservations, sigma: Float) -> None:
         self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
@@ -138,7 +154,10 @@ class _Problem:
         self._share = np.minimum(_INDEPENDENT / count, 1.0)  # (T,) what a triple counts
 
     def guessed(self, x: Float) -> "_Guess":
-        """Angles by habit alone; a bend is that of a fist if it suits a fist better."""
+        """Guess the angles from joint couplings alone.
+
+        A flexion is that of a fist if it suits a fist better.
+        """
         grid = np.zeros((2, len(_GRID_RAD), 4, LOCAL))
         grid[_KNUCKLES, ..., MCP] = grid[_FIST, ..., PIP] = _GRID_RAD[:, None]
         grid[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
@@ -196,13 +215,19 @@ class _Problem:
         )  # fmt: skip
 
     def _off(self, x: Float, angles: Float) -> Float:
-        """Seen minus fitted (T, 4, 4) in standard deviations; NaN: not seen. A finger that the laser misses is far."""
+        """Return seen minus fitted (T, 4, 4) in standard deviations.
+
+        NaN: not seen. A finger that the laser misses is far.
+        """
         shown = self._model(x, angles)
         off = (self._data - shown) / self._sigma
         return np.where(np.isnan(shown) & np.isfinite(self._data), _FARTHEST, off)
 
     def _prior_rows(self, guess: _Guess) -> tuple[Float, Float]:
-        """Residuals (T, 4, 3) of what fingers do, and their derivatives by the angles (T, 4, 3, 3)."""
+        """Return the residuals (T, 4, 3) of the posture priors and their derivatives.
+
+        By the angles (T, 4, 3, 3).
+        """
         angles, fist, flat = guess.angles, guess.fist, self._bend == FLAT
         ratio = np.broadcast_to(self._model.mcp_per_pip, angles.shape[:2])
         by = np.zeros((*angles.shape[:2], LOCAL, LOCAL))
@@ -222,7 +247,7 @@ class _Problem:
         return float((self._share * (data + grid)).sum() + ((x / self.prior_sigma) ** 2).sum())
 
     def _normal(self, x: Float, guess: _Guess) -> "_Normal":
-        """Normal equations about a place, strays weighed down."""
+        """Build the normal equations at a point, with outliers down-weighted."""
         off = np.nan_to_num(self._off(x, guess.angles))
         pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)], axis=-1)
         root = np.repeat((1.0 + pairs / _STRAYS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
@@ -246,7 +271,9 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations of unknowns that all triples share (26) and angles that belong to one finger in one (T, 4, 3).
+    """Normal equations of shared unknowns and of each finger's angles.
+
+    Unknowns that all strobe cycles share (26), and angles that belong to one finger in one strobe cycle (T, 4, 3).
 
     Attributes:
         own: (T, 4, 3, 3) information of the angles.
@@ -263,7 +290,11 @@ class _Normal:
     shared_pull: Float
 
     def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
-        """Information (26, 26) and pull (26,) without the angles, and what gives their steps from that of the rest."""
+        """Eliminate the angles and return the reduced normal equations.
+
+        Information (26, 26) and gradient (26,) without the angles, and what gives the angles' steps from the step of
+        the rest.
+        """
         eye = damping * np.eye(LOCAL)
         own = self.own * (1.0 + eye) + 1e-9 * np.eye(LOCAL)
         by_shared = _solve(own, self.mixed)
@@ -281,7 +312,9 @@ class _Normal:
 
 
 def fists_of(cost: Float) -> Bool:
-    """Which bends are fists, by what either kind costs (B, 2). The kind is told by tips, of which some are false.
+    """Classify flexions as fists by the cost of either kind (B, 2).
+
+    Tips distinguish the kinds, and some tips are false.
 
     A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.
     """

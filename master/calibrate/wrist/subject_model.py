@@ -1,4 +1,6 @@
-"""What a wrist device sees of a hand of which little is known: the forward function of a subject, and its derivatives.
+"""Measurement model of a wrist device for a subject, and its derivatives.
+
+For a hand of which little is known.
 
 Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
 and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
@@ -53,7 +55,10 @@ class Unknown:
 
 
 class SubjectModel:
-    """Laser points and tips of one device and hand by unknowns. What it holds was prepared by the constructor."""
+    """Laser points and tips of one device and hand as a function of the unknowns.
+
+    Its state was prepared by the constructor.
+    """
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
@@ -92,7 +97,9 @@ class SubjectModel:
         return out
 
     def __call__(self, x: Float, angles: Float) -> Float:
-        """Laser point (across, along) [m] and tip [px] of every finger, (T, 4, 4), NaN where the laser misses.
+        """Predict laser point (across, along) [m] and tip [px] of every finger.
+
+        (T, 4, 4), NaN where the laser misses.
 
         Args:
             x: (26,) as of `Unknown`.
@@ -101,7 +108,10 @@ class SubjectModel:
         return self._seen([self._surface_of(Unknown.of(x), angles)])[0]
 
     def derivatives(self, x: Float, angles: Float) -> tuple[Float, Float]:
-        """How that moves with what is unknown, (T, 4, 4, 26), and with the angles, (T, 4, 4, 3); 0 where not known."""
+        """Return the derivatives by the unknowns and by the angles.
+
+        (T, 4, 4, 26) by the unknowns, (T, 4, 4, 3) by the angles; 0 where not known.
+        """
         steps = np.r_[np.full(3, _ROTATION_STEP), np.full(3, _SHIFT_STEP), np.full(2, _SHARE_STEP)]
         ways = np.zeros((8, UNKNOWN))
         ways[:6, :6] = np.eye(6)
@@ -125,7 +135,10 @@ class SubjectModel:
         return out, np.moveaxis(per_pip[8:], 0, -1)
 
     def _surface_of(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
-        """Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m], camera frame."""
+        """Return the finger surface spheres and the tips in the camera frame.
+
+        Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m].
+        """
         whole = np.zeros((len(angles), 5, 4))
         whole[:, FINGERS, :3] = angles
         whole[:, FINGERS, DIP] = self.dip_per_pip * angles[..., 2]

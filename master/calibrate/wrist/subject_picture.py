@@ -1,4 +1,7 @@
-"""Picture of a guided motion: what was seen of it and what was fitted, from above and in the image."""
+"""Plot of a guided motion: seen and fitted points.
+
+From above and in the image.
+"""
 
 from pathlib import Path
 
@@ -10,7 +13,9 @@ from master.calibrate.wrist.subject import Subject
 
 
 def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
-    """Laser points on their plane, fingertips and knuckles in the image, seen (dots) and fitted (rings). PNG.
+    """Draw laser points, fingertips and knuckles, seen and fitted, as PNG.
+
+    Laser points on their plane, fingertips and knuckles in the image; seen (dots) and fitted (rings).
 
     Raises:
         RecordingError: The file cannot be written.

@@ -1,1 +1,4 @@
-"""The pages of the console, one file each: `build(state)` fills the shell of `master.console.app`."""
+"""Pages of the console, one file each.
+
+`build(state)` fills the shell of `master.console.app`.
+"""

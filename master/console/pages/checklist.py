@@ -1,4 +1,7 @@
-"""The page Checklist: what is not as it should be, each with what to do; or that all is well."""
+"""Page Checklist: what is not as it should be, each with what to do.
+
+Otherwise it states that all is well.
+"""
 
 from nicegui import ui
 

@@ -1,4 +1,4 @@
-"""The page Gestures: what each hand says now, what was said last, and poses of one's own."""
+"""Page Gestures: current gestures of each hand, recent ones, and custom poses."""
 
 import asyncio
 import math
@@ -48,7 +48,10 @@ def _now(state: ConsoleState) -> None:
 
 
 def hand_html(hand: str, now: dict[str, Gesture]) -> str:
-    """What one hand says: its pose as words, a pinch as a bar, a dial as a gauge."""
+    """Return the gestures of one hand as HTML.
+
+    A pose is shown as words, a pinch as a bar, a dial as a gauge.
+    """
     pose, pinch, dial, point = (now.get(kind) for kind in ("pose", "pinch", "dial", "point"))
     parts = [f"<h2>{escape(readable(hand))}</h2>"]
     name = "no pose" if pose is None else readable(pose.name)
@@ -74,7 +77,7 @@ def _bar(title: str, words: str, share: float, of: str) -> str:
 
 
 def _dial(angle_rad: float | None) -> str:
-    """A gauge whose needle has turned clockwise by the angle."""
+    """Draw a gauge whose needle is rotated clockwise by the angle."""
     known = angle_rad is not None and not math.isnan(angle_rad)
     degrees = math.degrees(angle_rad) if angle_rad is not None and known else 0.0
     words = f"{degrees:+.0f}°" if known else "none"
@@ -114,7 +117,10 @@ def _phase(gesture: Gesture) -> str:
 
 
 def _poses(state: ConsoleState) -> None:
-    """Poses of one's own: taught and forgotten by the same commands as in a terminal."""
+    """Build the controls for the user's own poses.
+
+    They are recorded and deleted by the same commands as in a terminal.
+    """
     with ui.element("section").classes("panel wide").props('aria-label="Poses of your own"'):
         ui.label("Poses of your own").classes("panel-title")
         ui.label(

@@ -1,4 +1,7 @@
-"""The page Live: what the cameras see, the hand in 3D, how much of it is known, and what it does."""
+"""Page Live: camera pictures, the hand in 3D and its tracking state.
+
+It shows how much of the hand is known, and what it does.
+"""
 
 from html import escape
 
@@ -85,7 +88,10 @@ def _camera(state: ConsoleState, camera: str) -> None:
 
 
 def _hands(state: ConsoleState) -> None:
-    """Text, rebuilt as one piece of HTML: a screen reader and a copy find plain words."""
+    """Build the text on the hands as one piece of HTML.
+
+    A screen reader and a copy thus find plain words.
+    """
     text = ui.html("", sanitize=False).classes("words")
 
     def update() -> None:
@@ -106,7 +112,10 @@ def _hands(state: ConsoleState) -> None:
 
 
 def joints(pose: HandPose) -> str:
-    """The 26 joints as dots, a row a finger, as HTML; each dot says its joint and state."""
+    """Return the 26 joints as HTML dots, one row per finger.
+
+    Each dot states its joint and state.
+    """
     rows: dict[str, list[str]] = {}
     for name, state, tracked in joint_states(pose):
         finger = name.split("-")[0]

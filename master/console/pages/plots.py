@@ -1,4 +1,7 @@
-"""The page Plots: the last minute of latency, rates, loss, clocks and temperature, drawn anew once a second."""
+"""Page Plots: the last minute of latency, rates, loss, clocks and temperature.
+
+It is redrawn once a second.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +18,10 @@ _COLOURS = ("#2f81f7", "#e3702f", "#2da44e", "#bf4b8a", "#9a6700", "#0e9aa7", "#
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One plot: its title with the unit, and what it draws: whole names, or beginnings of names that end with a dot."""
+    """One plot: its title with the unit, and the names of its series.
+
+    A series is a whole name, or the beginning of names that ends with a dot.
+    """
 
     title: str
     series: tuple[str, ...]

@@ -1,4 +1,7 @@
-"""The page Tune: settings and colours of each camera, and the filter of each rig; every change acts at once."""
+"""Page Tune: settings and colours of each camera, and the filter of each rig.
+
+Every change acts at once.
+"""
 
 from nicegui import ui
 

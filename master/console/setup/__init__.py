@@ -1,1 +1,4 @@
-"""Set-up by a page: from an empty calibration folder to a tracked hand, each calibration as a wizard."""
+"""Set-up by a page, from an empty calibration folder to a tracked hand.
+
+Each calibration is a wizard.
+"""

@@ -1,4 +1,7 @@
-"""Colours by a click: which pixel of the whole frame was meant, what the camera says it took, and keeping it."""
+"""Marker colours set by a click.
+
+It finds which pixel of the whole frame was meant, reads which colour the camera took, and keeps it.
+"""
 
 import json
 from collections.abc import Mapping
@@ -14,19 +17,25 @@ from master.console.setup.files import keep_old
 def pixel_of(
     camera: CameraCalibration, preview_px: tuple[int, int], at_px: tuple[float, float]
 ) -> tuple[float, float]:
-    """The pixel of the whole frame under a point of its preview: centres of pixels are whole numbers in both."""
+    """Return the full-frame pixel under a point of the camera's preview.
+
+    Centres of pixels are whole numbers in both.
+    """
     scale_u, scale_v = camera.width_px / preview_px[0], camera.height_px / preview_px[1]
     u, v = (at_px[0] + 0.5) * scale_u - 0.5, (at_px[1] + 0.5) * scale_v - 0.5
     return min(max(u, 0.0), camera.width_px - 1.0), min(max(v, 0.0), camera.height_px - 1.0)
 
 
 def pick(camera: str, marker: str, uv: tuple[float, float]) -> Command:
-    """The command that takes a marker's colour from about a pixel of the newest frame."""
+    """Return the command that samples a marker's colour around a pixel.
+
+    The pixel is one of the newest frame.
+    """
     return Command(camera, "pick", json.dumps({"marker": marker, "uv": [round(uv[0], 1), round(uv[1], 1)]}))
 
 
 def ranges_of(health: Health) -> dict[str, HsvRange]:
-    """The colours in use that an answer of a camera tells."""
+    """Return the colours in use that a camera's answer reports."""
     found: dict[str, HsvRange] = {}
     for key in health.metrics:
         if key.startswith("marker.") and key.endswith(".h_low"):
@@ -40,7 +49,9 @@ def ranges_of(health: Health) -> dict[str, HsvRange]:
 
 
 def keep_colours(tree: Path, camera: str, ranges: Mapping[str, HsvRange]) -> Path:
-    """Write colours that a camera of another machine told into its file here; lens and settings stay.
+    """Write the colours reported by a camera of another machine into its file here.
+
+    Lens and settings stay.
 
     Raises:
         CalibrationError: The file is missing, broken, or cannot be written.

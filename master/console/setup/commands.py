@@ -1,4 +1,7 @@
-"""Command lines of the processes that the set-up starts or tells to start: cameras, masters, calibrations."""
+"""Command lines of the processes that the set-up starts or asks to be started.
+
+They are cameras, masters and calibrations.
+"""
 
 import os
 import shlex
@@ -47,8 +50,10 @@ class Commands:
         return self.settings.calibration.resolve()
 
     def environment(self) -> dict[str, str]:
-        """What they need and what may not stand on a command line: the rig key. Where that is a keys folder's they
-        inherit where it is, and each camera has a certificate and a secret in it from here on.
+        """Return the environment variables of the processes, with the rig key.
+
+        The rig key may not stand on a command line. Where the key is a keys folder's, the processes inherit where
+        that folder is, and each camera has a certificate and a secret in it from here on.
 
         Raises:
             PhalanxError: There is no key.
@@ -85,7 +90,10 @@ class Commands:
         return [*line, *self._driver(camera, view, epoch_ns), "--seconds", f"{seconds:g}", "-o", str(out)]
 
     def pi(self, camera: CameraPlan) -> tuple[str, str]:
-        """What a person runs: here, to bring the files to the Pi, and there, to start its slave."""
+        """Return the two commands for a camera on a Pi.
+
+        A person runs one here, to bring the files to the Pi, and one there, to start its slave.
+        """
         host = camera.device or f"{camera.name}.local"
         there = "calib_json"
         copy = f"rsync -a {shlex.quote(f'{self.tree}/')} {shlex.quote(host)}:{there}/"
@@ -116,7 +124,9 @@ class Commands:
         return [sys.executable, "-m", "master", "run", *self._link()]
 
     def calibrate(self, command: str, values: Mapping[str, Value], work: Path, *, live: bool) -> list[str]:
-        """A calibration that writes its results below `work`, with the form's `values` and what the page knows.
+        """Return the command line of a calibration that writes below `work`.
+
+        It uses the form's `values` and what the page knows.
 
         Raises:
             CalibrationError: A field is empty that is needed, or a number is none.
@@ -169,13 +179,19 @@ class Commands:
 
 
 def epoch_of(view: str) -> int:
-    """When the scene of a view begins, this machine's monotonic clock [ns]: never, for a hand that is held still."""
+    """Return when the scene of a view begins, on this machine's monotonic clock [ns].
+
+    A hand that is held still never begins.
+    """
     later_s = _NEVER_S if view == "still" else _SOON_S
     return time.monotonic_ns() + round(1e9 * later_s)
 
 
 def out_of(command: str, work: Path) -> Path:
-    """Where a command is told to write: a page to print, pictures, or a tree of calibration files."""
+    """Return where a command writes its output.
+
+    The output is a page to print, pictures, or a tree of calibration files.
+    """
     return {
         "board": work / "board.pdf",
         "cube": work / "box.pdf",
@@ -184,7 +200,9 @@ def out_of(command: str, work: Path) -> Path:
 
 
 def world_of_project() -> Path:
-    """The calib_json tree that comes with the source, or that of the working directory: a simulated world.
+    """Return the calib_json tree used as the simulated world.
+
+    It is the one that comes with the source, or that of the working directory.
 
     Raises:
         CalibrationError: Neither is there.

@@ -1,4 +1,7 @@
-"""Form fields of a calibration, read off the command's own options, so that page and command line cannot differ."""
+"""Form fields of a calibration, read from the command's own options.
+
+Thus page and command line cannot differ.
+"""
 
 from argparse import SUPPRESS, Action, ArgumentParser
 from collections.abc import Mapping
@@ -52,7 +55,9 @@ def fields_of(command: Command) -> tuple[Field, ...]:
 
 
 def arguments_of(fields: tuple[Field, ...], values: Mapping[str, Value]) -> list[str]:
-    """The command line that says `values` (by field name); what is at its default, or empty, is left out.
+    """Return the command line for `values` (by field name).
+
+    Fields that are at their default, or empty, are omitted.
 
     Raises:
         CalibrationError: A required field is empty, or a number is none or out of range.

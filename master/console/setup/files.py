@@ -1,4 +1,6 @@
-"""Files that the set-up page writes: its own plan, cameras, rig, hand and key. An old file is kept beside the tree's.
+"""Files that the set-up page writes: its own plan, cameras, rig, hand and key.
+
+An old file is kept beside the tree's.
 
 What the page was told and no calibration file has a place for (which camera is simulated, which is a USB camera here)
 stands in console/setup.json of the same tree, so that the set-up goes on where it was left.
@@ -38,8 +40,10 @@ WORLDS_EIGHT = {2: "desk-back3"}
 
 
 class CameraPlan(Part, frozen=True):
-    """One camera as the page was told: what it is, where (device of a USB camera, host of a Pi), and more options of
-    its slave, such as `--control gain=32`.
+    """One camera as entered on the page: what it is, where, and more options.
+
+    Where is the device of a USB camera, or the host of a Pi; the options are those of its slave, such as `--control
+    gain=32`.
     """
 
     name: Name
@@ -50,7 +54,10 @@ class CameraPlan(Part, frozen=True):
 
 
 class Plan(Part, frozen=True):
-    """console/setup.json: what the page was told. `truth`: tree of the simulated world."""
+    """Contents of console/setup.json: what was entered on the page.
+
+    `truth`: tree of the simulated world.
+    """
 
     version: Literal[1] = 1
     rig: Name = "desk"
@@ -80,7 +87,9 @@ class Plan(Part, frozen=True):
 
 
 def load_plan(tree: Path) -> Plan:
-    """What the page was told before; a new plan where it was told nothing.
+    """Load the saved plan of the page.
+
+    It is a new plan where nothing was entered.
 
     Raises:
         CalibrationError: The file is broken.
@@ -90,7 +99,9 @@ def load_plan(tree: Path) -> Plan:
 
 
 def plan_of_rig(tree: Path, name: str) -> Plan:
-    """What the files of a rig tell where no page was told anything: its cameras, as ones that somebody else starts.
+    """Derive the plan from a rig's files where nothing was entered on the page.
+
+    Its cameras count as ones that somebody else starts.
 
     Raises:
         CalibrationError: The rig's file is broken.
@@ -115,7 +126,9 @@ def save_plan(tree: Path, plan: Plan) -> None:
 
 
 def write_cameras(tree: Path, plan: Plan) -> list[Path]:
-    """Camera files of the plan, and keep the plan. A file of the same mode stays as it is, with lens and colours.
+    """Write the camera files of the plan, and save the plan.
+
+    A file of the same mode stays as it is, with lens and colours.
 
     Raises:
         CalibrationError: A name stands twice, a simulated world has no such camera, a file cannot be written.
@@ -139,7 +152,10 @@ def write_cameras(tree: Path, plan: Plan) -> list[Path]:
 
 
 def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
-    """Whether a lens and colours measured with the one hold for the other: size and read-out are the same."""
+    """Return whether lens and colours of one mode hold for the other.
+
+    They do where size and read-out are the same.
+    """
     return (one.width_px, one.height_px, one.row_time_us, one.focus_m) == (
         other.width_px,
         other.height_px,
@@ -149,7 +165,9 @@ def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
 
 
 def write_rig(tree: Path, plan: Plan) -> list[Path]:
-    """Rig, hand and key of the plan, and keep the plan. Places that are measured stay while cameras are the same.
+    """Write rig, hand and key of the plan, and save the plan.
+
+    Measured camera places stay while the cameras are the same.
 
     Raises:
         CalibrationError: No cameras yet, no hand is of that length, or a file cannot be written.
@@ -202,7 +220,9 @@ def key_of(tree: Path, given: bytes | None) -> str:
 
 
 def keep_old(tree: Path, path: Path) -> Path | None:
-    """Copy a file of the tree that is about to be replaced into old/DATE/ of the tree; None: there is none.
+    """Copy a file that is about to be replaced into old/DATE/ of the tree.
+
+    Return None if there is no such file.
 
     Raises:
         CalibrationError: It cannot be copied.

@@ -1,4 +1,7 @@
-"""A calibration that runs: one command after the other, their lines, how far they are, and results to be taken over."""
+"""A running calibration.
+
+It runs one command after the other, with their lines, their progress, and results to be taken over.
+"""
 
 import threading
 from collections import deque
@@ -35,7 +38,10 @@ class JobState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What runs at once: name of the process -> its command line. `keyboard`: it waits for Enter."""
+    """Commands that run at once: name of the process -> its command line.
+
+    `keyboard`: it waits for Enter.
+    """
 
     title: str
     commands: dict[str, list[str]]
@@ -43,7 +49,10 @@ class Stage:
 
 
 class Job:
-    """Stages one after the other, on a thread of its own. Holds their lines and what the tree was at the start."""
+    """Calibration stages that run one after the other on a thread of their own.
+
+    It holds their lines and what the tree was at the start.
+    """
 
     def __init__(
         self,
@@ -89,7 +98,10 @@ class Job:
 
     @property
     def share(self) -> float | None:
-        """How far it is, 0..1, of all its stages; None: nobody tells."""
+        """Return the progress of the job over all its stages, 0..1.
+
+        None if no progress is reported.
+        """
         if self.state is JobState.DONE:
             return 1.0
         own = progress(line for one in list(self._now.values()) for line in list(one.lines))
@@ -140,7 +152,9 @@ class Job:
         return self.state
 
     def use(self) -> tuple[Path, ...]:
-        """Write the results into the tree in use; what was there is kept under old/. Return the files written.
+        """Write the results into the tree in use and return the files written.
+
+        What was there is kept under old/.
 
         Raises:
             CalibrationError: There is nothing, a file is broken, or one of the tree changed since the job began.

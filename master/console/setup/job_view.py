@@ -1,4 +1,4 @@
-"""A calibration under way as a person sees it: progress, what it says, what to press, its result."""
+"""View of a running calibration: progress, output, what to press, result."""
 
 from collections.abc import Callable
 from pathlib import Path

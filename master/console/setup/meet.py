@@ -1,5 +1,7 @@
-"""A master that tracks nothing: it gives the start and carries the bus, so that cameras can be seen before they are
-calibrated. `python -m master.console.setup.meet --rig NAME --calibration DIR ...`, as `phalanx run`.
+"""Master that tracks nothing, so cameras can be seen before calibration.
+
+It gives the start and carries the bus. Run as `python -m master.console.setup.meet --rig NAME --calibration DIR ...`,
+as `phalanx run`.
 """
 
 import os
@@ -23,7 +25,7 @@ _POLL_S = 0.2
 
 
 def meet(words: Sequence[str]) -> None:
-    """Give the start to the slaves of a rig and say who is there, until Ctrl-C."""
+    """Give the start to the slaves of a rig and print who is there, until Ctrl-C."""
     parser = ArgumentParser("meet", description="Give the start to the slaves of a rig.")
     for add in (add_rig, add_calibration, add_link, add_bus):
         add(parser)

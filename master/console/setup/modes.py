@@ -1,4 +1,6 @@
-"""Sensors and modes that a camera may have, with all that a camera file needs to begin with. docs/cameras.md has why.
+"""Sensors and modes that a camera may have.
+
+Each comes with all that a camera file needs to begin with. docs/cameras.md gives the reasons.
 
 Row times are those of the sensors' Linux drivers, line length over pixel rate, times the rows that are added up to one
 of the picture. Exposure and gains are where to start from: a bright room, markers well exposed and little smeared.
@@ -105,7 +107,9 @@ def modes_of(kind: Kind) -> dict[str, str]:
 
 
 def new_file(kind: Kind, mode: str, name: str, truth: Path) -> CameraCalibration:
-    """The file of a camera that was chosen on the page: its mode, no lens, no colours.
+    """Return the initial file of a camera that was chosen on the page.
+
+    It has the chosen mode, no lens and no colours.
 
     Args:
         kind: Of the camera.

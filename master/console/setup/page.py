@@ -1,4 +1,7 @@
-"""The set-up page: steps on the left with what is done, to do or stale; the panel of one step on the right."""
+"""Set-up page: steps on the left, the panel of one step on the right.
+
+Each step is marked as done, to do or stale.
+"""
 
 from collections.abc import Callable
 from functools import partial

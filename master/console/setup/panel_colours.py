@@ -1,4 +1,7 @@
-"""Panel of step 5: colours of the markers, by a click on each in the picture of each camera."""
+"""Panel of step 5: colours of the markers.
+
+They are set by a click on each in the picture of each camera.
+"""
 
 from dataclasses import dataclass
 
@@ -18,7 +21,7 @@ _KEYS = {"ArrowLeft": (-1, 0), "ArrowRight": (1, 0), "ArrowUp": (0, -1), "ArrowD
 
 @dataclass(slots=True)
 class _Choice:
-    """What is being picked: camera and marker, where the crosshair is, how large the preview is."""
+    """Current pick: camera and marker, crosshair position and preview size."""
 
     camera: str
     marker: str
@@ -56,7 +59,7 @@ def build(desk: Desk) -> None:
 
 
 def _serve(desk: Desk) -> None:
-    """Hold the simulated hand still, and say who must run."""
+    """Offer to hold the simulated hand still, and show who must run."""
     session = desk.session
     if session.plan.simulated and session.view != "still":
 
@@ -77,7 +80,10 @@ def _known(desk: Desk, camera: str) -> set[str]:
 
 
 class _ColourChoice:
-    """The picture to click on. Holds what is being picked and which markers each camera knows."""
+    """Picture to click on, with what is being picked.
+
+    It also holds which markers each camera knows.
+    """
 
     def __init__(self, desk: Desk, rig: RigCalibration) -> None:
         self._desk, self._rig = desk, rig

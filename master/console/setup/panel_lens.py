@@ -1,4 +1,7 @@
-"""Panel of step 4: lenses and places of the cameras, from a printed board that is shown to them."""
+"""Panel of step 4: lenses and places of the cameras.
+
+They are measured from a printed board that is shown to the cameras.
+"""
 
 import json
 from pathlib import Path

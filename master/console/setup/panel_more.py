@@ -1,4 +1,7 @@
-"""All calibrations as wizards, made of one form each: what it is for, what is needed, what to do, fields, result."""
+"""All calibrations as wizards, made of one form each.
+
+A form states what it is for, what is needed, what to do, fields and result.
+"""
 
 from nicegui import ui
 
@@ -64,7 +67,10 @@ def build_wizard(desk: Desk, wizard: Wizard) -> None:
 
 
 def _cannot_record(desk: Desk, wizard: Wizard) -> str:
-    """Why the page cannot make the recording itself; empty where it can, or where none is needed."""
+    """Return why the page cannot make the recording itself.
+
+    Empty where it can, or where none is needed.
+    """
     if not wizard.prepared:
         return ""
     try:

@@ -1,4 +1,7 @@
-"""Panel of step 2: which markers, whose hand, and the key that keeps strangers out."""
+"""Panel of step 2: which markers, whose hand, and the rig key.
+
+The key keeps unknown senders out.
+"""
 
 import re
 

@@ -1,4 +1,7 @@
-"""Panel of step 3: the cameras run, here or on their Pis, and are seen on the bus."""
+"""Panel of step 3: the cameras run and are seen on the bus.
+
+They run here or on their Pis.
+"""
 
 from nicegui import ui
 

@@ -1,4 +1,4 @@
-"""Panel of step 6: the master tracks, and says whether all is well."""
+"""Panel of step 6: the master tracks, and reports whether all is well."""
 
 import numpy as np
 from nicegui import ui

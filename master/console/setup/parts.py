@@ -1,4 +1,7 @@
-"""Parts that all panels of the set-up page use: actions off the event loop, errors, commands to copy, live pictures."""
+"""Parts that all panels of the set-up page use.
+
+They are actions off the event loop, errors, commands to copy and live pictures.
+"""
 
 import base64
 from collections.abc import Callable
@@ -17,7 +20,9 @@ _EMPTY = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw==
 
 @dataclass(slots=True)
 class Desk:
-    """One window of the set-up page. Holds the session and where a panel says what went wrong.
+    """One window of the set-up page.
+
+    It holds the session and where a panel reports what went wrong.
 
     Attributes:
         session: Of the console.
@@ -30,7 +35,10 @@ class Desk:
     complain: Callable[[str], None]
 
     async def attempt(self, action: Callable[[], T]) -> T | None:
-        """Do what may take a while off the event loop; what goes wrong is shown, and None returned."""
+        """Run a slow action off the event loop.
+
+        An error is shown, and None is returned.
+        """
         self.complain("")
         try:
             return await run.io_bound(action)

@@ -1,4 +1,7 @@
-"""How far a calibration is, read off the lines that it prints: `7 of 25`, `40 %`, or a step with its number."""
+"""Progress of a calibration, read from the lines that it prints.
+
+A line holds `7 of 25`, `40 %`, or a step with its number.
+"""
 
 import re
 from collections.abc import Iterable
@@ -8,7 +11,10 @@ _SHARE = re.compile(r"\b(\d{1,3}) %")
 
 
 def share_of(line: str) -> float | None:
-    """What share of the work a line tells is done, 0..1; None: it tells none."""
+    """Return the share of the work that a line reports as done, 0..1.
+
+    None if it reports none.
+    """
     if found := _COUNT.search(line):
         done, whole = int(found[1]), int(found[2])
         return min(done / whole, 1.0) if whole else None
@@ -18,7 +24,10 @@ def share_of(line: str) -> float | None:
 
 
 def progress(lines: Iterable[str]) -> float | None:
-    """The last share that any line tells; None: none does."""
+    """Return the last share of work that any line reports.
+
+    None if none does.
+    """
     last = None
     for line in lines:
         share = share_of(line)
@@ -27,7 +36,10 @@ def progress(lines: Iterable[str]) -> float | None:
 
 
 def fault(lines: Iterable[str]) -> str:
-    """What a command that failed said last: its error, with what to do, as its author wrote it."""
+    """Return the error that a failed command printed last.
+
+    It includes what to do, as its author wrote it.
+    """
     printed = [line.strip() for line in lines if line.strip()]
     for place, line in reversed(list(enumerate(printed))):
         if line.startswith(("phalanx: ", "phalanx-slave: ", "meet: ")):

@@ -1,4 +1,7 @@
-"""Recordings for calibrations, made by the cameras of this machine: all record at once, are joined, and searched."""
+"""Recordings for calibrations, made by the cameras of this machine.
+
+All cameras record at once; the recordings are joined and searched.
+"""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -14,7 +17,9 @@ from master.console.setup.wizards import Wizard
 def recording_stages(
     commands: Commands, wizard: Wizard, values: Mapping[str, Value], work: Path
 ) -> tuple[list[Callable[[], Stage]], dict[str, Value]]:
-    """What makes the recording of a wizard, and the form's values with its folders filled in.
+    """Return the stages that make a wizard's recording, and the form's values.
+
+    The values have the recording's folders filled in.
 
     Raises:
         CalibrationError: A camera is not on this machine, or the wizard needs no recording of these cameras.

@@ -1,4 +1,6 @@
-"""What the set-up page has under way: the plan, the cameras and the master it started, and the calibrations that run.
+"""State of the set-up page: plan, cameras, master and calibrations.
+
+Cameras and master are those that the page started; the calibrations are those that run.
 
 One of it for all windows of a console. Its methods wait for processes, so pages call them off the event loop.
 """
@@ -28,7 +30,10 @@ LENS = "lens"  # the job of the main line: capture, then stereo
 
 
 class Session:
-    """Holds plan, the step that was opened last, view of the simulated cameras, and jobs by the command they are of."""
+    """Set-up session: plan, last opened step, simulated view and running jobs.
+
+    The step is the one opened last, the view is that of the simulated cameras, and jobs are keyed by their command.
+    """
 
     def __init__(self, state: ConsoleState) -> None:
         """Go on where the files of the console's tree are.
@@ -62,7 +67,10 @@ class Session:
 
     @property
     def master(self) -> LocalProcess | None:
-        """The master of this console that runs: one that tracks, one that only meets, or a calibration."""
+        """Return the running master of this console.
+
+        It is one that tracks, one that only meets the cameras, or a calibration.
+        """
         return self.state.local.running().get(MASTER)
 
     @property
@@ -119,7 +127,9 @@ class Session:
             self.plan = plan
 
     def start_cameras(self, view: str) -> None:
-        """Start, or start anew, all cameras of this machine; simulated ones look at `view`.
+        """Start or restart all cameras of this machine.
+
+        Simulated ones look at `view`.
 
         Raises:
             PhalanxError: There is no rig or no key yet, or a process cannot be started.
@@ -151,7 +161,9 @@ class Session:
                 thread.join()
 
     def start_master(self) -> None:
-        """Start the master: one that tracks if lenses and places are known, else one that only meets the cameras.
+        """Start the master.
+
+        It tracks if lenses and places are known; otherwise it only meets the cameras.
 
         Raises:
             PhalanxError: There is no rig or no key yet; another master runs; a process cannot be started.
@@ -228,7 +240,9 @@ class Session:
             return self._begin(wizard.command, wizard.title, stages, work, keyed=keyed)
 
     def use(self, job: Job) -> tuple[Path, ...]:
-        """Write a job's results into the tree; a master that only meets the cameras gives way to one that tracks.
+        """Write a job's results into the tree.
+
+        A master that only meets the cameras then gives way to one that tracks.
 
         Raises:
             PhalanxError: As of `Job.use` and `start_master`.
@@ -265,7 +279,10 @@ class Session:
         return job
 
     def _after(self) -> None:
-        """A job ended: cameras that it borrowed come back, and somebody must carry the bus again."""
+        """Restore cameras and master after a job has ended.
+
+        Cameras that the job borrowed come back, and somebody must carry the bus again.
+        """
         try:
             with self._lock:
                 cameras, master = self._bring_back
@@ -318,7 +335,10 @@ def wizard_named(command: str) -> Wizard:
 
 
 def _plan(state: ConsoleState) -> Plan:
-    """What the page was told, if that is of a rig that the console was told to show; else what the rig's file says."""
+    """Return the saved plan of the page, or one derived from the rig's file.
+
+    The saved plan counts if it is of a rig that the console was started to show.
+    """
     tree, rigs = state.settings.calibration, state.settings.rigs
     plan = load_plan(tree)
     if plan.cameras and (not rigs or plan.rig in rigs):

@@ -1,4 +1,7 @@
-"""How far a set-up is, told from its files alone: which steps are done, which are to do, which are stale and why."""
+"""Progress of a set-up, derived from its files alone.
+
+It states which steps are done, which are to do, and which are stale and why.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,7 +39,10 @@ class Step:
 
 
 def steps_of(tree: Path, plan: Plan, *, keyed: bool = False) -> tuple[Step, ...]:
-    """The steps whose results are files, in order; `keyed`: the console was given a key, the tree needs none."""
+    """Return the steps whose results are files, in order.
+
+    `keyed`: the console was given a key, so the tree needs none.
+    """
     cameras, broken = _cameras(tree, plan)
     rig, rig_error = _rig(tree, plan)
     return (
@@ -48,7 +54,7 @@ def steps_of(tree: Path, plan: Plan, *, keyed: bool = False) -> tuple[Step, ...]
 
 
 def usable(tree: Path, plan: Plan) -> bool:
-    """Whether a hand can be tracked with what the files say."""
+    """Return whether the files are sufficient to track a hand."""
     return all(step.state is not Done.TO_DO for step in steps_of(tree, plan))
 
 

@@ -1,4 +1,7 @@
-"""The table of wizards: what each calibration is for, what is needed, what to do, and which fields are shown first."""
+"""Table of wizards.
+
+For each calibration it states what it is for, what is needed, what to do, and which fields are shown first.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
