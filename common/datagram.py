@@ -81,9 +81,7 @@ class Refusal(StrEnum):
     IMPOSTOR = "impostor"  # speaks for a camera that it is not
     UNKNOWN = "unknown_camera"  # a slave that this rig does not have
     OTHER_MASTER = "other_master"  # a beacon of another master while ours is well
-    DUPLICATE_SENDER = (
-        "twin"  # a hello of a second process under a name whose first one is well; a beacon that lists it
-    )
+    DUPLICATE_SENDER = "duplicate_sender"  # a hello of a second process of a name whose first is well
 
 
 class Header(NamedTuple):

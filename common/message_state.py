@@ -48,7 +48,7 @@ CheckCode = Literal[
     "disk_full",
     "strobe_slipped",
     "imu_silent",
-    "twin_sender",
+    "duplicate_sender",
     "version_mismatch",
     "secret_mismatch",
     "marker_mismatch",

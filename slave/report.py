@@ -173,6 +173,6 @@ def _why_alone(counts: Mapping[str, int]) -> str:
         return (
             "a master is heard, but not with the secret of this device: phalanx fleet deploy brings what fits"
         )
-    if counts.get("refused.twin", 0):
+    if counts.get("refused.duplicate_sender", 0):
         return "a master is heard, but it has somebody of this name already: two slaves of one name?"
     return "no master heard yet: is it running, and does its --beacon reach this network and port?"

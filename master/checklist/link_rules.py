@@ -102,7 +102,7 @@ class LinkRules:
         duplicate, unknown_peer = sender.duplicate, sender.unknown_peer
         host = None if duplicate is None else duplicate.host
         yield Verdict(
-            "twin_sender",
+            "duplicate_sender",
             name,
             duplicate is not None,
             f"Two processes say that they are {name}; the one at {host} is not taken while the other is well.",

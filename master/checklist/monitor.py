@@ -34,7 +34,7 @@ _ABSENT: frozenset[CheckCode] = frozenset(("camera_absent", "imu_silent"))
 _COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_range"))
 _LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
 _MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
-_NOT_TAKEN: frozenset[CheckCode] = frozenset(("twin_sender", "version_mismatch", "secret_mismatch"))
+_NOT_TAKEN: frozenset[CheckCode] = frozenset(("duplicate_sender", "version_mismatch", "secret_mismatch"))
 _OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN - {"marker_mismatch"}
 # Cause -> what is not told of the same camera, its markers, or a group with it in it.
 _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {

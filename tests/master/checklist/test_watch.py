@@ -248,7 +248,7 @@ CASES = [
         "phalanx-slave run --name imu",
     ),
     Case(
-        "twin_sender",
+        "duplicate_sender",
         "left",
         _set("twin", "left", RejectedPeer("10.0.0.7", 10)),
         _set("twin", "left", None),
