@@ -68,7 +68,7 @@ def of_links(long: bool) -> list[Fault]:
               " hears a foreign rig; the camera is absent", _wrong_key, (), ("camera_absent",)),
         Fault("version", "a slave of another wire version, then ours", "not taken; named on both sides", _version,
               ("refused.version",), ("version_mismatch",)),
-        Fault("duplicate", "a second process with the name of a camera", "the first keeps its session; both sides say it",
+        Fault("duplicate", "a second process of a camera's name", "the first keeps its session; both sides log it",
               _duplicate, ("refused.duplicate_sender",), ("duplicate_sender",), tracks=0.7),
     ]  # fmt: skip
 

@@ -200,7 +200,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
         ({"refused.foreign": 5}, "of another rig key"),
         ({"refused.version": 5}, "of another version"),
         ({"refused.secret": 5}, "not with the secret of this device"),
-        ({"refused.twin": 5}, "somebody of this name"),
+        ({"refused.duplicate_sender": 5}, "somebody of this name"),
     ],
 )
 def test_a_slave_without_a_master_says_what_it_hears(

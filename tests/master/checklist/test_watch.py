@@ -99,7 +99,7 @@ CASES = [
         "left",
         lambda b: b.away.add("left"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "slave",
     ),
     Case(
@@ -244,14 +244,14 @@ CASES = [
         "imu",
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "phalanx-slave run --name imu",
     ),
     Case(
         "duplicate_sender",
         "left",
-        _set("twin", "left", RejectedPeer("10.0.0.7", 10)),
-        _set("twin", "left", None),
+        _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
+        _set("duplicate", "left", None),
         "the one at 10.0.0.7 is not taken",
         "--name",
     ),
@@ -312,7 +312,7 @@ def test_who_never_came_is_reported_after_a_grace() -> None:
     shown = bench.seconds(8.0)
     assert not any(items for s, items in shown if s < 5.0)
     assert [(i.code, i.subject) for i in shown[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
-    assert "never heard" in shown[-1][1][0].sentence
+    assert "never received" in shown[-1][1][0].sentence
 
 
 def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:
