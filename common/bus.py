@@ -8,7 +8,7 @@ same tests run against both. Streams with the path DATAGRAM never come here.
 A subscription holds at most `depth` messages and drops the oldest: who reads too slowly sees
 what is new, and how much was dropped. A message is encoded and decoded by either bus, so
 receivers never share objects and never see one that `common.messages` would refuse.
-Of what devices say so much is taken of each per second (`common.streams`), before it is decoded: one that says more
+Of what devices send, so much is accepted of each per second (`common.streams`), before it is decoded: a sender of more
 costs nobody's time.
 """
 
@@ -25,7 +25,7 @@ from common.token_bucket import TokenBucket
 
 Handler = Callable[[Command], Health]
 ANY = "*"
-MOST_SENDERS = 256  # whose rates are told apart; on an open bus names can be invented
+MOST_SENDERS = 256  # whose rates are tracked separately; on an open bus names can be invented
 
 
 class Subscription(Protocol):
@@ -82,7 +82,7 @@ class Bus(Protocol):
         """Send `command` to its target and return the answer.
 
         Raises:
-            BusError: Nobody answered in time, or the target refused; the text says which.
+            BusError: Nobody answered in time, or the target refused; the message states which.
         """
         ...
 
@@ -108,7 +108,7 @@ class Inbox:
     It drops the oldest message when full, and decodes on reading.
 
     Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
-    under which name is the bus' to say, so what is in a message cannot be another's. Besides, how many of each name
+    under which name is up to the bus, so no message can be another's. Besides, how many of each name
     may come now.
     """
 

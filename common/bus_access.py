@@ -2,16 +2,16 @@
 
 Uses zenoh's access control, by the common names of certificates.
 
-Nothing is allowed that is not named here. What a device says goes to whoever listens; what it is told is only what the
+Nothing is allowed that is not named here. What a device sends goes to whoever listens; it receives only what the
 master passes on:
 
 | who | may |
 |---|---|
-| a device | say how it is, show pictures, answer commands, all under its own name; no poses, and it hears nothing |
+| a device | report its health, show pictures, answer commands, all under its own name; no poses, receives nothing |
 | an operator (viewer, console, recorder ...) | read everything, command everybody, be a program with its own name |
 | the master | everything |
 
-A program of an operator says how it is, that it is alive, and takes commands; it tells no poses, and never speaks for
+A program of an operator reports its health, that it is alive, and takes commands; it sends no poses, and never acts as
 the master or a device.
 
 The same table is in force on both sides: the master applies it to each that connects, and a device takes from its link
@@ -36,7 +36,7 @@ def rules_of_master(devices: Iterable[str]) -> dict[str, object]:
     """zenoh's `access_control` for the side that listens.
 
     Args:
-        devices: Names of the devices that may connect; others are not heard.
+        devices: Names of the devices that may connect; messages of others are dropped.
     """
     names = sorted(set(devices))
     program = [key_of("health", "*"), key_of("command", "*"), ALIVE_KEY.format(name="*")]

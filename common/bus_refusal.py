@@ -16,7 +16,7 @@ from common.endpoints import host_of, port_of
 from common.keys import Identity
 
 _PATIENCE_S = 0.5
-_ALONE_S = 2.0  # without anybody for so long, a process says why
+_ALONE_S = 2.0  # without anybody for so long, a process logs why
 _POLL_S = 0.25
 _NOT_YET_VALID, _EXPIRED = 9, 10  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
 _LOG = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
     refuses a certificate only then.
 
     Args:
-        endpoint: As `tls/192.168.1.2:47802`; of `quic/` nothing can be said.
+        endpoint: As `tls/192.168.1.2:47802`; for `quic/` no cause can be determined.
         identity: Own certificate.
     """
     if not endpoint.startswith("tls/"):
@@ -52,7 +52,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
             sealed.settimeout(_PATIENCE_S)
             sealed.recv(1)
     except TimeoutError:
-        return ""  # accepted: whoever refuses says so at once
+        return ""  # accepted: whoever refuses reports it at once
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in (_NOT_YET_VALID, _EXPIRED):
             return _why_invalid(endpoint, identity)

@@ -13,7 +13,7 @@ from common.keys import Identity
 LEASE_MS = 1000  # so soon a pulled cable is noticed
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 MAX_MESSAGE_BYTES = 1 << 20
-CLIENT_TIMEOUT_MS = 500  # a viewer tries a master that is not there for so long, then says that it waits
+CLIENT_TIMEOUT_MS = 500  # a viewer tries a master that is not there for so long, then reports that it waits
 # Batches that may wait for the link before a message is dropped. With zenoh's own 2, a busy machine that gives the link
 # no time for a millisecond loses messages; 16 is its most.
 LINK_QUEUE = {"data": 16, "data_low": 16}
@@ -92,5 +92,5 @@ def _rules(
         return rules_of_router()
     if listen is not None and encrypted(listen):
         return rules_of_master({*identity.devices, *devices})
-    # An operator is connected to nobody but a master, which may tell it everything.
+    # An operator is connected to nobody but a master, which may send it everything.
     return None if identity.name in (MASTER, OPERATOR) else rules_of_device(identity.name)

@@ -47,7 +47,7 @@ class HsvRange(Part, frozen=True):
 
     hsv_low[0] > hsv_high[0] wraps through 0.
 
-    `reference_bgr_linear` is the mean colour of the paint in linear light, blue first, 1 = white, at calibration; with
+    `reference_bgr_linear` is the mean marker colour in linear light, blue first, 1 = white, at calibration; with
     it a slave follows changes of the light.
     """
 

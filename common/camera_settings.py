@@ -2,8 +2,8 @@
 
 Defines the bodies of the commands "set" and "pick", and what a slave answers.
 
-A slave answers every command about its camera with a `Health` whose gauges say what the camera has now, read back, by
-the names of `figures`, and, with the prefix `WANTED`, what the camera file in use says; beside them the colour ranges
+A slave answers every command about its camera with a `Health` whose metrics are what the camera has now, read back, by
+the names of `figures`, and, with the prefix `WANTED`, values of the camera file in use; beside them the colour ranges
 in use, by `range_figures`.
 """
 
@@ -70,7 +70,7 @@ class ColourPick(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, 
     Attributes:
         marker: A marker of the rig.
         uv: Pixel [px] of the whole frame.
-        t_ns: Time of the preview that was clicked on [ns], as it says; the frame is kept for a second. Without it, or
+        t_ns: Time of the preview clicked on [ns], by its stamp; the frame is kept for a second. Without it, or
             later, the newest frame is taken, in which a moving hand is elsewhere.
     """
 

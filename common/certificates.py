@@ -6,7 +6,7 @@ Each process proves who it is by a certificate whose common name is its role (`m
 name on the bus. Only the master's may be shown by the side that listens (extended key usage serverAuth): whoever steals
 a camera's key cannot play the master before the other cameras.
 
-They are valid from 1970 on, because a Raspberry Pi has no clock battery: where the network does not tell it the time,
+They are valid from 1970 on, because a Raspberry Pi has no clock battery: where the network does not provide the time,
 it starts at the time of its last shutdown or of its system image, and would refuse each certificate that is younger.
 They end ten years after they were made: `phalanx fleet keys --renew` makes new ones.
 """
@@ -98,7 +98,7 @@ class Shown:
         listens: Whether it may be shown by the side that listens.
         since: Beginning of its validity.
         until: End of its validity.
-        fingerprint: First 16 hexadecimal digits of its SHA-256, to tell two of one name apart.
+        fingerprint: First 16 hexadecimal digits of its SHA-256, to distinguish two of one name.
     """
 
     name: str

@@ -6,14 +6,14 @@ Each machine has its own, so the master measures every slave's by the four time 
     there = t2 - t1 = offset + delay          back = t4 - t3 = delay - offset
 
 A network only ever adds delay. So in a plot over time the offset is a line below all `there` and above
-all `-back`, and the best one is the middle of the widest corridor between the two clouds. For delays
+all `-back`, and the best one is the middle of the widest search band between the two clouds. For delays
 with an exponential tail that is the maximum likelihood (Jeske, "On maximum-likelihood estimation of
-clock offset", IEEE Trans. Commun. 53, 2005; the corridor's slope: Moon, Skelly & Towsley, "Estimation
+clock offset", IEEE Trans. Commun. 53, 2005; the band's slope: Moon, Skelly & Towsley, "Estimation
 and removal of clock skew from network delay measurements", INFOCOM 1999). Each way has its own fastest
 echo: one way may queue as much as it likes, and no echo need be fast both ways, as NTP's filter wants.
 
 What no echo can see is a constant difference of the two ways. The offset is off by half of it, which
-is at most half of the corridor's width; where in there is unknown. An echo that leaves the corridor by
+is at most half of the band's width; where in there is unknown. An echo that leaves the band by
 more than its width would have arrived before it was sent: the remote clock was stepped, or a machine slept.
 """
 
@@ -31,10 +31,10 @@ DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twi
 WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
 SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
 SUSPECTS_AMONG = 20  # so many echoes
-_REFIT_SHARE = 16  # fit anew when one echo in so many is new: less moves the corridor by next to nothing
+_REFIT_SHARE = 16  # refit when one echo in so many is new: less moves the band by next to nothing
 _REFIT_NS = 500_000_000  # or when the fit is so old
 _FLOOR_NS = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
-_EDGE_SHARE = 8  # one echo in so many tells how sharp the edge of a cloud is
+_EDGE_SHARE = 8  # one echo in so many determines how sharp the edge of a cloud is
 _SOFT_EDGE = 1.5  # few delays are quite as short as an exponential law would have it
 _WIDEST_DRIFT = 800e-6  # a clock that is slewed by its time service: 500 ppm
 _GRID: Float = np.linspace(-1.0, 1.0, 33)
@@ -50,7 +50,7 @@ class ClockEstimate:
         offset_ns: Remote minus local time [ns].
         drift_ppm: Rate of the remote clock minus that of the local one [1e-6].
         sigma_ns: Standard deviation of the offset from scatter [ns], if both ways of the network cost the same.
-        bound_ns: Half of the corridor's width, that is of the shortest round trip [ns]: however much the two
+        bound_ns: Half of the band's width, that is of the shortest round trip [ns]: however much the two
             ways differ, the offset cannot be further off than that.
         drift_sigma_ppm: Standard deviation of the drift.
     """
@@ -102,7 +102,7 @@ class OffsetEstimator:
     Finds the widest search band between the echoes of a sliding window.
 
     Holds the echoes of the window and the estimate from them; after an echo that contradicts it, also those since.
-    Three such echoes among twenty are a stepped clock and start the estimate afresh from these. `steps` counts such
+    Three such echoes among twenty are a stepped clock and reinitialise the estimate from these. `steps` counts such
     restarts, `refused` impossible echoes.
     """
 
@@ -130,7 +130,7 @@ class OffsetEstimator:
     def settled(self) -> bool:
         """Return whether there are enough echoes, and none that contradict.
 
-        If so, there is no need to hurry.
+        If so, fast echoes are not needed.
         """
         return len(self._echoes) >= 2 * AT_LEAST and not self._suspects
 

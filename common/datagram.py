@@ -5,7 +5,7 @@
     4      1    wire version
     5      1    kind
     6      2    length of the whole datagram
-    8      4    rig tag: which rig key, without telling it
+    8      4    rig tag: which rig key, without revealing it
     12     8    key id: which key under the rig key (a process or a session)
     20     8    counter of that key, from 1
     28     n    body, encrypted
@@ -31,9 +31,11 @@ MAGIC = b"PHLX"
 HEADER = struct.Struct("!4sBBHIQQ")
 TAG_BYTES = 16
 OVERHEAD = HEADER.size + TAG_BYTES
-MAX_DATAGRAM = 4096  # 48 markers take 2.2 kB, 2.9 kB where they have rivals
+MAX_DATAGRAM = 4096  # 48 markers take 2.2 kB, 2.9 kB where they have alternatives
 KEY_BYTES = 32
-WINDOW = 1024  # counters behind the newest within which a late datagram is still told from a replayed one
+WINDOW = (
+    1024  # counters behind the newest within which a late datagram is still distinguished from a replayed one
+)
 
 
 class Kind(IntEnum):
@@ -55,8 +57,8 @@ class Refusal(StrEnum):
 
     FOREIGN = "foreign"  # not ours, or of another rig
     VERSION = "version"  # ours, of another wire version
-    CUT = "cut"  # shorter than it says
-    JUNK = "junk"  # longer than it says
+    CUT = "cut"  # shorter than its header states
+    JUNK = "junk"  # longer than its header states
     OVERSIZED = "oversized"  # longer than any of ours
     UNEXPECTED = "unexpected"  # unknown kind, or one that this side does not take
     STALE = "stale"  # sealed for a session that is over, or never was
@@ -71,7 +73,7 @@ class Refusal(StrEnum):
     )
     READY_TIME = "ready_time"  # a frame that the slave had long before or after it was exposed
     UNASKED_ECHO = "unasked_echo"  # an answer to an echo that was not asked, or was answered
-    FOREIGN_SESSION = "foreign_session"  # a message of another process than the one that said hello
+    FOREIGN_SESSION = "foreign_session"  # a message of another process than the one that sent the hello
     SEQUENCE = "sequence"  # a frame number that no camera can have reached since the last
     MARKER_COUNT = "marker_count"  # of a slave whose rig file names more or fewer markers
     RATE = "rate"  # more messages than the sender's rate by its files

@@ -3,7 +3,7 @@
 Also where a listener can be reached.
 
 `tls/HOST:PORT` (or `quic/`) is encrypted, and both sides prove who they are. `tcp/` is neither: it stays on a loopback
-address, which other machines cannot reach, unless somebody says `--open`.
+address, which other machines cannot reach, unless `--open` is given.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ def check(endpoint: str, open_bus: bool) -> None:
         open_bus: Whether plain text may leave it.
 
     Raises:
-        BusError: It must not; the text says what to do.
+        BusError: It must not; the message states what to do.
     """
     if endpoint.split("/", 1)[0] not in SCHEMES:
         raise BusError(f"bus endpoint {endpoint!r}: must begin with {', '.join(s + '/' for s in SCHEMES)}")

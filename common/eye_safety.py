@@ -3,7 +3,7 @@
 Laser class 1 by IEC 60825-1, infrared lamps of the exempt group by IEC 62471.
 
 Only what a wrist device needs: one wavelength between 700 and 1050 nm, and sources taken as points where that is the
-stricter case. IEC 60825-1 is edition 3 (2014) unless said otherwise, IEC 62471 is edition 1 (2006). All in SI units.
+stricter case. IEC 60825-1 is edition 3 (2014) unless stated otherwise, IEC 62471 is edition 1 (2006). All in SI units.
 """
 
 from math import atan, pi

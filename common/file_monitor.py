@@ -32,7 +32,7 @@ class MonitoredFiles:
 
         Each change is reported once.
 
-        The first look at a file tells of a change: whoever read the file before may have read another content.
+        The first look at a file reports a change: whoever read the file before may have read another content.
         """
         found = False
         for path in paths:
@@ -51,5 +51,5 @@ def _look(path: Path, before: _Look | None) -> _Look | None:
         if before is not None and stat == before.stat:
             return before
         return _Look(stat, hashlib.sha256(path.read_bytes()).digest())
-    except OSError:  # gone, or not to be read: whoever loads it says why
+    except OSError:  # gone, or not to be read: whoever loads it reports why
         return None

@@ -31,7 +31,7 @@ class FramePictures:
 
         Args:
             folder: The recording.
-            size_px: Width and height that the camera file says.
+            size_px: Width and height by the camera file.
             grey: Whether one channel is wanted.
         """
         self._folder, self._size_px, self._grey = folder, size_px, grey

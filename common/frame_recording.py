@@ -4,7 +4,7 @@ A folder with recording.json, frames.csv and pictures, or videos.
 
 The replay camera and the offline solver read it; `common.frame_writing` writes it. Whatever ended the recording,
 what is there can be read: the manifest comes first, and a frame's row after its file. So only the last row can be
-cut, and a cut last row is left out with a warning; every other broken row is an error.
+cut, and a cut last row is dropped with a warning; every other broken row is an error.
 """
 
 import csv
@@ -63,7 +63,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         cameras: Camera name -> the camera file's content.
         rig: The rig file's content; `rigs` where there are several.
         clicks: Camera -> marker -> (u, v) [px] of a pixel on that marker in the first frame.
-        continuous: False: frames are unrelated poses, each solved afresh.
+        continuous: False: frames are unrelated poses, each solved anew by reinitialising.
         clock: The clock of all `t_ns`; None: not known.
         objects: Object name -> the object file's content, of the objects that the rigs name.
     """

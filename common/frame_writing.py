@@ -158,7 +158,7 @@ class RecordingWriter:
         line = text.getvalue().encode()
         try:
             rest = line
-            while rest:  # a full disk takes a part first and says so only the next time
+            while rest:  # a full disk takes a part first and reports it only the next time
                 rest = rest[self._table.write(rest) :]
         except OSError:
             with suppress(OSError):  # where even this fails, the reader leaves the cut line out

@@ -94,7 +94,7 @@ def rotation_vector_to_matrix(vector: Float) -> Float:
 
     By Rodrigues' formula.
     """
-    # A turn too small to be told from none is taken as this small, not divided by.
+    # A turn too small to be distinguished from none is taken as this small, not divided by.
     angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-9)[..., None, None]
     k = skew(vector)
     return _EYE + np.sin(angle) / angle * k + (1 - np.cos(angle)) / (angle * angle) * (k @ k)

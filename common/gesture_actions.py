@@ -21,7 +21,7 @@ class PinchSettings(Part, frozen=True):
     `begin_gap_m`, `end_gap_m`: skin to skin at which it begins and ends. `closed_gap_m`, `open_gap_m`: where the
     strength is 1 and 0. `clear_m`: how much nearer than the finger next to it the finger is to the thumb; less is a
     fist or a bunch. `away_m`: as far beyond, nothing else is asked. `apart_rad`: how far the pads may be turned from
-    facing each other, doubt included. `fist_curl`: of 0..1, the other fingers together are curled less.
+    facing each other, uncertainty included. `fist_curl`: of 0..1, the other fingers together are curled less.
     `sigma_most_m`: of the gap, above which it is not known; `lost_s`: how long a pinch lasts without it.
     """
 
@@ -85,7 +85,7 @@ class TapSettings(Part, frozen=True):
     the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of 0..1, how far at most. `quiet_rad`:
     how far the four may bend together from when the thumb comes until it goes: more is a hand that closes.
     `nearer_m`: how much nearer the thumb is to the finger of this key than to another, over the whole touch; less is
-    told as none. `sigma_most_m`, `place_sigma_m`: of the gap, and of the finger's PIP, above which nothing is told.
+    none. `sigma_most_m`, `place_sigma_m`: of the gap, and of the finger's PIP, above which nothing is reported.
     """
 
     touch_gap_m: Length = 0.005
@@ -111,7 +111,7 @@ class PointSettings(Part, frozen=True):
     `stretched_rad`, `bent_rad`: sums of the flexions of PIP and DIP, of the index at most and of each of the others at
     least. `slack_rad`: by how much both are wider for one that has begun. `hold_s`: how long until it begins, and how
     long the shape may be lost. `sigma_most_m`: of a finger's tip, above which it is not known; `ray_sigma_rad`: of the
-    ray, above which it is told to nobody (half as much again for one that has begun).
+    ray, above which it is not published (half as much again for one that has begun).
     """
 
     stretched_rad: Angle = math.radians(45.0)

@@ -3,8 +3,8 @@
 The defaults here are those of calib_json/gestures/default.json.
 
 A pose is a set of ranges, each of one measured quantity of the hand with a soft border. Inside its range a quantity
-fits; outside it misfits by z = distance to the range / border, and the pose fits by exp(-1/2 sum z^2). What the file
-says is thus what is asked, quantity by quantity, and a pose that is taught is written in the same words.
+fits; outside, its residual is z = distance to range / border, and the pose fits by exp(-1/2 sum z^2). What the file
+states is thus what is required, quantity by quantity, and a pose recorded as a template is written in the same words.
 """
 
 from typing import Annotated, Literal
@@ -166,7 +166,7 @@ class GestureSettings(Part, frozen=True):
 
     The poses of a hand, by name, how they are held, and the thresholds of the actions.
 
-    Of a taught pose the provenance says, under its name, from what.
+    Of a template pose the provenance states, under its name, from what it was recorded.
     """
 
     version: Literal[1]

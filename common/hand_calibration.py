@@ -120,7 +120,7 @@ class HandProfile(Part, frozen=True):
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
     `posture`: how this person holds the fingers, in place of the couplings' prior; DIPs are free then.
-    `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand tell,
+    `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand give,
     as a wrist device measures it; 1 where a finger is not named.
     """
 

@@ -33,7 +33,7 @@ _LOG = logging.getLogger(__name__)
 
 _BENT = np.radians(5.0)  # a finger that never bends further has no plane
 _EXTENDED = 0.1  # share of the frames that counts as most extended, of a thumb
-_LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not to be told
+_LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not observable
 _LEAST_SPREAD = np.radians(2.0)  # of a DIP about its share of the PIP: no hand is a gear
 _FOLLOWED_M = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
 _ASIDE_DEG = 15.0  # of a rest heading, from the median of the motion

@@ -2,7 +2,7 @@
 
 Joint angles of recorded joints, and a normal distribution fitted to them.
 
-It is one distribution of all 20 angles, for fingers move together: four that each had their own would tell four times
+It is one distribution of all 20 angles, for fingers move together: four that each had their own would count four times
 how the palm is turned. A recording is one sample of how a person moves, so it is shrunk towards a wide prior as if that
 had been seen in `_PRIOR_SAMPLES` independent frames (the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data
 Analysis", 3rd edition 2013, section 3.6). How many independent frames there are follows from the correlation of one
@@ -22,8 +22,8 @@ _PRIOR_SAMPLES = 1.0
 _PRIOR_MEAN = np.radians([[5.0, 5.0, 10.0, 15.0], *[[0.0, 20.0, 30.0, 15.0]] * 4])
 _PRIOR_SIGMA = np.radians([[15.0, 15.0, 20.0, 25.0], *[[8.0, 25.0, 30.0, 18.0]] * 4])
 _ALIKE = 0.8  # correlation of an angle with that of the next finger
-_LEAST_RAD = np.radians(0.5)  # no angle is known better by the others, whatever its tracker says
-_FEWEST = 20  # frames below which a motion says nothing
+_LEAST_RAD = np.radians(0.5)  # no angle is known better by the others, whatever its tracker reports
+_FEWEST = 20  # frames below which a motion carries no information
 _UPRIGHT = 0.3  # cosine of the flexion beyond which a finger shows no abduction
 
 

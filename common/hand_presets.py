@@ -7,7 +7,7 @@ degrees at a straight MCP and by 15 at 90 degrees of flexion, the mean of all fi
 Walinchus, Ross & Beredjiklian, J. Hand Surg. Am. 39, 2014). Their ratio is taken: a limit is where the ligaments
 stop a finger. Of their own force people spread a fist even less.
 
-Nor do the papers say how far people differ from their limits. Active ranges of young adults have standard deviations
+Nor do the papers state how people differ from their limits. Active ranges of young adults have standard deviations
 of 5 to 12 degrees, and knuckles reach 20 degrees beyond the straight finger (Mallon, Brown & Nunley, "Digital ranges
 of motion: normal values in young adults", J. Hand Surg. Am. 16, 1991). So a preset is a prior with a width.
 """

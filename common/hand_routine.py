@@ -2,9 +2,9 @@
 
 The order of the postures, in 20 s, and the instruction for each step.
 
-Only some ways of bending tell lengths. A straight finger that bends at the knuckle alone draws a circle about the
+Only some ways of bending constrain lengths. A straight finger that bends at the knuckle alone draws a circle about the
 knuckle; one that curls while the knuckle is held draws the arc of its two farther bones. The postures (flat, tabletop,
-hook, fist) are those of the tendon-gliding exercises of hand therapy (Wehbe & Hunter, 1985). Repeating a bend tells it
+hook, fist) are those of the tendon-gliding exercises of hand therapy (Wehbe & Hunter, 1985). Repetition separates it
 from what wanders meanwhile, and all fingers at once use the time four times.
 """
 

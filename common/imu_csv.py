@@ -4,8 +4,8 @@ Read by the names of its columns.
 
 Columns in any order between commas, semicolons or tabs, others beside them (`imu_csv_columns`); comments before the
 header are skipped, a header of two lines (group, then axis) is joined, and between semicolons a decimal comma is one. A
-unit that the header does not say can be given. Where nobody says it, that of time is the one by which the recording has
-4 to 4000 samples a second, that of forces the one by which gravity is there, rates are in rad/s: `Table.units` says all
+unit that the header lacks can be given. Where it is not, that of time is the one by which the recording has
+4 to 4000 samples a second, of forces the one that gives gravity, rates are in rad/s: `Table.units` states all
 of it. A value that is empty or NaN was not measured.
 """
 
@@ -42,8 +42,8 @@ class Table:
         gyro_rad_s, accel_m_s2, mag_ut: (T, 3) in the sensor's axes; NaN: not measured.
         truth_wxyz: (T, 4) of the quaternion in it, whose z axis is up; NaN: none.
         columns: Quantity -> names of its columns.
-        units: Quantity -> the unit, and who said it.
-        late: Rows that were left out because they are not after the one before.
+        units: Quantity -> the unit, and where it is from.
+        late: Rows that were rejected because they are not after the one before.
         incomplete: Rows with a value that was not measured, of rate or force.
     """
 
@@ -63,7 +63,7 @@ def read_csv(path: Path, units: Mapping[str, str] | None = None, rate_hz: float 
 
     Args:
         path: The file.
-        units: Quantity (`time`, `gyro`, `accel`, `mag`) -> its unit, where the header does not say it.
+        units: Quantity (`time`, `gyro`, `accel`, `mag`) -> its unit, where the header does not state it.
         rate_hz: Samples per second of a table without a column of time.
 
     Raises:

@@ -3,7 +3,7 @@
 By the names in its header.
 
 A name is cut into words (`Gyroscope X (deg/s)`, `gyro_x_dps`, `gyrX`, `angular_velocity.x`, `w_RS_S_x [rad s^-1]`); one
-of them says what is measured, one the axis, the last ones or what stands in brackets the unit. Others are ignored.
+of them names what is measured, one the axis, the last ones or what stands in brackets the unit. Others are ignored.
 """
 
 import re
@@ -105,7 +105,7 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
     if not words or _OTHERS.intersection(words):
         return None
     fused = next((match for word in words if (match := _FUSED.fullmatch(word))), None)
-    if fused is not None:  # and what stands before it, `opt_qw`, says nothing more
+    if fused is not None:  # and what stands before it, `opt_qw`, adds nothing more
         axis = fused[2].translate(str.maketrans("0123", "wxyz"))
         words = [fused[1], axis, *words[words.index(fused[0]) + 1 :]]
     if words[-1] in "0123" and _WORDS[QUATERNION].intersection(words):

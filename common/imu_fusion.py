@@ -3,19 +3,19 @@
 Rates are integrated, the tilt is corrected towards gravity, and the bias is estimated at rest.
 
 The filter is an error-state Kalman filter without magnetometer (`ErrorState`). Its world has z up, and nothing else is
-known of it: the heading is what it was when the filter began, and drifts from then on; `heading_sigma_rad` says how
+known of it: the heading is what it was when the filter began, and drifts from then on; `heading_sigma_rad` is how
 far. Each step is summed up first, exactly for a constant rate, then gravity and rest correct it.
 
 - **A sample's rate is the mean over the period before it.** A part's low-pass, which keeps its samples free of aliases,
   delays them by about half a period: this comes nearer than a trapezoid does. Steps are taken from the stamps,
   which may jitter; what lies between the last sample and that period is summed up at the mean of both.
-- **Gravity** is told by the level velocity that forces sum up to in the world's axes: an arm gains none for long.
-- **Bias** is taken where `Stillness` sees rest; in motion gravity tells that of the axes that are level, and the scale
-  of those that turn. Slow even turns look like rest: they move a bias that rest has told by little. Where rest
+- **Gravity** is observed by the level velocity that forces sum to in the world's axes: an arm gains none for long.
+- **Bias** is taken where `Stillness` sees rest; in motion gravity gives that of the axes that are level, and the scale
+  of those that turn. Slow even turns look like rest: they barely move a bias that was estimated at rest. Where rest
   contradicts it for long, one of the two was a turn: the bias is learnt anew, and the heading is as unsure as that.
 
 VQF (Laidig, Seel 2023) is what this is measured against (`python -m bench imu`). It is no dependency: it has no wheel
-for the Pi's processor, expects a fixed period, and tells no covariance of the tilt.
+for the Pi's processor, expects a fixed period, and estimates no covariance of the tilt.
 
 Magnetometers are not used: steel in a desk turns them by more than a gyroscope drifts in minutes.
 """
@@ -33,12 +33,12 @@ from common.imu_stillness import Stillness
 from common.messages import ImuSample
 
 _SETTLED_RAD = radians(6.0)  # reached nine tenths of a second after the first sample
-_BRIDGED_S, _BRIDGED_SAMPLES = 0.1, 3.0  # a longer silence may hide a turn that no rate tells
+_BRIDGED_S, _BRIDGED_SAMPLES = 0.1, 3.0  # a longer gap may hide a turn that no rate measures
 _CLOCK_S = 1.0  # a sample so much older than the last is not late: a clock was set back
 _RATE_RAD_S, _FORCE_M_S2 = 100.0, 2000.0  # beyond any range there is (4000 deg/s, 200 g)
 _FALLING_M_S2 = 1.0  # shorter forces have no direction
 _BIAS_MOST_RAD_S, _SCALE_MOST = 3.0 * BIAS_RAD_S, 0.03  # three sigma of what they begin with
-_GATE_RAD_S = radians(0.1)  # three of it beyond what is believed: rather a slow turn
+_GATE_RAD_S = radians(0.1)  # three of it beyond what is estimated: rather a slow turn
 _CONTRARY_S = 6.0  # of such rest: an even turn hardly lasts so long, rather the bias was learnt in one
 _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 

@@ -4,7 +4,7 @@ One row per sample, on the same clock.
 
 `t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz[,heading_sigma]]` in rad/s, m/s^2, uT and rad; the quaternion takes
 the sensor's axes to its world, whose z axis is vertical, and its heading may have drifted so far. `nan` is a value that
-the sensor did not give. As of frames.csv, only the last row can be cut by whatever ended the recording: it is left out,
+the sensor did not give. As of frames.csv, only the last row can be cut by whatever ended the recording: it is dropped,
 every other broken row is an error.
 """
 

@@ -2,7 +2,7 @@
 
 It is still when rate and force have stayed near their own mean for a while.
 
-What is constant cannot be told from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
+A constant cannot be separated from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
 off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
 VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by half a degree,
 seen by gravity, or half a degree per second more or less is a motion.

@@ -2,7 +2,7 @@
 
 The rig key, which all share, and a secret of each device, which no other has.
 
-Whoever has the rig key can make and read handshakes. What a device says in a session needs its secret as well, which
+Whoever has the rig key can make and read handshakes. What a device sends in a session needs its secret as well, which
 only it and the master know: a device that was stolen reads and forges no datagram of another.
 
 The secret of a device follows from `devices.key`, 32 random bytes that never leave the PC. Where there is the rig key

@@ -2,10 +2,10 @@
 
 Of the computer that a process runs on. Linux; what is not available is not reported.
 
-A Raspberry Pi says by its firmware that it throttles, its clock is capped, or its supply is too weak. Other computers
-say by the trip points of their thermal zones how warm is too warm.
+A Raspberry Pi reports by its firmware that it throttles, its clock is capped, or its supply is too weak. Others
+define by the trip points of their thermal zones how warm is too warm.
 
-Everything is read below a root, / unless the variable `PHALANX_SYSTEM_ROOT` says otherwise: there a rehearsal or a test
+Everything is read below a root, / unless the variable `PHALANX_SYSTEM_ROOT` is set: there a rehearsal or a test
 lays its own files, with the room of the disk in `disk_free_mb`.
 """
 
@@ -25,7 +25,7 @@ BELOW_TRIP_C = 5.0
 LEAST_TRIP_C = 50.0  # a lower one switches a fan, or is a dummy of the firmware
 _ZONES = "sys/class/thermal"
 # Below soc or, on a Pi 5 with newer kernels, soc@107c000000. The file is deprecated, and some kernels have none: these
-# tell of a weak supply alone, as an alarm of the sensor rpi_volt (Linux, drivers/hwmon/raspberrypi-hwmon.c).
+# report a weak supply alone, as an alarm of the sensor rpi_volt (Linux, drivers/hwmon/raspberrypi-hwmon.c).
 _THROTTLED = "sys/devices/platform/soc*/soc*:firmware/get_throttled"
 _SENSORS, _SUPPLY, _WEAK = "sys/class/hwmon/hwmon*", "rpi_volt", "in0_lcrit_alarm"
 _TRIPS = ("passive", "hot", "critical")

@@ -54,7 +54,7 @@ def open_chunk(data: bytes, budget: WorkBudget) -> OpenedChunk:
     """Unpack the content of a chunk record.
 
     Raises:
-        RecordingError: It is broken, or beyond a bound; the text says why, not where.
+        RecordingError: It is broken, or beyond a bound; the message states why, not where.
     """
     try:
         return _traversed(_unpacked(Chunk.read(stream(data)), budget), budget)
@@ -69,7 +69,10 @@ def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
     size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
     if max(size, claimed) > CHUNK_BYTES:
         raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {CHUNK_BYTES}")
-    if size not in (claimed, -1):  # -1: the frame does not say, as of a writer that packs while it writes
+    if size not in (
+        claimed,
+        -1,
+    ):  # -1: the frame does not state it, as of a writer that packs while it writes
         raise RecordingError(f"claims {claimed} bytes unpacked, its data {size}")
     budget.take(claimed)
     content = zstandard.decompress(chunk.data, max_output_size=claimed) if packed and claimed else chunk.data

@@ -178,7 +178,7 @@ def _header(fd: int, place: _Place | None) -> Header | None:
 def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
     """Content of a file by the summary at its end.
 
-    None: there is no summary, or it is broken or says what cannot be.
+    None: there is no summary, or it is broken or holds what cannot be.
     """
     tail = os.pread(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:

@@ -69,7 +69,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
 
     Attributes:
         hand: Name of the hand profile.
-        t_ns: The instant at which the pose holds [ns], master's clock.
+        t_ns: Time at which the pose holds [ns], master's clock.
         position_m: Joint positions (26, 3) [m], rig frame.
         orientation_wxyz: Joint orientations (26, 4), unit quaternions, joint -> rig frame,
             OpenXR axes (-z along the bone to the tip, +y dorsal).
@@ -93,12 +93,12 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             seen, or no such device.
         solver_mode: (5,) `SolverMode` codes: what a wrist device solved each finger from.
         ambiguous: (5,) another pose of the finger explains what the wrist device saw as well; this is the one that
-            fits the past, or habit.
+            fits the past, or the posture prior.
         palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
             vertical. NaN: not known, or no such device.
         palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
         wrist_angles_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
-            (`common.wrist_joint`). NaN: no such device, or nothing tells.
+            (`common.wrist_joint`). NaN: no such device, or nothing measures them.
         wrist_angles_sigma_rad: (2,) their standard deviations.
     """
 
@@ -160,7 +160,7 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
 
     Attributes:
         object: Name of the object file.
-        t_ns: The instant at which the pose holds [ns], master's clock.
+        t_ns: Time at which the pose holds [ns], master's clock.
         position_m: (3,) of the object's own frame [m], rig frame. NaN: never seen yet, or not for long.
         orientation_wxyz: (4,) unit quaternion, object axes -> rig frame. NaN with the position.
         cov: (6, 6) of position [m] and of a small turn about the rig's axes [rad]. NaN: unknown.
@@ -198,7 +198,7 @@ class Contact(Message, frozen=True, eq=False, tag=True):
     Attributes:
         hand: Name of the hand profile.
         object: Name of the object file.
-        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        t_ns: Time [ns], that of the hand's pose, master's clock.
         distance_m: (5,) from the skin of the last segment of thumb ... little to the surface of the object [m],
             negative inside. NaN: finger or object is not known.
         sigma_m: (5,) standard deviations of these.
@@ -230,11 +230,11 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
 
     Attributes:
         hand: Name of the hand profile.
-        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        t_ns: Time [ns], that of the hand's pose, master's clock.
         kind: `pose` (the hand is held in a shape), `pinch` (thumb and a finger), `dial` (a grip that turns), `tap`
             (the thumb on a part of a finger; begins and ends in one message of phase `end`), `point` (a ray).
         name: Which one: the pose (open_palm, counting_two, pointing, small_grasp, large_grasp, pinch, or one that was
-            taught); of a pinch the finger; of a tap the key (0 ... 9, star, hash); else the kind again.
+            made a template); of a pinch the finger; of a tap the key (0 ... 9, star, hash); else the kind again.
         phase: begin, update, end.
         began_t_ns: When it began [ns], same clock as `t_ns`.
         confidence: 0..1.

@@ -3,7 +3,7 @@
 docs/schema/messages.json, by `make schema`.
 
 On the wire a message is a msgpack map, and JSON schema has no word for two things there: bytes, and an array of
-numbers, which travels as the bytes of its elements, little-endian and row by row. Both say `"x-msgpack": "bin"`, and an
+numbers, sent as the bytes of its elements, little-endian and row by row. Both have `"x-msgpack": "bin"`, and an
 array what its elements are: `"x-dtype"` is "<f8" (64-bit floats), "<u2", "u1" (unsigned integers) or "?" (truth values,
 a byte each), and `"x-minimum"`, `"x-maximum"` their bounds. Shapes stand in the descriptions and in docs/wire.md; a NaN
 in an array or a number is "not known", and within all bounds.

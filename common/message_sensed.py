@@ -48,7 +48,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         area: Blob areas (M,) [px^2].
         quality: Probability (M,) 0..1 that what was found is the marker.
         sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
-            the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
+            the whole marker: noise, uncertainty from occlusion, size. Positive where `uv` is seen, NaN elsewhere.
         alt_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
             this is the marker. NaN: none, the usual case. Only where `uv` is seen.
             A row that is NaN in all was not seen.
@@ -98,9 +98,9 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     Attributes:
         camera: Camera name, the rig's only one.
         session: Random id of the sending process; a restart is a new session.
-        seq: Frame counter of the laser frame. It rises by more than one from triple to triple.
+        seq: Frame counter of the laser frame. It rises by more than one from strobe cycle to strobe cycle.
         t_ns: Middle of the exposure of row 0 of the laser frame [ns], sender's clock until `ingest`, then the master's.
-        ready_t_ns: When the last frame of the triple was handed to the slave [ns], same clock as `t_ns`.
+        ready_t_ns: When the last frame of the strobe cycle was handed to the slave [ns], same clock as `t_ns`.
         laser_uv: (5, 2) centroids of the part of the laser line that lies on each finger and is seen.
         laser_sigma_px: (5,) their standard deviation per axis; positive where `laser_uv` is seen, NaN elsewhere.
         laser_px: (5,) length of that part in the image.
@@ -213,7 +213,7 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
         mag_ut: Magnetic field (3,) [uT].
         orientation_wxyz: (4,) quaternion, sensor axes -> the sensor's world, whose z axis is vertical.
         heading_sigma_rad: Standard deviation of what its turn about the vertical has drifted since its beginning,
-            which was anywhere [rad]. NaN: who made the orientation does not say.
+            which was anywhere [rad]. NaN: the source of the orientation does not report it.
     """
 
     source: Name

@@ -58,7 +58,7 @@ CheckCode = Literal[
 class Health(Message, frozen=True, eq=False, tag=True):
     """What a process counted since it started.
 
-    Whatever is counted, the report can be read: counts stay at their largest value, gauges that are no number are left
+    Whatever is counted, the report is readable: counts stay at their maximum, metrics that are no number are left
     out, texts lose what cannot be printed.
 
     Attributes:
@@ -66,9 +66,9 @@ class Health(Message, frozen=True, eq=False, tag=True):
         session: Random id of the process.
         t_ns: Moment of the report [ns], clock of the source.
         counts: Event name -> how often (frames, dropped, refused by reason, ...).
-        gauges: Quantity name with its unit -> value now (rate_hz, offset_us, ...).
-        host: Name of the machine that the process runs on; empty: not told.
-        version: Of the program; empty: not told.
+        metrics: Quantity name with its unit -> value now (rate_hz, offset_us, ...).
+        host: Name of the machine that the process runs on; empty: not reported.
+        version: Of the program; empty: not reported.
     """
 
     source: Name
@@ -145,7 +145,7 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
     Attributes:
         source: Process name: "master".
         t_ns: When that message was there [ns], master's clock.
-        reject: How many instants of each hand are left out, at most, between two that are solved; 0: none.
+        reject: How many epochs of each hand are skipped, at most, between two that are solved; 0: none.
     """
 
     source: Name

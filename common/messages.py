@@ -3,7 +3,7 @@
 Arrays are read-only; NaN means "not seen".
 
 On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
-travels as itself and a message costs no Python loop. Rivals of markers are rare, and none at
+travels as itself and a message costs no Python loop. Alternatives of markers are rare, and none at
 all travel as no bytes: so the detections of 24 markers fit one Ethernet packet. `decode` is
 the only way in: whatever it returns has the right shapes, and each number is within the
 bounds of its field. Every field is described in docs/wire.md.
@@ -132,7 +132,7 @@ AnyMessage: TypeAlias = (
 
 MessageT = TypeVar("MessageT", bound=Message)
 
-# How msgspec begins to say that a number is beyond the `ge` or `le` of its field.
+# How msgspec begins its report of a number beyond the `ge` or `le` of its field.
 _BEYOND = tuple(f"Expected `{kind}` {sign}=" for kind in ("int", "float") for sign in "<>")
 _NONE = np.empty((0, 2))
 

@@ -2,7 +2,7 @@
 
 Writes the same bytes on every run; reads a file that may be missing, cut, hostile or no .npz at all.
 
-An .npz is a zip file of arrays, so a few bytes can claim any size, twice: the zip's index says how large a member is
+An .npz is a zip file of arrays, so a few bytes can claim any size, twice: the zip's index states how large a member is
 unpacked, the member's header how large the array. Both are compared, with each other and with a bound, before anything
 is unpacked.
 """
@@ -72,7 +72,7 @@ def read_npz(
     Args:
         path: The file.
         names: Which must be there; None: all there are.
-        fix: Said after the error: what the user can do.
+        fix: Printed after the error: what the user can do.
         also: Which are read as well where they are there.
         most_bytes: What the arrays may have together, unpacked; a small file may have less.
 

@@ -80,7 +80,7 @@ class ObjectProfile(Part, frozen=True):
     `markers`: three or more, not in one line; the rig lists their names in `free_markers`, the camera files have their
     colours. `tracker`: name of a device that tracks itself and sits on the object at `T_object_tracker`, which
     `phalanx calibrate tracker` measures, with `stamp_offset_us`: how much later its poses hold than their stamps
-    say. `shape`: parts of its surface, which distances and contact are measured to.
+    state. `shape`: parts of its surface, which distances and contact are measured to.
     """
 
     version: Literal[1]

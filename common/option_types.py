@@ -29,7 +29,7 @@ class Number:
         """
         try:
             value = int(text) if self.whole else float(text)
-        except ValueError as error:  # argparse would tell the name of the class
+        except ValueError as error:  # argparse would print the name of the class
             kind = "a whole number" if self.whole else "a number"
             raise ArgumentTypeError(f"{text}: must be {kind}") from error
         if not math.isfinite(value):

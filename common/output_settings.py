@@ -40,7 +40,7 @@ class VmcOutput(Part, frozen=True):
     Bones of the hands of a VRM avatar.
 
     `hand`: how the bone of the hand itself is turned: as the palm lies in the room, behind an arm that is kept in the
-    T-pose (palm), as the wrist is bent against the forearm, where a device on the forearm tells it (bend), or not at
+    T-pose (palm), as the wrist is bent against the forearm, where a device on the forearm gives it (bend), or not at
     all (rest). `q_avatar_rig`: quaternion wxyz, rig frame -> the avatar's frame in OpenXR axes (x to its right, y up,
     z to its back); the default is that of an upright camera that looks where the avatar looks.
     `forearm_m`: how far the hand is from the elbow, for receivers that move bones, too.

@@ -7,13 +7,13 @@ is a chain of spheres joined by cones. A sphere has the radius by which the palm
 so that the skin is as far from the bone as it should be.
 
 If the hand file gives `radius_m`, the skin is that far from every joint. If not, it is that of a hand of this size:
-shares of the distance between the knuckles of index and little finger, since the breadth of a hand tells the thickness
+shares of the distance between the knuckles of index and little finger, since the breadth of a hand gives the thickness
 of its fingers (Buchholz, Armstrong, "An ellipsoidal representation of human hand anthropometry", Human Factors 33,
 1991). The shares are those of the generic hand of the WebXR Input Profiles (MIT), cut across at these places while its
 own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and depths by breadth of hand of the scalable
 hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
 bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
-1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion tells of a person
+1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion measures of a person
 (`phalanx calibrate wrist subject`) is the file's `palmar_scale`, which multiplies both.
 """
 

@@ -55,7 +55,7 @@ def read_truth(
     Args:
         folder: The recording.
         names: Which must be there.
-        fix: Said after the error: what the user can do.
+        fix: Printed after the error: what the user can do.
         also: Which are read as well where they are there.
 
     Raises:

@@ -5,8 +5,8 @@ It contains the calibration it was made with.
     header | metadata "phalanx" | a file of calibration per attachment | chunks of messages | index
 
 There is a channel for each stream, sender and type, topic phalanx/STREAM/SENDER; a message is what `encode` makes of
-it (msgpack), and the channel's schema says what its fields are. The log time is when a message came, on the master's
-clock; the order in the file is that of writing, whatever the times say. A chunk is closed at least every half second
+it (msgpack), and the channel's schema states its fields. The log time is when a message came, on the master's
+clock; the order in the file is that of writing, whatever the times are. A chunk is closed at least every half second
 and given to the system at once: what is lost with the process is that half second. A file without its end is read up
 to the cut (`common.mcap_file`).
 """
@@ -197,7 +197,7 @@ class MessageRecording:
     Attributes:
         path: The file.
         files: Files of calibration by their relative path.
-        about: What its writer told of it: wire, program, started, and what else it gave.
+        about: Metadata from its writer: wire, program, started, and what else it gave.
         begin_t_ns, end_t_ns: First and last log time [ns]; both 0 where there is no message.
         counts: Stream -> messages.
         senders: Stream -> sender -> messages.

@@ -79,7 +79,7 @@ def refuse_misplaced(stream: str, name: str, message: AnyMessage) -> None:
     It is of another kind or sender, or of a time that cannot be.
 
     Raises:
-        RecordingError: The text says what, not where.
+        RecordingError: The message states what, not where.
     """
     if not isinstance(message, _kinds(stream)) or sender_of(message) != name:
         raise RecordingError(

@@ -85,7 +85,7 @@ class ImuCalibration(Part, frozen=True):
     `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
     frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
     the vertical, which drifts by `heading_drift_rad_s`; null: not known at all, as without a magnetometer.
-    `stamp_offset_us`: how much later its samples were taken than their stamps say.
+    `stamp_offset_us`: how much later its samples were taken than their stamps state.
     """
 
     name: Name = "imu"
@@ -115,10 +115,10 @@ class RigCalibration(Part, frozen=True):
     `solver`: whose hand is published: that of the card's line (fabrik), or that which the estimator makes from there.
     `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
     `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
-    `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
+    `stamp_offset_us`: how much later the frames of a camera were taken than their stamps state.
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
     finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
-    -> the line along which its laser point moves. `solver_mode`: fingers from the laser alone, bent by habit (fk),
+    -> the line along which its laser point moves. `solver_mode`: fingers from the laser alone, by joint coupling (fk),
     from laser and fingertip, without a tip not at all (ik), or from what there is (auto). `strobe`: laser and LEDs as
     lights, and how long they may shine.
     """
@@ -231,7 +231,7 @@ def check_rig(rig: RigCalibration, where: str) -> None:
 def check_places(rig: RigCalibration, where: str) -> None:
     """Refuse two cameras in one place.
 
-    Rays from one point have no intersection that tells a depth.
+    Rays from one point have no intersection that determines a depth.
 
     Raises:
         CalibrationError: With `where` and both cameras.

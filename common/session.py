@@ -3,8 +3,8 @@
 docs/wire.md draws it.
 
 From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
-- the rig tag, by which a datagram of another rig is told at once,
-- one key for every process that says beacon, hello or welcome, named by its random process id, so
+- the rig tag, by which a datagram of another rig is recognised at once,
+- one key for every process that sends beacon, hello or welcome, named by its random process id, so
   that two processes never seal under one key with the same nonce.
 
 From the rig key and the secret of one device (`common.link_key`), which only that device and the master know,
@@ -64,7 +64,7 @@ class Hello(Handshake, frozen=True):
         process: Random id of the slave's process, the `session` of its messages.
         slave_nonce: Drawn for this one attempt to get a session.
         master_nonce: That of the beacon: a hello to an earlier master is a replay.
-        proof: That who says it has the secret of `name`, and says it of all the fields above.
+        proof: That the sender has the secret of `name`, and vouches for all the fields above.
     """
 
     name: Name
@@ -97,8 +97,8 @@ class Unproven(Handshake, frozen=True):
 
     The master has another secret for its name. No session.
 
-    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It says only why: it is not
-    proven itself, and whoever has the rig key can say it.
+    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It states only why: it is not
+    proven itself, and whoever has the rig key can claim it.
     """
 
     master_nonce: Nonce

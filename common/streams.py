@@ -45,7 +45,7 @@ class Stream:
         path: Datagram or zenoh.
         key: Key on the zenoh bus, with {name} for the sender or target; None for datagrams.
         recorded: Whether the message recorder keeps it.
-        most_hz: Of those streams that devices say on the bus: what is taken of one sender per second.
+        most_hz: Of those streams that devices send on the bus: what is accepted of one sender per second.
     """
 
     message: type[Message]

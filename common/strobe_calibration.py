@@ -1,7 +1,7 @@
 """Laser and LEDs of a wrist device and their limits: the key `strobe` of a rig.
 
 The limits on pulse and duty are the user's; here they are held against those of the eye (`common.eye_safety`) and of
-the supply. `docs/safety.md` says what that covers, and what not. It is no certificate.
+the supply. `docs/safety.md` states what that covers, and what not. It is no certificate.
 """
 
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ class StrobeCalibration(Part, frozen=True):
     Attributes:
         max_pulse_us: No light is ever on for longer [us].
         max_duty: Nor for a larger share of any second; of each light.
-        lead_us: How much before an exposure a light goes on; what is late by more than that is left out [us].
+        lead_us: How much before an exposure a light goes on; what is late by more than that is rejected [us].
         others_w: What the device draws besides: camera, IMU [W].
         max_electrical_w: What all of it may draw in the mean [W]; 0.4 in Kim et al. 2012.
     """
@@ -88,7 +88,7 @@ class Limit:
         key: The keys of the rig file that decide it.
         value, bound: In `unit`.
         source: Where the bound is from.
-        fault: It tells of a fault, after which a light stays on; nothing is refused for it.
+        fault: It reports a fault, after which a light stays on; nothing is refused for it.
     """
 
     name: str

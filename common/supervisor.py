@@ -20,7 +20,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class ThreadEndedError(Exception):
-    """Error for a thread that returned before it was told to stop."""
+    """Error for a thread that returned before it was asked to stop."""
 
 
 class ThreadSupervisor:
@@ -74,7 +74,7 @@ def supervised_threads() -> Generator[ThreadSupervisor, None, None]:
 def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[], None]:
     """Make `work` a thread's work that fails when it returns too early.
 
-    To return is to fail unless `stopped` says that it was told to.
+    To return is to fail unless `stopped` reports that it was asked to.
     """
 
     def run() -> None:

@@ -2,7 +2,7 @@
 
 They were recorded by other people's cameras and programs.
 
-A frame is known by its number in the file, from 0. One that cannot be decoded has a number, too, and is left out, so
+A frame is known by its number in the file, from 0. One that cannot be decoded has a number, too, and is skipped, so
 that the same frame has the same number however often the file is read. Frames come in the order of the file: going
 forward costs what lies between, going back begins anew.
 
@@ -20,7 +20,7 @@ from common.errors import PictureError
 
 ENDINGS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 _MATROSKA = b"\x1a\x45\xdf\xa3"  # EBML, RFC 8794
-_GIVE_UP = 50  # frames in a row that do not decode, where the container does not say how many it has
+_GIVE_UP = 50  # frames in a row that do not decode, where the container does not state how many it has
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ Reach = Annotated[float, Meta(ge=-1.0, le=1.0)]  # [m] the device sees the finge
 Place = tuple[Reach, Reach, Reach]
 Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
 _MIN_OFFSET_M = (
-    1e-3  # of the laser's plane from the camera: nearer, it is seen along itself, and tells no depth
+    1e-3  # of the laser's plane from the camera: nearer, it is seen along itself, and measures no depth
 )
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 

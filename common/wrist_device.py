@@ -17,7 +17,7 @@ from common.hand_model import CHAINS, HandModel
 
 _ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
 _ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
-_LEAST_M = 1e-3  # a plane nearer to the lens than this tells no distance
+_LEAST_M = 1e-3  # a plane nearer to the lens than this measures no distance
 _FIELD_MARGIN = 1.0  # image sizes from the middle: half an image beside it
 _FARTHEST_M = 0.5  # a forearm
 _ORIGIN = np.zeros(3)

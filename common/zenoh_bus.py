@@ -51,7 +51,7 @@ class ZenohBus:
 
     Holds the zenoh session and everything declared on it. An unreachable peer does not delay the
     constructor by more than half a second; zenoh goes on trying, and everything declared here
-    holds again once the peer is back. `open` says whether it leaves this machine as plain text.
+    holds again once the peer is back. `open` states whether it leaves this machine as plain text.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class ZenohBus:
             listen: Endpoint where others connect to; needs the master's certificate if it is encrypted.
             connect: Endpoint of who listens; of several only for a router.
             access: Certificates, and whether plain text may leave the machine; None: as the variables PHALANX_KEYS and
-                PHALANX_OPEN say, for a master if it listens, else for an operator.
+                PHALANX_OPEN define them, for a master if it listens, else for an operator.
             beyond: See above.
             devices: Names that may connect, beside those whose certificates are in the keys folder.
             router: Pass everything on between all that are connected, in place of being one of them.
@@ -198,7 +198,7 @@ class ZenohBus:
         queries = queryable.handler
 
         def answer_next() -> None:
-            # A query is finished, and the asker told so, when it is left: never keep one while waiting.
+            # A query is finished, and its sender notified, when it is left: never keep one while waiting.
             with queries.recv() as query, suppress(zenoh.ZError):  # who asked may be gone
                 _answer(query, name, handler)
 
@@ -234,7 +234,7 @@ class ZenohBus:
                 raise BusError(
                     f"{command.target!r} refused {command.verb!r}: {printable(text[:MAX_REFUSAL])}"
                 )
-            # Nobody there yet looks the same as nothing to say: ask again, it costs nothing.
+            # Nobody there yet looks the same as no answer: ask again, it costs nothing.
             time.sleep(max(0.0, min(ASK_AGAIN_S, deadline - time.monotonic())))
         raise BusError(self._silence(command, timeout_s))
 
@@ -314,7 +314,7 @@ def _plain(error: zenoh.ZError) -> str:
 def _start(name: str, step: Callable[[], None], ended: Callable[[], bool]) -> threading.Thread:
     """Repeat `step` on a thread until zenoh closes what it reads from.
 
-    That is a failure unless `ended` says that it was meant to.
+    That is a failure unless `ended` reports that it was meant to.
     """
 
     def run() -> None:

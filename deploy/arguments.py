@@ -30,7 +30,7 @@ def add_demo(demo: ArgumentParser) -> None:
       phalanx demo --scene object                   a wand of painted beads travels before the cameras
       phalanx demo --scene grasp --rig desk-cube    the bar has a cube of tags: where it is, and which fingers touch it
       phalanx demo --scene gestures --seconds 80 --bus tcp/127.0.0.1:47802
-                                                    pinches, dials, taps and pointing, against what the hand really said
+                                                    pinches, dials, taps and pointing, against the gestures really made
     """
     view = demo.add_mutually_exclusive_group()
     view.add_argument(
@@ -248,7 +248,7 @@ def _seconds(text: str) -> float:
 def _positive(text: str) -> float:
     try:
         value = float(text)
-    except ValueError as error:  # argparse would tell the name of the function
+    except ValueError as error:  # argparse would print the name of the function
         raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError("seconds must be positive")

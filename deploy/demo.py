@@ -25,7 +25,7 @@ from typing import cast
 from deploy.process import Process
 from deploy.sensors import DemoError, Sensor, SensorKind, rig_options, sensors_of
 
-_READY_S = 90.0  # on a machine that has other things to do; who ends is told at once
+_READY_S = 90.0  # on a machine that has other things to do; an ended process is reported at once
 _STALE = ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd", "object_*.npz", "contact_*.npz",
           "gestures.jsonl")  # fmt: skip
 # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
@@ -96,7 +96,7 @@ def run_demo(
     Args:
         settings: What the user chose.
         stop: Set by Ctrl-C; the run then ends early, cleanly, and is summed up all the same.
-        say: Called with one line of progress at a time.
+        notify: Called with one line of progress at a time.
 
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
@@ -151,7 +151,7 @@ def play(
         keys: Keys folder of all processes.
         epoch_ns: When the scene begins, on this machine's monotonic clock.
         stop: Ends the run early.
-        say: Called with one line of progress at a time.
+        notify: Called with one line of progress at a time.
 
     Raises:
         DemoError: A process does not come up.

@@ -62,8 +62,8 @@ def deploy(
         targets: The machines.
         wish: What is wanted on them.
         reached: How they are reached.
-        ears: How their first datagrams are heard; None: nobody listens.
-        say: Called with one line a step, each with its host.
+        ears: How their first datagrams are received; None: nobody listens.
+        notify: Called with one line a step, each with its host.
     """
     hosts = _hosts(targets, reached, notify)
     if ears is None or wish.dry_run:

@@ -22,7 +22,7 @@ def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Not
         names: Senders.
         dry_run: Nothing is made there. A private folder takes its place for as long as this lasts, so that the rest of
             the way can be looked at: links to what is there, and what is lacking, made for nobody.
-        say: Called with what is made.
+        notify: Called with what is made.
 
     Raises:
         DeployError: They cannot be made.

@@ -16,7 +16,7 @@ from deploy.targets import DeployError, RigFile, Target
 from deploy.wheelhouse import Kind, wheelhouse
 
 STAGE = "/opt/phalanx/wheels"  # of root; the installer removes it
-_CLOCK_S = 0.5  # from here on it is said
+_CLOCK_S = 0.5  # from here on it is reported
 _PROBE_S = 60.0
 _PICAMERA2 = "picamera2"  # the default of cameras
 
@@ -31,7 +31,7 @@ class Wish:
         calibration: calib_json tree of the PC.
         keys: Keys folder of the PC.
         options: Of the installer, handed on.
-        cameras: What was said of their drivers: DRIVER or NAME=DRIVER.
+        cameras: Their drivers as given: DRIVER or NAME=DRIVER.
         wheels: Folder of wheels; None: they are downloaded.
         apt: Whether packages of the system are installed.
         dry_run: Write nothing.
@@ -72,7 +72,7 @@ class Host:
     Attributes:
         target: Which, and for what.
         remote: How it is reached.
-        say: Called with one line a step.
+        notify: Called with one line a step.
         sudo: Whether root is reached by sudo.
         changed: Whether something was changed, which can be taken back.
         reboot: Whether it runs only after it was restarted.
@@ -203,7 +203,7 @@ class Host:
         """Run the installer there; its result.
 
         Raises:
-            DeployError: It failed; its own line says why.
+            DeployError: It failed; its own line states why.
         """
         result: dict[str, object] = {}
         last = ""

@@ -143,4 +143,4 @@ def _give_way(pid: int, nice: int) -> None:
             except BlockingIOError:
                 time.sleep(_SESSION_AGAIN_S)
     except OSError:
-        return  # it has ended, or nobody may say so here: it runs as the others do
+        return  # it has ended, or it may not be changed here: it runs as the others do

@@ -28,7 +28,7 @@ _SETTINGS = (
     f"ServerAliveCountMax={ALIVE_TIMES}",
 )
 _NOT_REACHED = 255  # ssh's own exit code
-_HINTS = (  # the first that is found: a changed host key is said with two of them
+_HINTS = (  # the first that is found: a changed host key is reported with two of them
     (
         "Could not resolve hostname",
         "no machine of that name is known here; switched on, in this network? Or give its address in place of HOST",
@@ -163,7 +163,7 @@ def run_bounded(
     Args:
         words: The command.
         send: Its input.
-        on_line: Called with each line that it says.
+        on_line: Called with each line that it prints.
         limit_s: After so many seconds it is ended, with all that it started.
         environment: Variables besides those of this process.
         ended: It is ended when this is set, too.

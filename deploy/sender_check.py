@@ -20,7 +20,7 @@ from deploy.remote import run_bounded
 WAIT_SENDERS_S = (
     12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
 )
-LEAST_S = 4.0  # a master tells its counts once a second, a beacon comes as often
+LEAST_S = 4.0  # a master reports its counts once a second, a beacon comes as often
 _TIMES = 2.0
 _BEFORE_S = 5.0
 _END_S = 60.0  # of the program that listens, besides what it listens
@@ -46,7 +46,7 @@ class Received:
     """Datagrams that were received.
 
     Attributes:
-        rates: Name -> datagrams a second, of those that were heard.
+        rates: Name -> datagrams a second, of those that were received.
         cause: Why nobody could listen; None: somebody did.
         master: Whether it was a master that runs, which others may ask meanwhile.
     """

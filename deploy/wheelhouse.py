@@ -77,7 +77,7 @@ def wheelhouse(kind: Kind, given: Path | None, notify: Callable[[str], None]) ->
     Args:
         kind: Of machine.
         given: Folder that the user made; ours is added if it is missing there. None: they are downloaded.
-        say: Called when something is downloaded.
+        notify: Called when something is downloaded.
 
     Raises:
         DeployError: A wheel cannot be had.

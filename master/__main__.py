@@ -14,7 +14,7 @@ def main() -> int:
 
     0 done, 1 something the user can mend, 2 wrong usage, 70 a fault, 130 interrupted.
     """
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it logs its font cache on the first run
     return program().main()
 
 

@@ -27,7 +27,7 @@ OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no u
 _FASTER = (
     2.0  # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
 )
-_ANY_HZ = 10_000.0  # where no file says a rate
+_ANY_HZ = 10_000.0  # where no file states a rate
 _LEAST_HZ = 60.0
 _IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
 _TRACKER_HZ = 500.0
@@ -56,7 +56,7 @@ class SenderLimits:
 def bucket_of(rate_hz: float | None) -> TokenBucket:
     """How many messages of one kind may come from a sender.
 
-    `rate_hz` is that of its files; None: they say none.
+    `rate_hz` is that of its files; None: they state none.
     """
     per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
     return TokenBucket(per_s, per_s * _BURST_S)

@@ -105,7 +105,7 @@ def send_all(bus: Bus, steps: list[Command]) -> Health:
     """Ask one after the other; the last answer.
 
     Raises:
-        BusError: No such camera is on the bus, or it refused; what was told before stays.
+        BusError: No such camera is on the bus, or it refused; what was set before stays.
     """
     _appear(bus, steps[0].target)
     health: Health | None = None

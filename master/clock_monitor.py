@@ -2,7 +2,7 @@
 
 It covers the clocks of the slaves, the phases of the cameras and wrong time stamps.
 
-Gauges for `Health`, and lines for a person. Nothing here corrects anything.
+Metrics for `Health`, and lines for a person. Nothing here corrects anything.
 """
 
 from collections.abc import Callable, Sequence

@@ -5,7 +5,7 @@ The results are hands, objects, contact and gestures.
 In this order, because the hand is what is waited for: first the poses that a message completes, of every hand, then
 those of objects, then what the hands do. `push` is a generator: what it gave is out before the next is worked out.
 
-Objects belong to the marker rig that names them; a hand that markers tell is in the same frame, so contact is made for
+Objects belong to the marker rig that names them; a hand measured by markers has the same frame, so contact is made for
 each of those and every object. A wrist device alone has a frame of its own: its hand touches nothing that we know.
 """
 
@@ -51,7 +51,7 @@ class _Auxiliary:
     Attributes:
         shown: Camera -> the objects that it may see.
         trackers: Tracker -> the object that it sits on.
-        contacts, gestures: Hand -> what tells that of it.
+        contacts, gestures: Hand -> what detects that of it.
     """
 
     objects: tuple[TrackedObject, ...]

@@ -65,13 +65,13 @@ class Ingest:
             clock: The clock that every time is moved to.
             beacon: Where beacons go: a broadcast address and the slaves' beacon port.
             bind: Own address and port (0: any).
-            zenoh_endpoint: Where this master's bus listens, told to the slaves; may be empty.
+            zenoh_endpoint: Where this master's bus listens, sent to the slaves; may be empty.
             start_timeout_s: How long the first slave waits for the others.
             random: Source of nonces.
             imus: Names of IMUs that may take part.
             wrists: Those of `cameras` that belong to a wrist device.
             trackers: Names of devices that track themselves and may take part.
-            limits: What the files say of each sender (`admission.limits_of`); without, only what its messages can be.
+            limits: What files state of each sender (`admission.limits_of`); without, only what its messages can be.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
@@ -184,7 +184,7 @@ class Ingest:
         """Return the recently rejected peers by sender, in three mappings.
 
         The first has where a second process of the sender's name was rejected lately; the second where it speaks
-        another version; the third where somebody says hello without its secret.
+        another version; the third where somebody sends a hello without its secret.
         """
         t_ns = self._clock.now_ns()
         with self._lock:

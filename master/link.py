@@ -2,21 +2,21 @@
 
 It has the sessions of all slaves, as a push machine without a socket.
 
-`common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
+`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
-- A hello counts only with the proof that who says it has the secret of its name: a stolen device of the rig begins no
+- A hello counts only with the proof that its sender has the secret of its name: a stolen device of the rig begins no
   session in another's name, and takes no room of it.
 - A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns. Who was
-  silent for longer is replaced by whoever says hello.
+  silent for longer is replaced by whoever sends a hello.
 - A message whose time is yet to come, older than a second, or not after the last is not taken: the slave's clock was
-  stepped, and the echoes will tell how far.
-- A message counts in the session of the process that said hello, within the bounds of its type and of the sender's
+  stepped, and the echoes will measure how far.
+- A message counts in the session of the process that sent the hello, within the bounds of its type and of the sender's
   files (`master.admission`). One that makes something fail costs its sender a pause (`master.quarantine`).
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
   first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
-- A camera says markers and, when it looked for them, tags; that of a wrist device its triples, an IMU samples, a
+- A camera sends markers and, when it searched, tags; that of a wrist device its strobe cycles, an IMU samples, a
   tracker poses. Each kind of message has numbers of its own.
 - Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
@@ -102,7 +102,7 @@ class MasterLink:
         """Begin a new life of the master, with a nonce from `random`.
 
         `imus` and `trackers` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a
-        wrist device: they send strobed triples, the others markers and tags. `limits` is what the files say of each
+        wrist device: they send strobe cycles, the others markers and tags. `limits` is what the files state of each
         sender; one that is not in it has the bounds of its messages alone.
 
         Raises:
@@ -331,7 +331,7 @@ class MasterLink:
         try:
             result = self._opened(session, sender, header, datagram, t_ns)
         except Exception as error:  # noqa: BLE001
-            # Whatever a device says costs this device a pause, and never the thread that hears all others.
+            # Whatever a device sends costs this device a pause, and never the thread that receives from all others.
             self.quarantine.fault(session.name, error, t_ns)
             result = Refusal.FAULTY
         sender.refused += isinstance(result, Refusal)

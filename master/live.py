@@ -59,7 +59,7 @@ class LiveSettings:
             contact and gestures in its folder.
         summary: Where to write the summary, or None.
         files: Where the setups were read: what changes there is used at once. None: they stay as they are.
-        record: Where to record all that is taken and told (MCAP), or None; needs `files`.
+        record: Where to record all that is received and published (MCAP), or None; needs `files`.
     """
 
     beacon: tuple[str, int]

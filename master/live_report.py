@@ -126,7 +126,7 @@ class Reporter:
     def _looked(self) -> list[str]:
         """Lines of what the monitors of this second found.
 
-        What senders say may make one fail, but not the report.
+        What senders send may make one fail, but not the report.
         """
         try:
             if self._tuning is not None:

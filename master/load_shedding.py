@@ -2,10 +2,10 @@
 
 It solves the newest epoch, and no message is lost for it.
 
-An instant is left out (*shed*, counted as `instants_shed`) when what waits already completes a newer one of the same
-hand: where the hand was then interests nobody any more. All messages are taken, for a camera's past tells where its
-markers are at every instant. A newer instant waits when the leading camera, the first of the rig, has a frame in the
-queue, and every other camera has one there that is not older. So what is left out is a period of the cameras older than
+An epoch is dropped (*shed*, counted as `instants_shed`) when what waits already completes a newer one of the same
+hand: where the hand was then interests nobody any more. All messages are taken, for a camera's past shows where its
+markers are at every epoch. A newer epoch waits when the leading camera, the first of the rig, has a frame in the
+queue, and every other camera has one there that is not older. So what is dropped is a period of the cameras older than
 what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
@@ -20,9 +20,9 @@ from common.messages import Detections, Message
 from master.message_queue import QUEUE_PER_CAMERA, Span
 from master.rig_setup import RigSetup
 
-MOST = QUEUE_PER_CAMERA  # instants in a row: as many as can wait; a master that has no time but for messages tells some
+MOST = QUEUE_PER_CAMERA  # epochs in a row: as many as can wait; a master that has no time but for messages solves some
 _SILENT_PERIODS = (
-    12  # of the slowest camera: so long nothing waits for one that says nothing, as in `Pairing`
+    12  # of the slowest camera: so long nothing waits for one that sends nothing, as in `Pairing`
 )
 
 
@@ -32,7 +32,7 @@ class Cameras:
 
     Attributes:
         centre_ns: Camera -> middle of its frames after their stamps [ns].
-        silent_ns: A camera that said nothing for so long is not waited for.
+        silent_ns: A camera that sent nothing for so long is not waited for.
     """
 
     centre_ns: Mapping[str, int]
@@ -74,7 +74,7 @@ class LoadShedding:
 
     Attributes:
         waiting: Camera -> when its frames are that have come and were not taken yet [ns].
-        reject: How many instants are left out between two that are solved, of each hand; 0: none.
+        reject: How many epochs are dropped between two that are solved, of each hand; 0: none.
     """
 
     def __init__(self, setups: Sequence[RigSetup] = ()) -> None:

@@ -46,7 +46,7 @@ def bus_of_master(
 
     A router for `site` will do too.
 
-    `waiting` is told once why not yet.
+    `waiting` is called once with why not yet.
 
     Raises:
         BusError: The endpoint is malformed, or keys are missing.

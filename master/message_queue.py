@@ -15,7 +15,7 @@ from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerP
 from common.streams import sender_of
 from master.link_senders import SensorMessage
 
-QUEUE = 64  # frames, or triples, that may wait, of one or two cameras
+QUEUE = 64  # frames, or strobe cycles, that may wait, of one or two cameras
 QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
 CAPACITY = {
     "frame": QUEUE,

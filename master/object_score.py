@@ -89,9 +89,9 @@ def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
     """Of one object.
 
     Returns:
-        mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true instants at which it
-        was), occluded (share of the tracked poses that say so), nees (median of the squared error by
-        its covariance, six numbers: about 5.3 where that is honest). What has nothing to average is left out.
+        mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true epochs at which it
+        was), occluded (share of the tracked poses that report it), nees (median of the squared error by
+        its covariance, six numbers: about 5.3 where that is consistent). What has nothing to average is omitted.
     """
     mm, deg = errors(poses, truth)
     seen = poses.tracked & np.isfinite(mm) & np.isfinite(deg)

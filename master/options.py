@@ -2,7 +2,7 @@
 
 Also what the texts behind them mean.
 
-`--keys` and `--open` say the same as their environment variables, and set them: programs that a command starts by
+`--keys` and `--open` mean the same as their environment variables, and set them: programs that a command starts by
 itself, such as the recorder, or what the console's page begins, belong to the same rig.
 """
 
@@ -235,7 +235,7 @@ class _UseKeys(argparse.Action):
                 f"--keys {folder}: no such folder; make it: phalanx fleet keys {folder} --make"
             )
         os.environ[_KEYS] = str(folder.resolve())
-        os.environ.pop(_RIG_KEY, None)  # what was said last counts
+        os.environ.pop(_RIG_KEY, None)  # the last setting counts
 
 
 class _UseOpen(argparse.Action):

@@ -87,7 +87,7 @@ class CameraPhases:
             was = self._in_step[name]
             now = self._near[name] >= _LOOKS if near else False
             if near and not now:
-                continue  # not yet told
+                continue  # not yet reported
             if now != was:
                 self._in_step[name] = now
                 state = "in step with" if now else "free of"

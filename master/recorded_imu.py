@@ -30,7 +30,7 @@ def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[
     The setup has the accuracy of these samples.
 
     A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live slave makes
-    its orientation of them. The heading of that begins anywhere, whatever the rig's file says of it.
+    its orientation of them. The heading of that begins anywhere, whatever the rig's file states of it.
 
     Raises:
         RecordingError: imu.csv is broken.

@@ -1,4 +1,4 @@
-"""Who was turned away lately, by name.
+"""Who was rejected lately, by name.
 
 Second processes under one name, slaves of another wire version, slaves whose secret is not the one that the
 master has for their name, and slaves whose rig has other markers.
@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 from common.datagram import HEADER, MAGIC, Header, Kind
 from common.session import RigKeys
 
-LATELY_NS = 1_500_000_000  # both say hello again within a second
+LATELY_NS = 1_500_000_000  # both send a hello again within a second
 _POLL_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
 
 
@@ -21,7 +21,7 @@ SeenT = TypeVar("SeenT")
 
 
 class RejectedPeer(NamedTuple):
-    """Where somebody who was turned away speaks from: host, and what wire version."""
+    """Where somebody who was rejected sends from: host, and what wire version."""
 
     host: str
     version: int
@@ -50,7 +50,7 @@ class RejectedPeers:
         self._next_ns: int | None = None
 
     def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Record a duplicate sender `name`, which said hello at `t_ns` [ns].
+        """Record a duplicate sender `name`, which sent a hello at `t_ns` [ns].
 
         A second process under this name, while the first one was well.
         """
@@ -94,7 +94,7 @@ class RejectedPeers:
         return _lately(self._versions, t_ns)
 
     def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Return where senders say hello without their secret, as of `t_ns` [ns].
+        """Return where senders send a hello without their secret, as of `t_ns` [ns].
 
         A mapping from name to where.
         """

@@ -31,7 +31,7 @@ def replay_recording(options: Namespace, notify: Notify) -> None:
     wanted = () if folder != _given(options) else options.rig
     manifest = load_manifest(folder)
     rigs = rigs_to_solve(manifest, wanted, options.only, options.level, options.solver)
-    if options.hand is not None and not options.hand.is_file():  # said now, not after all the detection
+    if options.hand is not None and not options.hand.is_file():  # reported now, not after all the detection
         raise RecordingError(f"{options.hand}: no such hand profile")
     out: Path = options.out
     try:

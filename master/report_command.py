@@ -71,7 +71,7 @@ def _parser() -> ArgumentParser:
 def main() -> None:
     """Run it; an error is a line."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it logs its font cache on the first run
     try:
         report(sys.argv[1:])
     except PhalanxError as error:

@@ -3,8 +3,8 @@
 Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Objects are
 those of all of them together.
 
-Each pair of cameras is calibrated in a frame of its own; `T_world_rig` says where that lies in the one they share. What
-rigs of one hand say twice must be said alike: a silent choice between two filters would be nobody's.
+Each pair of cameras is calibrated in a frame of its own; `T_world_rig` is where that lies in the one they share. What
+rigs of one hand specify twice must be specified alike: a silent choice between two filters would be nobody's.
 """
 
 from collections.abc import Mapping, Sequence

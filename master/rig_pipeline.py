@@ -191,7 +191,7 @@ def build_pipeline(
         continuous: False: every frame is an unrelated pose; no filter, no memory.
         side: Wrist device and IMU; None: there are none, or they are left out.
         counts: Counted into; None: counts of its own.
-        shed: Asked for each instant whether it is left out; None: none is.
+        shed: Asked for each epoch whether it is dropped; None: none is.
 
     Raises:
         CalibrationError: The depth model or the solver does not fit the rig, or it is no marker rig.

@@ -27,7 +27,7 @@ from master.outputs.result_files import (
 )
 from master.rig_setup import RigSetup
 
-_LATE_S = 0.4  # a gesture that is told so long after it was made is not that one
+_LATE_S = 0.4  # a gesture that is reported so long after it was made is not that one
 _GAP_NS = 200_000_000  # between two rows of one contact
 _TRUTH_HZ = 60.0
 
@@ -115,8 +115,8 @@ class RunResults:
 
         Returns:
             Those of `score_objects`; held_s, how long an object was held; gestures, how often each was made
-            (kind and name -> count). Where the hand of the scene knows what it says: gestures_right, of those that it
-            made how many were told, gestures_made, gestures_false, told and not made; dial_deg, the median error of
+            (kind and name -> count). Where the scene's hand knows what it signals: gestures_right, of those that it
+            made how many were reported, gestures_made, gestures_false, those not made; dial_deg, median error of
             the dial's angle.
         """
         out: dict[str, object] = {}

@@ -3,12 +3,12 @@
 Frames received, lost, skipped, late, duplicate, reordered on the way.
 
 A frame is *lost* when it was sent and never came, *skipped* when nothing was sent under its number: numbers
-alone cannot tell, so `Sequence` counts both as lost and `Losses` parts them by the counters of the datagrams. It is
+alone cannot distinguish, so `Sequence` counts both as lost and `Losses` parts them by counters of the datagrams. It is
 *late* when it came after a newer one, and is dropped then, because the newer one was used already. So received + lost +
 skipped + late is the number of frames between the first and the last. A restarted slave is a new sequence.
 
 The camera of a wrist device sends one message for three frames, numbered by its laser frame. There all of this counts
-triples: numbers three apart miss nothing, and one more or less, after a frame that slipped, neither. Tags are looked
+strobe cycles: numbers three apart miss nothing, and one more or less, after a slipped frame, neither. Tags are looked
 for in some frames only: their numbers rise as they like, and nothing is missing between two.
 """
 

@@ -1,6 +1,6 @@
 """Ctrl-C and a stop by the system as an event.
 
-For commands that run until they are told to end.
+For commands that run until they are asked to end.
 """
 
 import signal

@@ -3,7 +3,7 @@
 What cameras see of it and a tracker on it become one row of poses.
 
 Cameras measure it in the rig's own frame, a tracker through its registration. So while cameras track it their poses
-are told, and the tracker's where they do not; what cameras hold is not told while the tracker knows better. Time never
+are output, and the tracker's elsewhere; what cameras hold is not output while the tracker knows better. Time never
 goes back.
 """
 

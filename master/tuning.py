@@ -5,7 +5,7 @@ Other geometry, depth model, filter, hand, object or gestures: a new pipeline re
 Each hand has a pipeline; only those change whose files did; objects and gestures change together (`master.dispatcher`).
 
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
-it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
+it takes over, between two messages. An epoch is never solved twice: poses go on with rising times.
 """
 
 import threading
@@ -71,7 +71,7 @@ class _OrientationSample:
 class LivePipeline:
     """The pipeline of one hand in use.
 
-    Holds it, its setup, what it was told last, and the one that is to take over with the next message.
+    Holds it, its setup, what it was passed last, and the one that is to take over with the next message.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class LivePipeline:
             CalibrationError: As `change`.
         """
         stage = _WhenOpen(self._stage)
-        # What it is shown to warm up has been solved by the other already: nothing of it is left out.
+        # What it is shown to warm up has been solved by the other already: nothing of it is dropped.
         dropped_epochs = self._dropped_epochs
         new = pipeline_of(
             setup,

@@ -57,7 +57,7 @@ class UserServices:
     def install(self, text: str) -> str:
         """Write the unit and start it, now and at each login.
 
-        Returns a line that says what was done.
+        Returns a line that states what was done.
 
         Raises:
             PhalanxError: It does not run; with its last words. It goes on being tried.

@@ -2,7 +2,7 @@
 
 The box, stated by the rig and in the rig frame, in which its accuracy was tested.
 
-Outside it a hand is tracked as well as the cameras see it, but how well is not known. So a joint says whether it lies
+Outside it a hand is tracked as well as the cameras see it, but how well is unknown. So a joint reports whether it lies
 inside; that it does not, alone makes no pose invalid.
 """
 

@@ -48,7 +48,7 @@ def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progr
 
     The errors are as `score_wrist` has them.
 
-    Such a pose carries the points of the last triple. Each triple counts once, at the first pose after it.
+    Such a pose carries the points of the last strobe cycle. Each cycle counts once, at the first pose after it.
     """
     point = poses.laser_m.reshape(len(poses), -1)
     measured = np.asarray(np.isfinite(point).any(axis=1))

@@ -2,7 +2,7 @@
 
 They cover its laser points, its fingertips, and the hand solved from them.
 
-Every strobed triple of the truth counts once, also one of which nothing was made: what is not found is missed there.
+Every strobe cycle of the truth counts once, also one of which nothing was made: what is not found is missed there.
 """
 
 import logging
@@ -30,7 +30,7 @@ _NEAR_PX, _FAR_PX = (
 )  # of a tip that is found, and of one that is false: half the width of a fingertip
 _STRAIGHT_RAD = np.radians(
     85.0
-)  # up to here the laser tells the flexion; from about 95 degrees its point stands still
+)  # up to here the laser measures the flexion; from about 95 degrees its point stands still
 _MATCH_NS = 5_000_000  # less than half the time from one frame to the next
 _OF_WRIST = "wrist_"
 _ARRAYS = ("t_ns", "laser_pt", "laser_len_vis", "tip_uv", "tip_visible", "joints", "angles")
@@ -84,7 +84,7 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     """Truth of a rendered wrist recording; None where there is none.
 
     Its rows stand at its own `t_ns` where it has some; else there is one for each laser frame of `camera`. Where
-    frames were lost since, nobody can say which: there is none then, with a warning. In a recording of both kinds its
+    frames were lost since, it is not known which: there is none then, with a warning. In a recording of both kinds its
     keys begin with `wrist_`.
 
     Raises:
@@ -134,7 +134,7 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
         pip_rms_deg, pip_rms_deg_<finger>: RMS error of the PIP up to 85 degrees, of fingers that are tracked;
             pip_untracked: how many others there are.
         pip_deg, joint_mm: Mean over the fingers, and joints, that are valid.
-        both_<finger>: Triples in which laser (2 mm of line or more) and fingertip are seen, by the truth;
+        both_<finger>: Strobe cycles in which laser (2 mm of line or more) and fingertip are seen, by the truth;
             both_ik_<finger>: those of them that were solved from both; both_pip_deg_<finger>: mean error of the PIP
             (thumb: MCP) in those where the finger is valid.
         frames_without_pose: Poses of which nothing is valid.

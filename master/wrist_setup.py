@@ -28,7 +28,7 @@ class WristSetup(WristDevice):
         filter: Of the laser points, where frames follow each other.
         volume: What the rig states, or None.
         frame_s: From frame to frame of its camera.
-        late_ns: How much later frames are taken than their stamps say [ns].
+        late_ns: How much later frames are taken than their stamps state [ns].
         imu: The IMU on the forearm, where it is known how that is mounted; or None.
     """
 
@@ -46,7 +46,7 @@ class WristSetup(WristDevice):
     def of(cls, rig: RigCalibration, camera: CameraCalibration, model: HandModel) -> "WristSetup":
         """Build and check.
 
-        Where the rig does not say where its laser is, it is put at the foot of the camera on its plane: the laser of
+        Where the rig does not state where its laser is, it is put at the foot of the camera on its plane: the laser of
         such a device sits beside the lens.
 
         Raises:

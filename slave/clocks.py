@@ -145,8 +145,8 @@ class DeviceClock:
         Of stamps that came together all are learned from before the first becomes a time.
 
         Args:
-            stamp_ns: What the sensor said, later than the last time [ns].
-            arrival_ns: A moment at which it had said it, slave's clock [ns].
+            stamp_ns: The sensor's time stamp, later than the last one [ns].
+            arrival_ns: A time at which that stamp had already been received, slave's clock [ns].
 
         Returns:
             Whether it can be: it is not older than the last, and not from the future.

@@ -38,7 +38,7 @@ class Counters:
             gaps: What their numbers leave out is called.
             empty: What items without anything in them are called; empty: they are not counted.
             counts: More counts, given out with these.
-            metrics: More metrics, likewise; those that are no number are left out.
+            metrics: More metrics, likewise; those that are not numbers are omitted.
         """
         self._items, self._gaps, self._empty = items, gaps, empty
         self._more_counts, self._more_metrics = counts, metrics

@@ -19,7 +19,7 @@ def engine_of(name: str, numpy: _Engine, numba: Callable[[], _Engine]) -> _Engin
         numba: Loads the other one: an optional package, which only who asks for it loads.
 
     Raises:
-        PhalanxError: numba is asked for and not installed; the text says how to install it.
+        PhalanxError: numba is asked for and not installed; the message states how to install it.
         ValueError: No such name.
     """
     if name == "numpy":

@@ -2,7 +2,7 @@
 
 At most one line is written in ten seconds.
 
-What is a `PhalanxError` is said in its own words. Whatever else a driver or a detector raises is a fault in a program:
+A `PhalanxError` is logged by its own message. Whatever else a driver or a detector raises is a fault in a program:
 it is counted, and logged with its traceback.
 """
 
@@ -22,7 +22,7 @@ ValueT = TypeVar("ValueT", int, float)
 class Failures:
     """Counts and logs the errors of one device or loop.
 
-    Holds how many were none of ours, when the last line was logged, what was left out, and if any is open.
+    Holds how many were none of ours, when the last line was logged, how many were not logged, and if any is open.
     """
 
     def __init__(self, of: str, clock: Callable[[], int] = now_ns) -> None:
@@ -73,7 +73,7 @@ class Failures:
             self.log("could not be given back", error)
 
     def over(self, event: str) -> None:
-        """Log that all is well again, unless what went wrong was left out, too."""
+        """Log that all is well again, unless the failure itself was not logged, too."""
         if self._open:
             _LOG.warning("%s: %s", self._of, event)
         self._open = False

@@ -5,7 +5,7 @@ Recordings of single cameras, and of the IMU, made side by side, become one reco
 Every camera is recorded by a process of its own, into a folder of its own. Cameras of one rig become a recording of
 that rig; those of several rigs, such as marker cameras and the wrist device of one hand, one of all rigs. Their times
 can be compared as they are when they are on one clock: one start of one machine. Between machines only the wall clocks
-say how the clocks lie to each other, as well as something (NTP, PTP) keeps those together; so that is done only on
+relate the clocks to each other, as well as something (NTP, PTP) keeps those together; so that is done only on
 request.
 """
 

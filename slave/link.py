@@ -2,17 +2,17 @@
 
 It runs from the first beacon to data, as a push machine.
 
-`common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
-- While the master of the session is heard, beacons of any other life are ignored: an old one
+`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
+- While the master of the session is received, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
   this device; the session changes only then. Who only has the rig key ends none. Unanswered for `NONCE_NS` it goes on
-  with another nonce: the master takes none twice, and may have given that one up for a twin or a replay.
-- A session that the master's beacons do not list for a second is lost to it: say hello again.
-- Whoever is not welcomed though the beacons list its name has a twin. It goes on saying hello: the master takes it as
+  with another nonce: the master takes none twice, and may have rejected that one as a duplicate sender's or a replay.
+- A session that the master's beacons do not list for a second is lost to it: send a hello again.
+- Whoever is not welcomed though the beacons list its name has a duplicate. It keeps sending hello: it is accepted as
   soon as the other one is silent.
-- To a beacon of its rig in another wire version it says a hello in its own, once a second: the master cannot take it,
-  and can tell who it is.
+- To a beacon of its rig in another wire version it sends a hello in its own, once a second: the master cannot take it,
+  and can identify the sender.
 """
 
 from collections import Counter
@@ -52,7 +52,7 @@ DUPLICATE_SENDER_NS = (
     1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
 )
 STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
-LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
+LATELY_NS = 2_500_000_000  # so long after it was last seen something is reported as wrong
 _DUPLICATE_SENDER = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 

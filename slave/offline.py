@@ -156,7 +156,7 @@ def calibrate_colours(
 
     Writes its camera file.
 
-    With clicks, from the clicked paints of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
+    With clicks, from the clicked colours of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
     from what moves with the hand in all frames.
 
     Args:
@@ -164,16 +164,16 @@ def calibrate_colours(
         camera: Camera name.
         output: Camera file to write: the recording's, with `markers` filled.
         clicks: Marker -> (u, v) [px] in the camera's first frame, before those of the recording.
-        auto: Use all frames though there are clicks; these then only name the paints.
-        like: Camera file whose hues name the paints; the shape of the hand checks them where it can.
-        hand: Hand profile whose shape names the paints, or checks their names; by default
+        auto: Use all frames though there are clicks; these then only name the marker colours.
+        like: Camera file whose hues name the marker colours; the shape of the hand checks them where it can.
+        hand: Hand profile whose shape names the marker colours, or checks their names; by default
             calib_json/hands/<hand of the rig>.json.
-        say: Receives lines of progress.
+        notify: Receives lines of progress.
 
     Raises:
         RecordingError: The recording is broken, has no frame of the camera, or clicks for some markers only.
-        FitError: A click is not on a paint, two paints look the same, or the frames do not tell the paints or
-            their names for certain; the text says what to do.
+        FitError: A click is not on a marker colour, two look the same, or the frames do not determine the colours or
+            their names for certain; the message states what to do.
         CalibrationError: A file cannot be read or written.
     """
     recording = open_recording(folder)

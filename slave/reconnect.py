@@ -5,7 +5,7 @@ after 0.2 s, 0.4 s ... until the device is there or the slave ends. Every openin
 settings again. `seq` goes on behind a gap of as many items as fit into the absence, so that they count as dropped.
 
 Whatever a driver raises, also what is no error of ours, is a loss of its device. Only that several devices are there
-and nobody said which one is meant is mended by no waiting: that error goes on to the user.
+and none was selected is mended by no waiting: that error goes on to the user.
 """
 
 import threading

@@ -8,7 +8,7 @@ The camera never waits for the disk.
 
 A frame is encoded by any of several threads and written by one, in the order of the camera. The disk is looked at
 before every frame: where less than a reserve would be left, where it is full or gone, the recording ends with what
-was complete, and `failure` says why.
+was complete, and `failure` states why.
 """
 
 import os
@@ -79,7 +79,7 @@ class Recorder:
             queue_bytes: Memory for frames that wait; two fit in any case.
             free_bytes: What is free on the disk of a folder.
             encoders: So many threads at most encode, and one a core.
-            reserve_option: What a user says to have another reserve.
+            reserve_option: The option by which a user sets another reserve.
 
         Raises:
             RecordingError: The folder holds something, or cannot be written.
@@ -117,7 +117,7 @@ class Recorder:
         Whatever comes after the end is ignored.
 
         Raises:
-            RecordingError: The image is not of the size the camera file says.
+            RecordingError: The image is not of the size given by the camera file.
         """
         size = (self._camera.height_px, self._camera.width_px)
         if frame.image.shape[:2] != size or frame.image.dtype != np.uint8:
@@ -145,7 +145,7 @@ class Recorder:
         try:
             free = self._free(self._folder)
         except OSError:
-            free = 0  # the disk is gone; the writer will say so
+            free = 0  # the disk is gone; the writer will report it
         room = max(free - self._reserve, 0)
         return Progress(
             self._frames,
@@ -233,7 +233,7 @@ def feed(source: FrameSource, recorder: Recorder, stop: threading.Event) -> None
 
     Raises:
         CameraError: The camera is gone.
-        RecordingError: Its images are of another size than its file says.
+        RecordingError: Its images are of another size than by its file.
     """
     while not stop.is_set() and recorder.wants_more and (frame := source.read()) is not None:
         recorder.offer(frame)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # of cameras alone
     from slave.tuning import CameraTuning
 
 LOG_EVERY = 20  # reports
-ALONE_AT = 6  # the report after which a slave without a master says what it hears
+ALONE_AT = 6  # the report after which a slave without a master logs what it receives
 _LOG = logging.getLogger(__name__)
 
 
@@ -87,7 +87,7 @@ class Reporter:
     def answer(self, command: Command) -> Health:
         """Obey a command.
 
-        "report" says how it is, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
+        "report" sends a report, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
         the slave; the others are those of the camera and of raw frames.
 
         Raises:

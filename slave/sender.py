@@ -215,7 +215,7 @@ def wait_for_start(
 ) -> bool:
     """Wait for the master as long as it takes.
 
-    False if told to stop before, or the source has ended.
+    False if stopped before, or the source has ended.
 
     Args:
         started: Waits for the start at most so many seconds; whether it has come.

@@ -3,7 +3,7 @@
 Ready, what it does now, and that its loop goes round.
 
 The watchdog is fed by the loop itself, never by a thread that would live on while the loop hangs. A wait that may be
-long and is no hang says so: for the master it comes round again and again; a lost camera asks for more patience
+long and is no hang reports so: for the master it comes round again and again; a lost camera asks for more patience
 (`WATCHDOG_USEC`), as does a slow start (`EXTEND_TIMEOUT_USEC`), and a hang in those is ended, too, only later.
 
 It is fed four times in a period, not twice: of a slave that is stopped for 3 s with a watchdog of 5 s, up to 3.75 s may
@@ -42,8 +42,8 @@ def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
 class Service:
     """Belongs to the thread of the loop.
 
-    Holds where to tell it, the watchdog's period, how often the loop went round since it was last said, and when it is
-    to be said again.
+    Holds where to report it, the watchdog's period, how often the loop went round since last reported, and when it is
+    to be reported again.
     """
 
     def __init__(

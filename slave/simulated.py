@@ -1,7 +1,7 @@
 """Simulate sensors: the scene of a camera, the IMU on a hand, a tracker.
 
 A simulated IMU or tracker is the first-class stand-in for hardware. It measures item k when its own oscillator, which
-is the slave's (perhaps skewed) clock, says `epoch + k periods`, and hands it over then. A process too slow for its rate
+is the slave's (perhaps skewed) clock, is at `epoch + k periods`, and emits it then. A process too slow for its rate
 leaves items out, seen as gaps in `seq`, and never works off a backlog.
 """
 
@@ -121,9 +121,9 @@ def world_of(
     """Folder and rig of the simulated world: the slave's own, unless given.
 
     Args:
-        believed: The calib_json tree of the slave.
+        assumed: The calib_json tree of the slave.
         rig: Its rig, of which places and lenses may be unknown.
-        truth: Another tree, which knows them; None: the slave believes the truth.
+        truth: Another tree, which knows them; None: the slave's own tree is the truth.
         name: The rig there; None: the one of the same name.
 
     Raises:

@@ -1,6 +1,6 @@
 """The seam between the slave and its devices: what a driver has to be.
 
-Nothing behind it can tell which device it is.
+Nothing behind it can distinguish which device it is.
 
 A driver opens its device in its constructor. It may also have counts and metrics, and a camera settings that change.
 """
@@ -46,12 +46,12 @@ class Source(Protocol[ItemT_co]):
     def read(self) -> ItemT_co | None:
         """Block until the next item, or return None at the end of the stream.
 
-        `t_ns` is on the slave's clock; a gap in `seq` is an item that was left out. `session` is 0: the sender fills it
+        `t_ns` is on the slave's clock; a gap in `seq` is an item that was dropped. `session` is 0: the sender fills it
         in. A tracker that does not know where it is gives poses of NaN, a few in a second.
 
         Raises:
             PhalanxError: The device is gone, or an item is broken. Never replaced by a fake one.
-            TrackerChoiceError: Several devices are there, and nobody said which one is meant.
+            TrackerChoiceError: Several devices are there, and none was selected.
         """
         ...
 
@@ -90,6 +90,6 @@ class Tunable(Reporting, Protocol):
 
         Raises:
             CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or
-                the text says that they are not.
+                the text states that they are not.
         """
         ...

@@ -2,9 +2,9 @@
 
 On command, or because its files were changed.
 
-    settings    say what the camera has, and which colours are in use
+    settings    report what the camera has, and which colours are in use
     set         other exposure, gains, rate, margin, colours (body: `common.camera_settings.CameraSettings`)
-    pick        the colour of a marker, from a pixel on its paint (body: `common.camera_settings.ColourPick`)
+    pick        the colour of a marker, from a pixel on it (body: `common.camera_settings.ColourPick`)
     load        another content of the camera file (body: the file): exposure, gains, rate, colours of the markers
     save        write the content in use to the slave's own camera file
 

@@ -2,7 +2,7 @@
 
 It waits for the master's start, then sends without ever waiting.
 
-A socket around `slave.link`: one thread hears the beacons, one what the master sends to this
+A socket around `slave.link`: one thread receives the beacons, one what the master sends to this
 slave. The camera loop calls `send`; a datagram that cannot go now is counted and forgotten,
 because the next frame is worth more than this one.
 """
@@ -51,7 +51,7 @@ class Uplink:
             key: Rig key (32 bytes), alone or with this device's secret.
             clock: The clock of all times that this slave sends.
             beacon_port: UDP port of the beacons; several slaves of one machine share it.
-            bind: Where to be heard from: 0.0.0.0 for every network, or an address of this machine.
+            bind: Where to receive: 0.0.0.0 for every network, or an address of this machine.
             random: Source of nonces.
 
         Raises:
@@ -185,7 +185,7 @@ class News:
 
     A line passes if it differs from the last one, at least `LOG_NS` after it.
 
-    Whoever has the rig key can have this slave told something else with each datagram; its log is not filled by that.
+    Whoever has the rig key can send this slave something else with each datagram; its log is not filled by that.
     """
 
     def __init__(self) -> None:
@@ -210,7 +210,7 @@ class News:
 def _hosts(bind: str) -> tuple[str, str]:
     """Return where to bind for beacons and for data.
 
-    A socket bound to one address of the machine hears no broadcast (Linux, ip(7)), hence the
+    A socket bound to one address of the machine receives no broadcast (Linux, ip(7)), hence the
     loopback's broadcast address for a loopback address, and every network for any other.
     """
     try:

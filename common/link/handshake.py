@@ -1,6 +1,6 @@
 """The states of a session, for both ends of the link: one transition table.
 
-Each end classifies what arrives as an `Event`, and `RULES` says what follows:
+Each end classifies what arrives as an `Event`, and `RULES` defines what follows:
 the next state, the datagram to send back, or the reason to refuse. What is in
 no row cannot occur. An end obeys reply and refusal. Its state it derives from
 the sessions that it holds and from time, so `next`, and the rows of `SEALED`,

@@ -4,7 +4,7 @@ Held still, rotated, held again, as a person does it.
 
 For the calibration of cameras without hardware. The board is flat and exact, each pixel is the mean of the part of
 the board that it sees, light falls off with the board's tilt, and the sensor's noise is that of every simulated
-camera. Left out: motion blur and rolling shutter, since a board is measured while it is held still.
+camera. Not modelled: motion blur and rolling shutter, since a board is measured while it is held still.
 """
 
 from collections.abc import Mapping

@@ -1,6 +1,6 @@
 """A painted card at known distances, for `calibrate depth` without hardware.
 
-The published target, 75 x 50 mm in the paint of a finger (Kalbfleisch, section VI), stands between the lenses and faces
+The published target, 75 x 50 mm in a finger's colour (Kalbfleisch, section VI), stands between the lenses and faces
 them, before a wall of the grey of the desk. It is drawn as the checkerboard is; its colour is that of a flat marker in
 the light of all scenes with a hand.
 """

@@ -4,7 +4,7 @@ It moves freely between; the true gestures are known.
 
 In 75 s two rounds of everything, in an order, at a pace, in places and with knobs that are drawn from the seed: each
 finger is pinched, a knob is turned to and fro, another is turned farther than a hand turns at once and gripped again,
-keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and says
+keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and signals
 nothing.
 
 What the cameras see of it changes as it does in use: in each round every act is shown another way (`_SHOWN_DEG`).
@@ -104,7 +104,7 @@ class Gestures:
     The state it holds is its script, fixed by the constructor.
 
     Attributes:
-        said: Everything the hand says, in order.
+        annotations: All gestures of the hand, in order.
     """
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:

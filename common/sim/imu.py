@@ -4,7 +4,7 @@ Raw output of a common part; it does not know its orientation.
 
 The motion's exact rates, as means since the last sample, and forces, and on top of them the errors of a part, an
 LSM6DSO if none is named. The
-accelerometer's zero is off by as much as the rig's file says that the tilt may be: gravity then points elsewhere, and
+accelerometer's zero is off by as much as the tilt may be by the rig's file: gravity then points elsewhere, and
 no filter can know better. Zeros and scale are the same for a whole recording; the gyroscope's zero wanders a little, as
 in a part that warms up. That of a wrist device sits on the forearm, at the wrist joint (`OnForearm`).
 """
@@ -70,7 +70,7 @@ class SimulatedImu:
             part: Which sensor.
 
         Raises:
-            CalibrationError: The rig's file does not say how the IMU is mounted, or how its world lies to the rig.
+            CalibrationError: The rig's file does not state how the IMU is mounted, or how its world lies to the rig.
         """
         if imu.q_palm_imu is None or imu.q_rig_world is None:
             raise CalibrationError(_UNPLACED)

@@ -2,7 +2,7 @@
 
 Reflectances, light, and the step between linear light and sRGB bytes.
 
-Paint reflectances are those of the rendered recordings (truth_meta.json, paint_reflectance_linear_srgb), so that
+Marker reflectances are those of the rendered recordings (truth_meta.json, paint_reflectance_linear_srgb), so that
 colours learnt here and there agree.
 """
 
@@ -108,7 +108,7 @@ def marker_colour(marker: str) -> tuple[float, float, float]:
     """Return the linear RGB reflectance of a marker's colour.
 
     Raises:
-        CalibrationError: The simulator has no paint of that name.
+        CalibrationError: The simulator has no marker colour of that name.
     """
     known = MARKER_LINEAR_RGB | MORE_MARKER_LINEAR_RGB
     if marker not in known:

@@ -1,7 +1,7 @@
 """Beads and tags of tracked objects: image coverage, appearance and ground truth.
 
 As with a hand's markers (`painter`), everything nearer is cut out of the coverage, and the same coverage blends the
-paint into the image.
+marker colour into the image.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ class ObjectPainter:
         """Prepare colours.
 
         Raises:
-            CalibrationError: A bead's marker has no paint.
+            CalibrationError: A bead's marker has no colour.
         """
         self._view, self._tables = view, tables
         self._size = (view.optics.width_px, view.optics.height_px)

@@ -53,7 +53,7 @@ class SeenBead:
         at: (3,) its middle [m], camera frame.
         part: Its outline.
         bands: (LAYERS, N, 2) [px] its outline, then the parts on which the light falls more and more steeply.
-        shine_uv: (2,) [px] where the paint mirrors the lamp; shine_px: radius of that spot.
+        shine_uv: (2,) [px] where the marker mirrors the lamp; shine_px: radius of that spot.
         t_s: The moment of its row [s], scene time.
     """
 

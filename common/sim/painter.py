@@ -2,7 +2,7 @@
 
 The ground truth is what a camera sees of each marker.
 
-Coverage is measured with everything nearer cut out, and the same coverage blends the paint into the image, so
+Coverage is measured with everything nearer cut out, and the same coverage blends the marker colour into the image, so
 image and truth come from one drawing.
 """
 
@@ -84,7 +84,7 @@ class Painter:
         """Prepare colours.
 
         Raises:
-            CalibrationError: A marker of the rig has no paint.
+            CalibrationError: A marker of the rig has no colour.
         """
         self._view = view
         self._size = (view.optics.width_px, view.optics.height_px)
@@ -161,7 +161,7 @@ class Painter:
         )
 
     def window(self, image: Image, group: list[AnyPainted], snapshot: Snapshot) -> tuple[int, int, Image]:
-        """Paint a group of markers and blur its window, all in linear light.
+        """Draw a group of markers and blur its window, all in linear light.
 
         Returns where the window goes and its pixels.
         """

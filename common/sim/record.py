@@ -68,7 +68,7 @@ class SceneTake:
 
     It holds the ground truth of the frames taken so far.
 
-    Cameras run as the scene's timing says, all stamped on one clock. The reference time of a row is the middle
+    Cameras run by the scene's timing, all stamped on one clock. The reference time of a row is the middle
     of the exposure of the centre row of the rig's first camera.
     """
 
@@ -206,7 +206,7 @@ def record_scene(
         scene: What to render.
         seconds: How long [s]; at least one frame is written.
         start_s: Scene time of the first frame [s].
-        continuous: False tells readers that every frame is a pose of its own.
+        continuous: False informs readers that every frame is a pose of its own.
         imu: Whether the rig's IMU is recorded too, from a little before the first frame to a little after the last.
 
     Raises:

@@ -46,7 +46,7 @@ def record_both(
         imu: Whether the IMU of the wrist device is recorded too, a little longer than the frames.
         wrist_late_ns: By how much the stamps of the wrist camera are too late [ns]: a clock error.
         step: Pixels between the rays that shade skin (`WristRenderer`).
-        wrist_rig: What the manifest says of the wrist device; None: the truth.
+        wrist_rig: The wrist device by its manifest; None: the truth.
 
     Raises:
         CalibrationError: The wrist device has no IMU, or it is not known how that is mounted.

@@ -1,13 +1,13 @@
 """Renderer from scene to camera image, with the truth of what each marker shows.
 
-It draws hand, paint, desk, card, blur and noise.
+It draws hand, markers, desk, card, blur and noise.
 
 Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look round;
 sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the light, where
 it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
-there stays as bright as white paint under the new light, also where a real one would outshine it. Another exposure or
+there stays as bright as a white marker in the new light, also where a real one would outshine it. Another exposure or
 gain of the camera does the same (`Renderer.exposed`), and a longer exposure smears more.
 """
 
@@ -47,7 +47,7 @@ class Renderer:
         """Prepare desk, noise and colour tables (some tenths of a second).
 
         Raises:
-            CalibrationError: No such camera, or a marker without paint.
+            CalibrationError: No such camera, or a marker without a colour.
         """
         self._view = View(scene, camera)
         optics = self._view.optics

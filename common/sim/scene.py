@@ -32,7 +32,7 @@ class SceneTruth:
     """Complete ground truth of a scene at one time.
 
     Attributes:
-        t_s: The instant [s], scene time.
+        t_s: Time [s], scene time.
         T_rig_palm: (4, 4) palm frame -> rig frame [m].
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.

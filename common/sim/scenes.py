@@ -116,7 +116,7 @@ def renderer_of(
             palm of a bent wrist by steps of its bend.
 
     Raises:
-        CalibrationError: The scene has no such camera, or a marker without paint.
+        CalibrationError: The scene has no such camera, or a marker without a colour.
     """
     if isinstance(scene, WristScene):
         return (

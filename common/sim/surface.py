@@ -1,4 +1,4 @@
-"""Skin and paint of a simulated hand, as few points as a fast renderer needs.
+"""Skin and markers of a simulated hand, as few points as a fast renderer needs.
 
 The hand is spheres joined to tapered capsules (phalanges) and hulls (palm, thumb web, sleeve). All places that
 move are *key points* of one array, so that a camera can bring each to the moment at which its own row is exposed.
@@ -20,7 +20,7 @@ from common.hand_model import CHAINS, METACARPALS, Chains, HandModel
 
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
-# The skin below the paint is a little smaller and shorter, so that it does not shine out around it.
+# The skin below the marker is a little smaller and shorter, so that it does not shine out around it.
 SKIN_UNDER_CAP = 0.86
 SKIN_BACK_SHARE = 0.4
 

@@ -78,7 +78,7 @@ def seen(
     """What a camera sees of a thing, which `later_s` [s] on is at `later`.
 
     Args:
-        thing, later: At two instants.
+        thing, later: At two times.
         later_s: The time between them [s].
         T_camera_rig: (4, 4).
         to_light: Unit vector (3,), camera frame.

@@ -4,7 +4,7 @@ Every part is where it is when its own row is exposed.
 
 Rolling shutter: the middle of the exposure of row v is `t + v row_time`, so a part's place and its row are found
 together, by two rounds of projecting and moving (the hand moves far less than a row per row time). Between three
-exact instants the key points follow a parabola.
+exact times the key points follow a parabola.
 """
 
 from copy import copy
@@ -65,7 +65,7 @@ class Snapshot:
         cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
         rim_uv: (C, n, 2) [px] the cap's edge towards the finger, and the finger's girth at its last joint.
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
-        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the paint mirrors
+        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the marker mirrors
             the lamp, in OpenCV's numbers (`raster.fixed`).
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
         palm_speed: (2,) [px/s] of the palm.

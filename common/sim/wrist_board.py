@@ -5,7 +5,7 @@ It is held in each place; the frames are ambient, laser and LED.
 For the calibration of a wrist device without hardware. The board is flat, exact and white paper (Lambert); a wall
 stands behind it. Light falls off as it does: LEDs with the square of the distance, with the cosine on the paper and
 with their own lobe, the lens with a power of it; the laser is a sheet of Gaussian thickness within its fan.
-The sensor is linear, its noise that of photons and of reading. Left out: motion, since the board is held still.
+The sensor is linear, its noise that of photons and of reading. Not modelled: motion, since the board is held still.
 """
 
 from dataclasses import dataclass
@@ -252,8 +252,8 @@ def record_wrist_board(
     Args:
         folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.
         scene: What to render.
-        rig: What the manifest says of the device; None: the truth.
-        illuminations: Frames of a triple that are kept; the others were lost.
+        rig: The device by its manifest; None: the truth.
+        illuminations: Frames of a strobe cycle that are kept; the others were lost.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.

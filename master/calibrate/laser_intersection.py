@@ -4,7 +4,7 @@ This is the forward function of a pose.
 
 The skin (`common.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first, the
 nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the image is
-put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are left out.
+put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are ignored.
 
 **Smooth.** Whoever inverts it follows the point over hundredths of a degree, so nothing may jump by a ray. The fan ends
 at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing ray moves along the
@@ -227,7 +227,7 @@ def _at_edge(
     crossed = (inside > 0.0) & (outside < 0.0)
     crossed[2] &= (foot > 0.0) & (foot < known[6])
     share = np.where(crossed, outside / np.where(crossed, outside - inside, 1.0), np.inf).min(axis=0)
-    # Where the part's own surface turns away from the camera no ray passes it by, and clearness says how far.
+    # Where the part's own surface turns away from the camera no ray passes it by, and clearness measures how far.
     edge = np.isfinite(share)
     up, down = edge & rises, edge & ~rises
     first[chord[up], pose[up]] = 1.0 - share[up]

@@ -12,7 +12,7 @@ from common.streams import MASTER
 from common.terminal import echo
 from master.master_bus import join_bus
 
-ANSWER_S = 3.0  # a master tells once a second
+ANSWER_S = 3.0  # a master reports once a second
 
 
 def check(options: Namespace) -> int:

@@ -19,7 +19,7 @@ class CameraPlan:
         name: Camera.
         rate_hz: Frames per second.
         size_px: Width and height.
-        wrist: It belongs to a wrist device and sends strobed triples.
+        wrist: It belongs to a wrist device and sends strobe cycles.
         hands: Of each hand that it watches, the markers that sit on it.
         markers: All that its rigs name, those on objects too: what it reports of others is none of the rig's.
     """
@@ -55,9 +55,9 @@ class SenderNow:
         connected: Received within the last second.
         received, missed: Messages that were taken, and that were sent and could not be (lost, or too late), so far.
         clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
-        twin: Where a second process under its name was turned away lately; None: there was none.
-        stranger: Where it speaks another wire version, and which; None: it does not.
-        unproven: Where somebody says that he is it, without its secret; None: nobody does.
+        duplicate: Where a second process under its name was rejected lately; None: there was none.
+        unknown_peer: Where it speaks another wire version, and which; None: it does not.
+        unproven: Where somebody claims to be it, without its secret; None: nobody does.
         markers: How many markers it sends where its rig has another number; None: as many as the rig has.
     """
 
@@ -77,7 +77,7 @@ class MasterNow:
 
     Attributes:
         started: The start was given: cameras send.
-        senders: Camera or IMU -> how it is heard.
+        senders: Camera or IMU -> how it is received.
         groups: Of each group of the plan what its pipeline counted.
         disk_free_mb: Left on the disk that the master writes to [MB]; None: not known.
         files: What is wrong with the files.
@@ -96,7 +96,7 @@ class Verdict:
 
     Attributes:
         code, subject, sentence, fix: As of `CheckItem`.
-        wrong: None: it cannot say, or lies between the two bounds.
+        wrong: None: not known, or between the two bounds.
         senders: Which cameras or IMUs are concerned; none named: the subject itself.
         markers: Which of their markers; none named: all of the sender.
     """

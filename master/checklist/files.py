@@ -52,7 +52,7 @@ def judge(calibration: Path, rigs: tuple[str, ...], plan: Plan) -> tuple[CheckIt
     Args:
         calibration: calib_json tree.
         rigs: Names of rigs that run.
-        plan: What the files said that are in use.
+        plan: What the files in use state.
     """
     found: dict[tuple[str, str], CheckItem] = {}
     for name in rigs:

@@ -165,7 +165,7 @@ class LinkRules:
                 f"Camera {name} {'was never received' if never else 'is not received any more'}.",
                 f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
             )
-        if camera.wrist:  # without a hand there are no triples: it is the frames that count
+        if camera.wrist:  # without a hand there are no strobe cycles: it is the frames that count
             frames = None if reports is None or not reports.is_recent(t_ns) else reports.increase("frames")
             mute = frames == 0 and self._mute(name, t_ns)
         else:

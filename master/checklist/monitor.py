@@ -5,8 +5,8 @@ Reports and counts in, current problems out. No clock, no socket.
 Four things keep it quiet:
 
 - *Bounds*: what is wrong above one bound is well only below a lower one (`facts.beyond`).
-- *Time*: what may be the consequence of something else is told `HOLD_NS` later than that would be.
-- *Causes*: while one thing is wrong, what follows from it is not told, nor for `AFTER_NS` (`BACK_NS`) after it, while
+- *Time*: what may be the consequence of something else is reported `HOLD_NS` later than that would be.
+- *Causes*: while one thing is wrong, what follows from it is not reported, nor for `AFTER_NS` (`BACK_NS`) after, while
   windows still hold what was. A camera that is away is not slow, loses nothing, sees nothing; its table is `_FOLLOWS`.
 - *Coming up*: a sender that has just come, or the master, is given the time that its first numbers take.
 """
@@ -36,7 +36,7 @@ _LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
 _MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
 _NOT_TAKEN: frozenset[CheckCode] = frozenset(("duplicate_sender", "version_mismatch", "secret_mismatch"))
 _OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN - {"marker_mismatch"}
-# Cause -> what is not told of the same camera, its markers, or a group with it in it.
+# Cause -> what is not reported of the same camera, its markers, or a group with it in it.
 _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "camera_absent": _OF_SENDER,
     "imu_silent": _OF_SENDER,

@@ -61,7 +61,7 @@ class Received(Protocol):
         """Return the rejected processes of each sender, by reason.
 
         Sender -> where a second process of its name was rejected lately; where it speaks another version; where
-        somebody says hello without its secret.
+        somebody sends a hello without its secret.
         """
         ...
 
@@ -104,7 +104,7 @@ class ChecklistPublisher:
         Args:
             bus: Where slaves report and the list is published.
             clock: The master's.
-            heard: Where senders are heard.
+            received: What is received of the senders.
             setups: Of each hand, as they are in use.
             pipelines: Of each setup.
             files: Of the rigs; None: nobody watches them.

@@ -25,7 +25,7 @@ BRIGHT, BRIGHT_WELL = (
     1.5,
     1.35,
 )  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
-DUPLICATE_SENDER = "twins."  # gauges of the slave: hues between two markers as they are seen,
+DUPLICATE_SENDER = "twins."  # metrics of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
 AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker

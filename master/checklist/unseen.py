@@ -4,7 +4,7 @@ The cause is a wrong marker colour, or a wrong range of colours.
 
 A hand hides its own markers all the time, so what is not seen now means nothing. Three things mean something:
 
-1. It was seen, its colours were changed, and now it is not: that was the change. Told after `CHANGED_S`.
+1. It was seen, its colours were changed, and now it is not: that was the change. Reported after `CHANGED_S`.
 2. It was never seen since this slave, or these colours, began: a hand that comes shows all of its caps soon. After
    `NEVER_S`.
 3. It has not been seen for as long as no pose hides it: `GONE_S`. The cap has come off, or is dirty.
@@ -20,7 +20,7 @@ from master.checklist.slave_reports import SlaveReports
 CHANGED_S, NEVER_S, GONE_S = 0.9, 5.0, 30.0
 OTHERS = 3
 HALF = 0.5  # of the frames between two reports
-COLOUR = "colour."  # gauges of the slave: a number that changes with the range of a marker
+COLOUR = "colour."  # metrics of the slave: a number that changes with the range of a marker
 SEEN = "seen."
 
 

@@ -166,7 +166,7 @@ def board(command: ArgumentParser) -> None:
 def intrinsics(command: ArgumentParser) -> None:
     """Measure the lens of each camera by itself: focal length, centre and distortion, each with its uncertainty.
 
-    Wrong pictures are left out by themselves, each with the reason. Nothing is written without --out.
+    Wrong pictures are rejected automatically, each with the reason. Nothing is written without --out.
 
     Examples:
       phalanx calibrate cameras intrinsics views --board 9x6 --square-mm 25 --out calib_json
@@ -319,7 +319,7 @@ def verify(command: ArgumentParser) -> None:
 
 
 def time(command: ArgumentParser) -> None:
-    """Measure how much later a camera's frames are than its stamps say, from a hand that moves.
+    """Measure how much later a camera's frames are than their time stamps, from a hand that moves.
 
     Offsets are against the first camera of the rig. The master adds them to the times of every frame.
 

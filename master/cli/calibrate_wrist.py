@@ -22,7 +22,7 @@ def laser_plane(command: ArgumentParser) -> None:
     """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses.
 
     Hold the board still for each view, at 15 to 35 cm, near and far and tilted every way, so that the line runs over
-    it. Views with the line elsewhere are left out, each with the reason. Nothing is written without --out.
+    it. Views with the line elsewhere are rejected, each with the reason. Nothing is written without --out.
 
     Examples:
       phalanx calibrate wrist laser-plane RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
@@ -40,7 +40,7 @@ def laser_plane(command: ArgumentParser) -> None:
 def flat_field(command: ArgumentParser) -> None:
     """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper.
 
-    Its white squares at known places tell how bright paper looks in every part of the image. Show the board
+    Its white squares at known places show how bright paper looks in every part of the image. Show the board
     everywhere, in the corners too, its face to the camera, still, in a room that is not too bright. Nothing is written
     without --out.
 
@@ -181,7 +181,7 @@ def extrinsics(command: ArgumentParser) -> None:
     With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers
     one by one and together, bend the wrist as far one way as the other, and turn the forearm about all its axes. It
     needs the laser plane, a pose of the palm that is right to a centimetre and ten degrees (the drawing of the
-    device), and the hand file of that hand. Three markers on the back of the hand (rig desk-back3) tell it best.
+    device), and the hand file of that hand. Three markers on the back of the hand (rig desk-back3) constrain it best.
     Nothing is written without --out.
 
     Examples:

@@ -12,7 +12,7 @@ def status(command: ArgumentParser) -> None:
     that has keys or reports itself; a dash where nothing is known.
 
     With --wait it waits until datagrams of these senders come: at the master that runs or, where none does, here; it
-    ends with 1 if one of them is not heard.
+    ends with 1 if one of them is not received.
 
     Examples:
       phalanx fleet status                           once, as a table
@@ -49,9 +49,9 @@ def status(command: ArgumentParser) -> None:
 
 
 def keys(command: ArgumentParser) -> None:
-    """The secrets of a rig: keys for its datagrams, certificates for its bus. docs/keys.md says who has which.
+    """The secrets of a rig: keys for its datagrams, certificates for its bus. docs/keys.md lists who has which.
 
-    Says who has a certificate, what for, until when, and which device has no secret for its datagrams. With --make it
+    Prints who has a certificate, what for, until when, and which device has no secret for its datagrams. --make
     makes a keys folder, or adds what is missing: what is there stays as it is. `phalanx fleet deploy` does that, and
     brings each device its part.
 
@@ -59,7 +59,7 @@ def keys(command: ArgumentParser) -> None:
     makes only a new certificate for that device; its old one stays valid and its secret stays, so not for a lost one.
 
     --revoke locks out devices that were lost, sold or stolen: all keys are made anew, and these get none. A lost device
-    reads and forges nothing of the others. But it has the rig key and a certificate, and is heard as itself: nothing
+    reads and forges nothing of the others. But it has the rig key and a certificate, and counts as itself: nothing
     less keeps it out.
 
     Examples:
@@ -92,7 +92,7 @@ def relay(command: ArgumentParser) -> None:
 
     At that place, with --listen, a router: it passes on what several masters publish, each under the name of its site,
     and readers name the site. Routers that are connected are one: a reader at any of them sees every site. One that was
-    away is joined again by itself, and so is everybody at it. docs/scale.md says when one is needed.
+    away is joined again by itself, and so is everybody at it. docs/scale.md describes when one is needed.
 
     Beside each master, with --site and --router, a relay: it repeats at the router what the master publishes: hands,
     objects, contact, gestures, health and the checklist. No command comes down, nothing that cameras send goes up. A

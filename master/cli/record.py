@@ -99,7 +99,7 @@ def export(command: ArgumentParser) -> None:
     """Write what was recorded of hands for other tools: tables, motion capture, an animated model, Rerun.
 
     Positions read back are those of the poses to 0.1 mm in every format. In tables what was not observed is empty; in a
-    motion it stands still, and how often is said. docs/export.md has columns, axes, and how to open the files in
+    motion it stands still, and how often is reported. docs/export.md has columns, axes, and how to open the files in
     Blender, Unity and pandas.
 
     Examples:

@@ -18,7 +18,7 @@ def run(command: ArgumentParser) -> None:
     With --install it becomes a service of this user, without root: started at login, and again after a fault. All
     options are checked before anything is written. With other options it is installed again, with the same ones nothing
     changes. Keys stay where they are: the unit has the path of their folder alone. `systemctl --user status
-    phalanx-master` shows how it is, `journalctl --user -u phalanx-master` what it said.
+    phalanx-master` shows how it is, `journalctl --user -u phalanx-master` what it logged.
 
     Examples:
       phalanx run --rig desk

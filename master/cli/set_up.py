@@ -50,11 +50,11 @@ def camera(command: ArgumentParser) -> None:
 
 
 def gestures(command: ArgumentParser) -> None:
-    """List the poses that a hand is known by, and what is asked of each; teach one, forget one, or say which gestures
+    """List the poses that a hand is known by, and what is asked of each; teach one, forget one, or list which gestures
     a recorded hand makes, from when to when.
 
-    To teach a pose, show it a few times before a running master, or say where it is in a recorded run. The hand is
-    known by it at once: a running master follows the file. A pose that cannot be told from another is refused, and the
+    To teach a pose, show it a few times before a running master, or give its time in a recorded run. The hand is
+    known by it at once: a running master follows the file. A pose too similar to another is refused, and the
     file stays as it was.
 
     Examples:
@@ -63,7 +63,7 @@ def gestures(command: ArgumentParser) -> None:
       phalanx gestures --teach vulcan --within open_palm --examples 8
       phalanx gestures --teach horns --poses out/poses.npz --range 1.0-1.8 --range 4.2-5 --range 7.5-8.1
       phalanx gestures --forget horns
-      phalanx gestures --poses out/demo/poses.npz                            what a recorded hand says
+      phalanx gestures --poses out/demo/poses.npz                            the gestures of a recorded hand
       phalanx gestures --poses out/poses.npz --settings mine.json --hand me.json --every
     """
     what = command.add_mutually_exclusive_group()

@@ -26,7 +26,7 @@ from master.console.state import ConsoleSettings, ConsoleState
 from master.listening import is_loopback, page_certificate, places_of, private_folder
 
 TITLE = "Phalanx"
-_AWAY_S = 30.0  # a page that was not heard for so long, as on a busy machine, goes on where it was
+_AWAY_S = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], No
     Args:
         settings: How the console was started.
         folder: Where password and certificate are kept.
-        say: Called with the password when it is made, and how to know the certificate.
+        notify: Called with the password when it is made, and how to know the certificate.
 
     Raises:
         PhalanxError: A file of the password or of the certificate cannot be used.

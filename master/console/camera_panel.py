@@ -19,7 +19,7 @@ from master.console.local_mirror import update_copy
 from master.console.state import ConsoleState
 from master.console.tuner import GAINS, InUse, Range, colour_body
 
-# Name of the gauge, title, unit, slider from, to, decimals, logarithmic.
+# Name of the metric, title, unit, slider from, to, decimals, logarithmic.
 _SETTINGS: tuple[tuple[str, str, str, float, float, int, bool], ...] = (
     ("exposure_us", "Exposure", "µs", 50.0, 30_000.0, 0, True),
     ("analogue_gain", "Gain", "", 1.0, 16.0, 2, False),

@@ -27,8 +27,8 @@ class CommandQueue(Generic[AnswerT]):
         """Start with an empty queue.
 
         Args:
-            tell: Sends a change and waits for the answer, on a thread.
-            on_answer: Called with the answer, on the page's loop, unless more is to be told already.
+            send: Sends a change and waits for the answer, on a thread.
+            on_answer: Called with the answer, on the page's loop, unless more is to be sent already.
             on_error: Called with the error's text as it is.
         """
         self._send, self._on_answer, self._on_error = send, on_answer, on_error

@@ -14,7 +14,7 @@ class Setting:
 
     The slider is logarithmic where the value spans decades.
 
-    A change by a person is told once to `on_change`; `show` changes the controls and tells nobody.
+    A change by a person is passed once to `on_change`; `show` changes the controls and calls nothing.
     """
 
     def __init__(

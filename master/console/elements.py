@@ -23,7 +23,7 @@ class CameraView(Element, component="static/camera_view.js"):
 
         Args:
             camera: Its name.
-            label: What a screen reader says.
+            label: What a screen reader reads.
             on_pick: Called with the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
         super().__init__()

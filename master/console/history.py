@@ -72,7 +72,7 @@ class History:
 
         Frames are those that arrive from each camera; lost messages are counted for each sender.
 
-        A count of the master that is absent is 0: what never happened it does not tell.
+        A count of the master that is absent is 0: what never happened it does not report.
         """
         out: dict[str, float] = {}
         for count in report.counts:

@@ -32,7 +32,7 @@ class Link:
 
         Args:
             open_bus: Opens the bus, or raises `BusError` while nobody listens there.
-            take: Stream -> what is told each of its messages, on a thread of its own; must not raise.
+            take: Stream -> what is called with each of its messages, on a thread of its own; must not raise.
         """
         self._open_bus, self._take = open_bus, dict(take)
         self._bus: Bus | None = None
@@ -61,7 +61,7 @@ class Link:
         """Send a command and wait for the answer; never on the thread of the page.
 
         Raises:
-            BusError: There is no bus, nobody answered in time, or the target refused; the text says which.
+            BusError: There is no bus, nobody answered in time, or the target refused; the text states which.
         """
         bus = self._bus
         if bus is None:

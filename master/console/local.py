@@ -88,7 +88,7 @@ class LocalProcess:
             self._child.stdin.write(f"{line}\n".encode())
             self._child.stdin.flush()
         except (OSError, ValueError):
-            return  # it ended meanwhile, which `ended` says
+            return  # it ended meanwhile, which `ended` reports
 
     def interrupt(self) -> None:
         """Ask it to end (SIGINT), as Ctrl-C does; does not wait."""
@@ -229,4 +229,4 @@ class LocalProcesses:
             pipe.write(line + "\n")
             pipe.flush()
         except OSError:
-            return  # the warden was killed: the processes still end with `close`
+            return  # the supervisor was killed: the processes still end with `close`

@@ -3,7 +3,7 @@
 The master and the wizards read this copy.
 
 A slave of this machine has written the very file; one of another machine has written its own, and only what its answer
-tells can be copied: settings and colour ranges, not what the calibration says.
+contains can be copied: settings and colour ranges, not the calibration.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ def update_copy(path: Path, saved: InUse) -> bool:
     """Bring the file to what the slave saved. Whether anything differed.
 
     Raises:
-        CalibrationError: The file is missing, broken or read-only, or the slave has what a file must not say.
+        CalibrationError: The file is missing, broken or read-only, or the slave has what a file must not contain.
     """
     camera = load(path, CameraCalibration)
     body = saved.body() | {"markers": markers_over(saved, camera.markers or {})}

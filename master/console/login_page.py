@@ -3,7 +3,7 @@
 Nothing behind it is answered before somebody has logged in, and everything ends with the session.
 
 It stands before everything that the console serves: pages, NiceGUI's own socket and files, our sockets, downloads. Only
-the page of the login itself is open. A socket ends when its session does, also while nothing is said on it.
+the page of the login itself is open. A socket ends when its session does, also while nothing is sent on it.
 """
 
 import asyncio

@@ -18,7 +18,7 @@ _MOST = 64  # cameras: a bus on which names are invented costs no memory
 class PictureSizes:
     """Compares the sizes of previews with those of the camera files.
 
-    Holds the sizes [px] that the files said last, and why the last preview of a camera was refused.
+    Holds the sizes [px] that the files stated last, and why the last preview of a camera was refused.
     """
 
     def __init__(self, camera: Callable[[str], CameraCalibration]) -> None:
@@ -33,7 +33,7 @@ class PictureSizes:
     def fits(self, preview: Preview) -> bool:
         """Whether a preview is no larger than its camera's pictures.
 
-        Where no file says their size, any that a message may carry is.
+        Where no file states their size, any that a message may carry is.
         """
         width, height = jpeg_size(preview.jpeg)
         most = self._size(preview.camera)

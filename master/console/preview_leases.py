@@ -8,7 +8,7 @@ from common.errors import BusError
 from common.messages import Command, Health
 from common.preview_wish import PreviewWish
 
-LEASE_S = 3.0  # so long a look holds: whoever still looks says so again before
+LEASE_S = 3.0  # so long a lease holds: whoever still looks renews it before
 ASK_EVERY_S = 1.0  # a camera shows itself for 3 s after each request
 _ANSWER_S = 1.5
 

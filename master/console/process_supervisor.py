@@ -3,7 +3,7 @@
 Run as `python -m master.console.process_supervisor`.
 
 It reads "+PID" and "-PID" lines from a pipe whose other end only the console holds. The end of the pipe is the end of
-the console: each process group that is still listed is told to end, and killed if it does not.
+the console: each process group that is still listed is asked to end, and killed if it does not.
 """
 
 import os
@@ -53,7 +53,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(
             number, signal.SIG_IGN
-        )  # a terminal that closes reaches the console, which tells by the pipe
+        )  # a terminal that closes reaches the console, which notifies by the pipe
     end_groups(watch(sys.stdin))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from common.messages import Gesture
 
-HOLD_S = 0.5  # a gesture is repeated with every pose of its hand: not heard for so long, it is over
+HOLD_S = 0.5  # a gesture is repeated with every pose of its hand: not received for so long, it is over
 KEPT = 30
 _MOST = 64
 

@@ -3,7 +3,7 @@
 The limits apply to whoever connects and does not, or not yet, send requests like a browser.
 
 uvicorn by itself waits for ever for a request that never comes or never ends, keeps headers however many there are, and
-gives TLS a minute. A stranger would hold every place, or all memory, without a password.
+gives TLS a minute. An unknown sender would hold every place, or all memory, without a password.
 """
 
 import asyncio
@@ -119,7 +119,7 @@ def console_server(app: FastAPI, tls: ssl.SSLContext | None) -> ConsoleServer:
         lifespan="on",
         limit_concurrency=MOST_CONNECTIONS,
         ws_max_size=MOST_MESSAGE_BYTES,
-        proxy_headers=False,  # who asks is who is connected, whatever a header says
+        proxy_headers=False,  # who asks is who is connected, whatever a header states
     )
     config.load()
     config.ssl = tls

@@ -35,7 +35,7 @@ from master.console.tuner import Tuner
 from master.master_bus import join_bus
 from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
 
-STALE_S = 3.0  # what was not told again for so long is no longer shown as present
+STALE_S = 3.0  # what was not reported again for so long is no longer shown as present
 MAX_NAMES = 64  # kept of each kind: a bus on which names are invented costs no memory
 _LATENCIES = 4096
 

@@ -38,8 +38,8 @@ class InUse:
     """Settings and colours in use, as a slave's answer reports them.
 
     Attributes:
-        wanted: Setting -> what its camera file in use says, by the names of gauges.
-        read: Setting -> what was read back from the camera; absent where it does not tell.
+        wanted: Setting -> what its camera file in use states, by the names of metrics.
+        read: Setting -> what was read back from the camera; absent where it does not report it.
         markers: Marker -> its colours in use; absent: it has none.
     """
 

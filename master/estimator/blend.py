@@ -2,12 +2,12 @@
 
 The hand is watched by several kinds of sensors. It is blended part by part: the palm and each finger.
 
-Such a hand is solved elsewhere from one instant to the next whenever another marker is seen or one less, when another
-sensor tells a finger, and when what is told without markers is suddenly else. What is shown goes on as the hand moves,
+Such a hand is solved elsewhere from one epoch to the next whenever another marker is seen or one less, when another
+sensor measures a finger, and when what is measured without markers jumps. What is shown goes on as the hand moves,
 and all that leads elsewhere is led in, no faster than a given speed.
 
-How the hand moves meanwhile is told without solving it: the palm goes as the markers on its back go that are seen in
-both instants, and everything else at half the speed at which it was shown.
+How the hand moves meanwhile is estimated without solving it: the palm goes as those markers on its back go that are in
+both epochs, and everything else at half the speed at which it was shown.
 """
 
 from math import exp
@@ -19,7 +19,7 @@ from master.estimator.observation_sources import BY_MARKERS
 
 PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
-_SUDDEN_M = 3e-3  # from one instant to the next, beside motion
+_SUDDEN_M = 3e-3  # from one epoch to the next, beside motion
 _SPEED_S = 0.03  # of the shown hand, which is smooth
 _GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goes on
 _STALE_S = 0.1  # after such a gap nothing of a speed is left

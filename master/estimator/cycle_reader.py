@@ -3,8 +3,8 @@
 The rows hold rays and points on the laser plane, for the level asked for.
 
 fk     laser points only, of fingers that bend naturally
-ik     only fingers of which laser point and tip are both seen; of the others nothing is said
-auto   what there is: a finger whose tip is not seen is told by its laser point, as far as that goes
+ik     only fingers of which laser point and tip are both seen; the others are not reported
+auto   what there is: a finger whose tip is not seen is solved from its laser point, as far as that goes
 """
 
 from collections import Counter

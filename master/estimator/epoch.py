@@ -20,7 +20,7 @@ class Epoch:
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
         own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
         back_normal: (3,) unit vector from the hand to the cameras that see its back.
-        orientation: How other sensors have the palm turned; None: they do not say.
+        orientation: Rotation of the palm by other sensors; None: not measured.
         wrist: What a wrist device sees of the fingers; None: nothing.
         place: (3,) [m] where the palm is, of a wrist device alone; None: not known.
         start: Another hand of this epoch; None: there is none.
@@ -92,11 +92,11 @@ class FittedHand(SolvedHand):
 
     Attributes:
         alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
-            instant alone.
+            epoch alone.
         x: (n,) free angles.
-        scale: By how much the misfit of the instant has scaled `measurement_cov`.
-        natural: Probability that the hand obeys habits.
-        surprise: (M,) chi square of each marker.
+        scale: By how much the residual of the epoch has scaled `measurement_cov`.
+        natural_weight: Probability that the hand follows the posture prior.
+        marker_chi2: (M,) chi square of each marker.
         steps: Of the search.
         twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone.
     """
@@ -121,9 +121,9 @@ class Fitted:
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        solver_mode: (5,) `SolverMode` codes of what a wrist device tells the fingers from, now.
+        solver_mode: (5,) `SolverMode` codes of what the fingers are solved from by a wrist device, now.
         ambiguous: (5,) whether another pose of the finger explains that as well.
-        rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was left out.
+        rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was rejected.
         refused, off: (5,) fingertips and laser points that no pose explains.
     """
 

@@ -45,7 +45,7 @@ class EpochSteps:
 
     Attributes:
         state: All that is remembered of the hand; `now`: its fields.
-        at: Task, belief, what is found, and room: fields of `Workspace`.
+        at: Task, epoch prior, what is found, and scratch: fields of `Workspace`.
         observed: Rows of the markers.
         placed: (M,) of which of the hand's markers the places are known at the epoch.
         on_hand: (M,) the hand's markers among those of the rig.

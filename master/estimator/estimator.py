@@ -45,7 +45,7 @@ class Estimator:
             markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
             continuous: False: every epoch is an unrelated pose, nothing is remembered.
-            natural: Whether the hand is taken to obey habits, and begins anew where markers are unexplained: the fit
+            natural: Whether the hand follows the posture prior, and begins anew where markers are unexplained: the fit
                 of the card's line, which has no other hand to begin from.
             settings: Every number that tunes it.
             wrist: A wrist device on the forearm of this hand; None: there is none.
@@ -126,7 +126,7 @@ class Estimator:
         before, rejected = steps.kept() if may_contradict else None, False
         out, reinitialised = self._solve(at, known=known)
         if out is not None and before is not None and self._at.found.contrary[0] > self.settings.contrary:
-            # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
+            # The IMU is rejected: it began anew, or the wrist was flicked. But not where it is the only measurement.
             for orientation in (None, at.orientation):
                 steps.put_back(before)
                 steps.set_priors(replace(at, orientation=orientation), known=known)
@@ -178,7 +178,7 @@ class Estimator:
         limit = self._steps.predict()
         if limit < 0.0:
             return np.inf, False
-        # Whether a hand obeys habits, fingers before a wrist device say by themselves.
+        # Whether a hand follows the posture prior, fingers before a wrist device decide by themselves.
         wrong = self._steps.fit(self._posture_prior if self._at.ground.seen[0] > 0 else self._natural_prior)
         if self._natural_only and may_leave:
             return wrong, not (self._steps.has_outlier() and self._steps.determines_hand(at))
@@ -191,7 +191,7 @@ class Estimator:
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`.
 
-        Of what a wrist device tells the level counts, that of now or of the triple before.
+        Of what a wrist device measures the level counts, that of now or of the strobe cycle before.
         """
         ground = self._at.ground
         sources: list[int] = ground.sources.tolist()

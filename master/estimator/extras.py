@@ -7,14 +7,14 @@ They cover how the extras go on by themselves, and what an epoch leaves.
              while, a Gauss-Markov process of second order (Matern 3/2), stepped exactly (Hartikainen, Saerkkae 2010,
              "Kalman filtering and smoothing solutions to temporal Gaussian process regression models")
     tilt     what the IMU has the vertical off by, for seconds
-    heading  walks as far as the IMU is told to
+    heading  walks as far as the IMU's drift is stated
     light    logarithm of the unit of distances by light: of the device and its subject, all but constant
 
 Wrists at work flex by a median of 1.4...54 deg/s about a median posture of -30...3 deg (43 types of work; Hansson et
 al. 2009, Int. J. Ind. Ergonomics 39, 221); most of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and
 15 of deviation (Palmer et al. 1985, J. Hand Surg. 10A, 39).
 
-What an epoch says errs as the last one did: shape, skin and hidden fingers hardly change from frame to frame. So of
+The errors of an epoch are those of the last: shape, skin and hidden fingers hardly change from frame to frame. So of
 the information that it gains on what is constant only a share counts, as much as is new in that time.
 """
 
@@ -96,7 +96,7 @@ def predict_extras(
         state: Changed.
         dt_s: Since they were stepped last.
         process_noise_rad2: Variance of what the heading has drifted in that time.
-        belief, room: Written.
+        epoch_prior, scratch: Written.
     """
     K, z, P, M = state.z.shape[0], state.z, state.z_cov, scratch.M
     if K < EXTRAS:
@@ -170,9 +170,9 @@ def keep_extras(
         settings: How much of it is new.
         state: Changed.
         dt_s: Since the last epoch.
-        belief: What was believed before.
+        epoch_prior: The prior of the epoch.
         z: (K,) their mean.
-        cov: (N, N) covariance, with theirs last, and `scale` by how much the misfit has scaled it.
+        cov: (N, N) covariance, with theirs last, and `scale` by how much the residual has scaled it.
         room: Scratch.
     """
     K, P, A, B, new = state.z.shape[0], state.z_cov, scratch.A, scratch.B, scratch.M[0]
@@ -180,7 +180,7 @@ def keep_extras(
         return
     first = cov.shape[0] - K
     for i in range(K):
-        # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
+        # What the palm and what fingers constrain are two blocks: within one, as much is new of everything.
         errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LED_SCALE else settings.errs_s
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):

@@ -7,7 +7,7 @@ to it more closely or less. Both are those of a regression through the origin,
 
     e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,
 
-of expected squares, so that a finger that is hardly known tells no false closeness. The sums begin as if some fingers
+of expected squares, so that a finger that is hardly known feigns no closeness. The sums begin as if some fingers
 of usual hands had been seen, and fade back to that.
 """
 

@@ -3,7 +3,7 @@
 They give densities by hand, and the pose that is taken.
 
 Three hands are weighed (`master.estimator.finger_scan`): natural, straight and free ones. Fingers whose tips are seen
-tell which of them it is. A density may have several parts; the one that weighs most, by where the finger was, is taken,
+decide which of them it is. A density may have several parts; the heaviest, by where the finger was, is taken,
 and the covariance holds all of them.
 """
 
@@ -78,7 +78,7 @@ def weigh_hands(
 
     Write also the probabilities of the hands.
 
-    A finger of which the laser alone tells has no say: it is explained by any.
+    A finger measured by the laser alone does not count: it is explained by any.
     """
     others = 0
     for f in range(1, 5):
@@ -133,7 +133,7 @@ def choose(
     By the densities that `weigh_hands` left.
 
     Two tops are of one part where the density does not fall clearly between them. Where frames follow each other, a
-    part near to where the finger was is believed rather.
+    part near to where the finger was is preferred.
     """
     count, p = FINE * (NODES - 1) + 1, scan.p
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]

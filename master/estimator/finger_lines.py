@@ -5,7 +5,7 @@ towards the device; the thumb's runs diagonally. A guided curl measures this lin
 new point is normalised, and what deviates from it is abduction: the printed law (`master.estimator.cubic`) needs both.
 
 The model of a hand does not: it knows the line by its bones. It is not stretched to the measured range either, because
-where the point of a straight finger lies says how straight that was held, 3 mm for each degree. On simulated hands with
+where the point of a straight finger lies shows how straight it was held, 3 mm for each degree. On simulated hands with
 skin wrong by 10 % and a palm by 1 degree and 1 mm, stretching turned a PIP good to 4 degrees (median of eight hands)
 into one good to 13 where curls ended anywhere, and to 5 where all were full.
 """
@@ -27,7 +27,7 @@ def principal_line(points_m: Float) -> FingerLine:
     It follows the principal component of their scatter.
 
     Args:
-        points_m: (N, 3) [m], camera frame, in any order; NaN rows are left out.
+        points_m: (N, 3) [m], camera frame, in any order; NaN rows are rejected.
 
     Returns:
         The line, its origin at the point of the straightest finger, range (0, length).

@@ -3,17 +3,17 @@
 For every PIP they find the best of the other angles, and how likely it is.
 
 Laser point and fingertip hold a finger's angles in some directions well and in others hardly: near the turn of a
-fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip nothing but habit
-tells. So a finger's posterior may be long, bent, and in two parts, and no descent from one start finds that. For every
-PIP of a grid the other unknowns (abduction, flexion, DIP and the twist of its hinges) are brought to the least misfit;
+fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip only the prior
+constrains it. A finger's posterior may be long, bent, and in two parts, and no descent from one start finds it. For
+each PIP of a grid the other unknowns (abduction, flexion, DIP and twist of its hinges) get their least chi square;
 what is left of the residuals is interpolated between the nodes; and the density over the PIP is, with the others
 integrated out (Laplace; MacKay, "Information Theory, Inference, and Learning Algorithms", 27),
 
-    exp(-misfit / 2) |S|^1/2 p(flexion, PIP)       S: covariance of the others at that PIP
+    exp(-chi2 / 2) |S|^1/2 p(flexion, PIP)         S: covariance of the others at that PIP
 
 p is a mixture of three hands: a *natural* one, whose flexion follows the PIP, a *straight* one, whose fingers are
 stretched while they bend in their knuckles ("intrinsic plus" in hand surgery), and a *free* one, whose joints know
-nothing of each other. All fingers tell which of them it is.
+nothing of each other. All fingers decide which of them it is.
 """
 
 from math import inf, log, sqrt
@@ -124,10 +124,10 @@ class Scan:
         out: (5, 5) angles and twist chosen, and `mode` (5, 5) of the most likely pose of that part.
         way: (5, 5) derivative of these by the PIP there.
         pip2: (5,) variance of the PIP.
-        misfit: (5,) chi square of the best node; of none: infinite.
+        chi2: (5,) chi square of the best node; of none: infinite.
         parts: (5,) how many parts a density has that count.
         known: (5,) whether the finger was scanned.
-        first, last: (5,) nodes between which the valley was searched.
+        first, last: (5,) nodes between which the minimum was searched.
         showing: (5, NODES) 1 where the fingertip would be in sight.
     """
 

@@ -7,7 +7,7 @@ makes of the cut is the centroid of the part that is lit and seen. It lies near 
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
 lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
 laser is the laser point: within 0.2 mm (median) from a PIP of 45 degrees on, 0.4 mm over all, at most about 1 mm. The
-ridge has derivatives in closed form; the exact cut (`laser_centroid`) tells what it lacks.
+ridge has derivatives in closed form; the exact cut (`laser_centroid`) gives what it lacks.
 
 A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of direction s,
 at q + v - s (n . v) / (n . s), with n the normal of the plane.

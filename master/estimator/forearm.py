@@ -1,14 +1,14 @@
 """The palm by an IMU that sits on the forearm, through a wrist that bends.
 
-The IMU tells how the forearm lies in a world of its own, whose z axis is up; the hand hangs on it by the wrist:
+The IMU measures how the forearm lies in a world of its own, whose z axis is up; the hand hangs on it by the wrist:
 
     R_rig_palm = R_rig_world exp(tilt) R_z(heading) R_world_forearm R_forearm_palm(bend)
 
-`imu.q_rig_world` says where up is in the rig. Tilt, heading and bend are unknowns of the estimator
+`imu.q_rig_world` states where up is in the rig. Tilt, heading and bend are unknowns of the estimator
 (`master.estimator.extras`); here is what comes and goes: samples, sessions and clocks.
 
-An IMU that restarts lies in a new world, and the heading begins anew. Mostly it tells so: silent for a while, it begins
-to count its drift again. If not, palms that contradict for long say it.
+An IMU that restarts lies in a new world, and the heading begins anew. Mostly it shows: silent for a while, it begins
+to count its drift again. If not, palms that contradict for long reveal it.
 """
 
 from collections import Counter
@@ -44,7 +44,7 @@ class Forearm:
     Attributes:
         lost: Whether the IMU began anew since `orientation_at` was asked.
         counts: `orientation.used`, epochs that had a sample, `orientation.absent`, those farther than 50 ms from any;
-            samples left out, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
+            samples rejected, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
             `forearm.outlier`, palms that contradicted it.
     """
 
@@ -52,7 +52,7 @@ class Forearm:
         """Follow the IMU of a rig file, counting into `counts` if given.
 
         Raises:
-            CalibrationError: The file does not say how it is mounted.
+            CalibrationError: The file does not state how it is mounted.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
         self._imu, self._imu_forearm = imu, _wxyz(rotation_of("q_palm_imu", imu.q_palm_imu).T)
@@ -103,7 +103,7 @@ class Forearm:
         rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
         sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
-        axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
+        axes[2] = matrix_of(tilted)[:, 2]  # about the estimated vertical it turns
         wide = (
             z_cov[HEADING, HEADING]
             + process_noise
@@ -142,7 +142,7 @@ class Forearm:
         This needs no heading.
 
         Args:
-            t_ns: The instant.
+            t_ns: The epoch.
             wrist_angles_rad, wrist_cov: (2,), (2, 2) of the wrist.
 
         Returns:
@@ -184,13 +184,13 @@ class Forearm:
     def _process_noise_rad2(self, t_ns: int, found: Between) -> float:
         """Variance [rad^2] of what the heading has drifted since the epoch before.
 
-        Drifts that a filter tells are no walks: mostly a bias that nobody knows, whose variance grows with the square
+        Drifts that a filter reports are no walks: mostly an unknown bias, whose variance grows with the square
         of the time. Of a long silence that counts; from epoch to epoch it is a walk, of as much as can be followed.
         """
         since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
         even_rad = abs(found.drift_rad - self._drift_rad)
         process_noise = found.drift_rad**2 - self._drift_rad**2
-        if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever told
+        if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever reported
             even_rad, process_noise = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
         self._asked_ns, self._drift_rad = t_ns, found.drift_rad
         return float(max(even_rad**2, min(max(process_noise, _PROCESS_NOISE2 * since_s), _MOST2 * since_s)))

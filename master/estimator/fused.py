@@ -1,8 +1,8 @@
 """One hand from marker cameras, a wrist device and its IMU: rows of one fit.
 
-`FusedPipeline` is a push machine without clock, socket or thread. An epoch of the cameras takes the rows of the triple
+`FusedPipeline` is push-driven, without clock, socket or thread. An epoch of the cameras uses rows of the strobe cycle
 before it, if there is a new one, and how the IMU has the forearm turned; where the cameras are silent, epochs are those
-of the triples. A sensor that says nothing adds no row: there is no state in which one is used and another not.
+of the strobe cycles. A silent sensor adds no row: there is no state in which one is used and another not.
 """
 
 from collections import Counter, deque
@@ -23,9 +23,9 @@ from master.estimator.pipeline import MarkerPipeline, SolvedPose
 from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.wrist_setup import WristSetup
 
-_SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's triples lead
-_MAX_AGE_NS = 70_000_000  # an older triple says nothing of fingers now
-_OWN_NS = 17_000_000  # half of the time from triple to triple: of epochs that are unrelated
+_SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's strobe cycles lead
+_MAX_AGE_NS = 70_000_000  # an older strobe cycle constrains no finger now
+_OWN_NS = 17_000_000  # half the period of the strobe cycles: of epochs that are unrelated
 _KEPT = 8
 
 
@@ -45,7 +45,7 @@ class WristSide:
 
         Args:
             setup: Device and hand.
-            reader: Makes rows of triples.
+            reader: Makes rows of strobe cycles.
             counts: Counted into, by event and finger: `late`, `outside`, `no_plane`, `tip_refused`, `off`, `ambiguous`;
                 and as of `Forearm`.
             continuous: False: every message is an unrelated pose.

@@ -11,7 +11,7 @@ cameras the one of least cost is taken, in units of chi-square:
 A combination counts only where its rays meet before the cameras, no farther from the prediction than noise is once in a
 million; and one that overrules a camera only where it is no farther from the marker's past, either. The past may have
 been a mistake: it can overrule one camera, but not two that agree on a place. Where nothing is left, or where two
-combinations that overrule cameras fit alike at different places, the marker is dropped for this instant.
+combinations that overrule cameras fit alike at different places, the marker is dropped for this epoch.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class GateSettings:
         overrule: Least gain in chi-square for each camera that is overruled: 1 in 100 by chance, one degree of freedom.
         past_most: Largest cost of the distance from the past: more than one camera, less than two.
         false_alarm: Probability that noise alone is farther from a prediction than the gate.
-        most_cameras: Cameras with an alternative that are combined, 32 combinations; those beyond are left out.
+        most_cameras: Cameras with an alternative that are combined, 32 combinations; those beyond are rejected.
         same_m: [m] combinations whose points are nearer are one thing: a finger's width.
         place_m: [m] standard deviation of a marker's place a moment ago.
         speed_m_s: [m/s] standard deviation of a marker's speed.
@@ -108,8 +108,8 @@ def associate(
 
     Args:
         cameras: In the order of the observations' first axis.
-        pixels: First places of one instant (C, M, 2) [px], sigma (C, M) [px], area (C, M) [px^2]; NaN: not seen.
-        rivals: Second places (C, M, 2) [px] and sigma (C, M); NaN: none.
+        pixels: First places of one epoch (C, M, 2) [px], sigma (C, M) [px], area (C, M) [px^2]; NaN: not seen.
+        alternatives: Second places (C, M, 2) [px] and sigma (C, M); NaN: none.
         hand: All markers as the hand's other markers predict them, those that have no alternative.
         past: Where each marker was last (M, 3) [m], and how long ago (M,) [s]; NaN: never.
         rays_px: Standard deviation per axis that the calibration leaves.

@@ -19,11 +19,11 @@ class Posterior:
 
     Attributes:
         palm, x, z: (4, 4) palm, (n,) free angles, (K,) extras.
-        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras, by this instant alone.
-        surprise: (M,) chi square of each marker.
+        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras, by this epoch alone.
+        marker_chi2: (M,) chi square of each marker.
         steps: (1,) of the search.
-        natural: (1,) probability that the hand obeys habits.
-        scale: (1,) by how much the misfit has scaled the covariance.
+        natural_weight: (1,) probability that the hand follows the posture prior.
+        scale: (1,) by how much the residual has scaled the covariance.
         contrary: (1,) chi square of the palm against how other sensors have it turned, and of what the extras gave in.
     """
 
@@ -78,7 +78,7 @@ class Hypothesis:
     Attributes:
         palm, x, z: (4, 4), (n,), (K,) where its search ended.
         gradient, normal: (N,), (N, N) there.
-        surprise, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
+        marker_chi2, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
         cost, apart: (1,) half the sum of squares, and the half of what rays that do not meet have between them.
         share: (1,) its probability.
         step: (N,) from there to the mean within the limits, and `off` (N,) the same from the likelier hand.

@@ -11,8 +11,8 @@ from common.arrays import Float
 from common.calibration import UNIT_WITHIN
 from common.geometry import Wxyz
 
-REACH_NS = 50_000_000  # farther from an instant a sample tells nothing of it
-_KEPT = 512  # half a second of the fastest sensors; instants lie at most two camera periods behind
+REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
+_KEPT = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
 _STRAIGHT = 1e-9  # sine of an angle below which an arc is a straight line
 
 
@@ -42,16 +42,16 @@ class OrientationSamples:
     """Push machine. Holds the newest samples, and when the first came.
 
     Attributes:
-        counts: Samples left out: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
+        counts: Samples rejected: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
     """
 
     def __init__(self, counts: Counter[str], drift_rad_s: float, late_us: float = 0.0) -> None:
         """Begin without any, counting into `counts`.
 
         Args:
-            counts: What is left out, by reason.
-            drift_rad_s: How fast headings drift where samples do not say how far.
-            late_us: How much later samples were taken than their stamps say; added to these.
+            counts: What is rejected, by reason.
+            drift_rad_s: How fast headings drift where samples do not state how far.
+            late_us: How much later samples were taken than their time stamps; added to these.
         """
         self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
         self._samples: deque[_Sample] = deque(maxlen=_KEPT)
@@ -66,7 +66,7 @@ class OrientationSamples:
 
         The quaternion (4,) is IMU axes -> its world, q as good as -q.
 
-        What is no rotation is left out. A sample long before the newest means that a clock was set back, or that the
+        What is no rotation is rejected. A sample long before the newest means that a clock was set back, or that the
         newest came from a time that is not yet: the others are forgotten.
         """
         t_ns += self._late_ns

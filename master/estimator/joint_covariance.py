@@ -1,10 +1,10 @@
 """Kernels of how sure each joint is: this epoch and the state before.
 
-What this epoch says and what the state before says are no independent witnesses: the same habits, and errors of markers
+The estimates of this epoch and of the state before are not independent: the same priors, and errors of markers
 that repeat, are in both. So they are never added up as the Kalman filter does (Julier, Uhlmann 1997, "A non-divergent
 estimation algorithm in the presence of unknown correlations", show what that leads to). In each direction the surer of
-the two is taken, and no more: in the coordinates in which the covariance of this instant is the unit matrix and that of
-the past diagonal, the smaller of each pair. Where every finger is seen this instant says more, and counts alone.
+the two is taken, and no more: in the coordinates in which the covariance of this epoch is the unit matrix and that of
+the past diagonal, the smaller of each pair. Where every finger is seen this epoch constrains more, and counts alone.
 """
 
 from math import acos, cos, sqrt

@@ -11,7 +11,7 @@ from master.estimator.residuals import Observations
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _PALM_BY = 3  # markers
-_BACK_NUMBERS = 2.0  # a marker on the back tells where that looks, by two angles
+_BACK_NUMBERS = 2.0  # a marker on the back measures where that looks, by two angles
 
 
 class Ground:
@@ -24,7 +24,7 @@ class Ground:
         most: (1,) the most rays of any; a marker that is placed as a point counts as two.
         numbers: (1,) numbers that are measured.
         back: (1,) whether a marker on the palm's back is seen.
-        by_markers: (1,) whether they tell where the palm is.
+        by_markers: (1,) whether they determine where the palm is.
     """
 
     shown: Bool

@@ -2,7 +2,7 @@
 
 The IMU is mounted and placed in the rig; the orientation has its covariance.
 
-An IMU tells its axes in a world of its own, whose z axis is vertical:
+An IMU measures its axes in a world of its own, whose z axis is vertical:
 
     R_rig_palm = R_rig_world R_world_imu R_palm_imu^T
 
@@ -31,8 +31,8 @@ from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import SolvedHand
 
 _LOST_RAD = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
-_FREE_RAD = 10.0  # tells nothing beside any marker
-SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it says how the palm lies
+_FREE_RAD = 10.0  # constrains nothing beside any marker
+SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it determines how the palm lies
 _EYE = np.eye(3)
 
 
@@ -40,7 +40,7 @@ class OrientationTrack:
     """Push machine. Holds the samples of one IMU.
 
     Attributes:
-        counts: `orientation.used`, instants that had one, `orientation.absent`, those that had none; samples left out:
+        counts: `orientation.used`, epochs that had one, `orientation.absent`, those that had none; samples rejected:
             `orientation.missing`, `orientation.not_unit`, `orientation.late`.
     """
 
@@ -48,7 +48,7 @@ class OrientationTrack:
         """Follow the IMU of a rig file, counting into `counts` if given.
 
         Raises:
-            CalibrationError: The file does not say how it is mounted, or how its world lies to the rig.
+            CalibrationError: The file does not state how it is mounted, or how its world lies to the rig.
         """
         self._imu = imu
         self._palm_imu = rotation_of("q_palm_imu", imu.q_palm_imu)
@@ -70,7 +70,7 @@ class OrientationTrack:
         None where no sample is near enough.
 
         Args:
-            t_ns: The instant.
+            t_ns: The epoch.
             near: The hand as it was solved, which gives the heading where the IMU has none; None: not known.
         """
         found = self._samples.between(t_ns)

@@ -8,7 +8,7 @@ finger. Where flexion narrows the abduction (`common.hand_limits`), the paramete
 
     abduction = share(flexion) parameter
 
-so that a box of parameters is all the legal poses, and habits of spreading fade in a fist as the range does. Where
+so that a box of parameters is all the legal poses, and the prior of spreading fades in a fist as the range does. Where
 limits have a tolerance, what is beyond them costs, and the box ends three standard deviations farther out.
 """
 

@@ -116,8 +116,8 @@ class MarkerPipeline:
             estimator: Fits the hand to the pixels, from the line's hand; None: the line's hand is published.
             smooth: Filters the fitted hand; None: frames are unrelated, nothing is filtered.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
-            volume: What the rig states, or None; joints say whether they lie in it.
-            imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
+            volume: What the rig states, or None; joints report whether they lie in it.
+            imu: On the palm; its orientation is used where the rig states how it is mounted and how its world lies.
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
@@ -324,7 +324,7 @@ class MarkerPipeline:
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 
     def _count_outliers(self, found: MarkerPositions, frames: FrameSet) -> None:
-        """Count markers whose rays do not meet, and what is left out of each camera."""
+        """Count markers whose rays do not meet, and what is rejected of each camera."""
         if found.outliers.any():
             self._count("apart", found.outliers)
             self.counts["epipolar_outliers"] += int(found.outliers.sum())

@@ -28,7 +28,7 @@ def pose_of(
         t_ns: The epoch.
         smooth_m: (M, 3) [m] markers after the 1 € filter, and `markers` before it.
         markers: As triangulated.
-        volume: What the rig states; joints say whether they lie in it.
+        volume: What the rig states; joints report whether they lie in it.
     """
     solution = hand.solution
     if solution is None:

@@ -4,24 +4,24 @@ They compute both hypotheses, their evidence, mean and covariance.
 
 The evidence of a hypothesis is the density of the markers under it, by Laplace's approximation
 
-    log p = -cost + log density of the habits - log det(normal) / 2
+    log p = -cost + log density of the posture prior - log det(normal) / 2
 
-at its solution (MacKay 1992, "Bayesian interpolation", section 4). Whether a hand obeys habits does not change from
+at its solution (MacKay 1992, "Bayesian interpolation", section 4). Whether a hand is natural does not change from
 frame to frame, while the evidence of one is noise in part: its logarithm is smoothed in time. Mean and covariance are
 those of the mixture: the spread between solutions is uncertainty as well. Of a free hand the mean within its limits is
 taken, of a natural one the likeliest pose (`master.estimator.truncated`).
 
-The covariance is that of this instant alone. To the fit the state before is a prior, as wide as a hand moves meanwhile.
-That holds it steady, but it is no second witness: the same habits led to it from the same markers, so a wrong direction
-of a finger is as wrong in every frame of a held pose. What is left are rows and habits. Habits hold better of some
-postures than of others: a pointing hand defies them. By how much, the misfit of the instant itself tells, which scales
+The covariance is that of this epoch alone. To the fit the state before is a prior, as wide as a hand moves meanwhile.
+That holds it steady, but it is not independent: the same prior led to it from the same markers, so a wrong direction
+of a finger is as wrong in every frame of a held pose. What is left are rows and posture prior. It holds better of some
+postures than of others: a pointing hand defies it. By how much, the residual of the epoch itself shows, which scales
 the covariance (Birge 1932), with the claimed widths as one observation more (a prior of unit information: Kass,
 Wasserman 1995):
 
     covariance = s^2 normal^-1,   s^2 = max(1, (1 + chi^2) / (1 + f)),   f = numbers that are measured - 6
 
-A good fit makes nothing surer than it was claimed. Beliefs that contradict each other, whatever the markers, say
-nothing of the instant: their least cost is no part of chi^2.
+A good fit makes nothing surer than it was claimed. Priors that contradict each other, whatever the markers, are no
+evidence of the epoch: their least cost is no part of chi^2.
 """
 
 from math import exp, log
@@ -359,7 +359,7 @@ def posterior(
     """Fit one epoch from a start.
 
     Args:
-        rig, settings, habits, belief, observed: What is known.
+        rig, settings, posture_prior, epoch_prior, observed: What is known.
         palm, x, z: (4, 4), (n,), (K,) where both searches begin.
         natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
         numbers: How many numbers are measured.

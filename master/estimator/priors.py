@@ -2,12 +2,12 @@
 
 It covers the posture priors of natural and of free hands, and curled fingers.
 
-Every belief is a row of a least-squares problem that is linear in the free angles, divided by its standard deviation.
+Every prior is a row of a least-squares problem that is linear in the free angles, divided by its standard deviation.
 
-Hands mostly obey habits, and now and then defy them altogether: a gun, horns, a pianist. One width of the habits would
+Hands mostly follow joint couplings, and now and then defy them altogether: a gun, horns, a pianist. One width would
 be too wide for the former or too narrow for the latter. So there are two hypotheses of every hand, *natural* and
-*free*, and the markers tell by their evidence how much of each to believe (MacKay 1992, "Bayesian interpolation": the
-width of the habits is what a free hand gains in fit and pays in volume).
+*free*, and the evidence of the markers decides how much each counts (MacKay 1992, "Bayesian interpolation": the
+width of the prior is what a free hand gains in fit and pays in volume).
 """
 
 from typing import NamedTuple

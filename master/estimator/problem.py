@@ -32,10 +32,10 @@ class EpochPrior:
     It is filled in place.
 
     Attributes:
-        own_w2, own: (n,) inverse variances and means of single angles, by this instant.
+        own_w2, own: (n,) inverse variances and means of single angles, by this epoch.
         past_w2, past: (n,) the same, by the state before.
         palm: (4, 4) the palm by the state before.
-        palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
+        palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: no prior.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
         back_normal: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
         z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).

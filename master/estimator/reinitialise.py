@@ -20,7 +20,7 @@ from master.estimator.settings import Settings
 from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.wrist_device import WRIST_ANGLES
 
-_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
+_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a reinitialising search begins: open to closed
 _MCP_PER_PIP = 0.6
 _ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
 _EVEN = 0.5  # probability

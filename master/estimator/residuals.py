@@ -3,13 +3,13 @@
 A RAY row is where a camera would see a marker, minus where it did [px], without what the side of a painted cap that it
 sees shifts its centroid by (`master.fabrik.rays`). A POINT row is a measured place [m].
 
-What is wrong with the marker itself, such as paint, bones and the side of a cap that is not known, is seen by all
+What is wrong with the marker itself, such as its colour, bones and the side of a cap that is not known, is seen by all
 cameras. It is a shift d of the marker with a covariance S, and is integrated out: with H, g the information and
 gradient of the rays,
 
     H - H (H + S^-1)^-1 H,   g - H (H + S^-1)^-1 g,   cost - g' (H + S^-1)^-1 g / 2
 
-so a marker that one camera sees tells two numbers and one that sixteen see is no surer than its paint.
+so a marker that one camera sees gives two numbers and one that sixteen see is no surer than its colour.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from master.estimator.kinematics import Scratch
 from master.estimator.matrices import inverse_3
 
 _BEHIND = 1e4  # half chi square of a marker behind a camera that sees it
-_NOWHERE = 1.0  # [1/m^2] information about a marker that no row tells of
+_NOWHERE = 1.0  # [1/m^2] information about a marker that no row constrains
 
 
 class Observations(NamedTuple):

@@ -37,7 +37,7 @@ class Range:
 class Settings(NamedTuple):
     """The estimator's settings; kernels take it as it is."""
 
-    # Habits of a natural hand: standard deviations and means of its angles.
+    # Posture prior of a natural hand: standard deviations and means of its angles.
     abduction_rad: Annotated[float, Range("rad", 0.01, 1.0, _HANDS)] = radians(7.0)
     natural_flexion_rad: Annotated[float, Range("rad", 0.01, 2.0, _HANDS)] = radians(14.0)
     neighbour_flexion_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(30.0)
@@ -107,7 +107,7 @@ class Settings(NamedTuple):
     speed_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "three tenths of a new one count at 60 frames a second")
     ] = 0.047
-    # One camera alone: perspective tells depth poorly, so it is held.
+    # One camera alone: perspective constrains depth poorly, so it is held.
     held_depth_m: Annotated[
         float, Range("m", 1e-4, 0.1, "a step of depth of a hand that one camera sees")
     ] = 0.004

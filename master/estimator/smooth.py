@@ -9,7 +9,7 @@ the rotation vector from there to what was solved, so it is never near half a tu
 
 **Noise.** The variance of each signal is measured while it runs (`master.fabrik.noise`) and is at most that of the
 markers it rests on. A solved pose is steadier than its markers in one pose and less steady in another, as its priors
-hold it, and its covariance contains errors that stay; neither says what is new in each frame.
+hold it, and its covariance contains errors that stay; neither states what is new in each frame.
 
 The joints come from forward kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the
 PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
@@ -18,10 +18,10 @@ limits; what has to be cut is an abduction that the filtered flexion does not al
 **Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held; and where another sensor takes over
 from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
 solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
-the server says it is: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
+the server has it: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
 of how far it is shown from where it is solved to be; one whose region is too large now is not tracked.
 
-A hand that was wrong a moment ago, as its tracker says, is shown at once where it is, and the filter begins anew.
+A hand that was wrong a moment ago, as its tracker reports, is shown at once where it is, and the filter begins anew.
 
 A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.blend` has it.
 
@@ -92,7 +92,7 @@ class HandOneEuro:
         """Filter palm, angles and joints of a hand; the rest of it stays.
 
         Args:
-            t_ns: The instant; a hand that is not after the last one is passed on as it is.
+            t_ns: The epoch; a hand that is not after the last one is passed on as it is.
             hand: As solved. One that is not valid is passed on, and what follows begins anew.
             cov_m2: (M, 3, 3) [m^2] noise of the markers; NaN: not measured. What rests on none is filtered by
                 the noise it shows.

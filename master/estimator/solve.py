@@ -3,9 +3,9 @@
 They build normal equations, and search downhill inside the limits.
 
 Unknowns are the palm's turn and shift and the free angles (`master.estimator.kinematics`). What is minimised is half
-the sum of squares of the rows (`master.estimator.residuals`) and of what is believed:
+the sum of squares of the rows (`master.estimator.residuals`) and of the priors:
 
-    habits    of one hypothesis (`master.estimator.priors`)
+    posture   of one hypothesis (`master.estimator.priors`)
     own       single angles, of fingers that are curled out of sight
     past      single angles and the palm, from the state before; and its depth, where one camera sees all there is
     facing    the back of the hand looks towards the cameras that see a marker on it
@@ -186,11 +186,11 @@ def linearise(
 
     Return the cost.
 
-    To search.surprise (M,) chi square of each marker, to search.apart (1,) half of what rays that do not meet have
+    To search.marker_chi2 (M,) chi square of each marker, to search.outliers (1,) half of what non-meeting rays have
     between them, and to search.information (M, 3, 3) what is known of each marker's place.
 
     Args:
-        rig, habits, belief, observed: What is known.
+        rig, posture_prior, epoch_prior, observed: What is known.
         h: Hypothesis.
         palm, x, z: (4, 4), (n,), (K,) the hand.
         gradient, normal: Written.
@@ -315,7 +315,7 @@ def descend(
     tolerance, is taken without another linearisation.
 
     Args:
-        rig, habits, belief, observed, h: What is known, and the hypothesis.
+        rig, posture_prior, epoch_prior, observed, h: What is known, and the hypothesis.
         tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
         palm, x, z: (4, 4), (n,), (K,) where it begins, inside the limits, and then where it ended.
         gradient, normal: Written: (N,), (N, N) there, or before the last step.

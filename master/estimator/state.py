@@ -4,13 +4,13 @@ A finger that is seen may be elsewhere at the next epoch by a wide random walk, 
 that nobody sees moves on a little the way it was moving, and with its neighbours: fingers are moved by muscles and
 nerves that they share, so a hidden ring finger between closing neighbours closes with them (Hager-Ross, Schieber 2000,
 "Quantifying the independence of human finger movements"; Ingram, Kording, Howard, Wolpert 2008, "The statistics of
-natural hand movements"). How far it strays from there is taken as a smooth stationary process, whose steps in a time
+natural hand movements"). How far it drifts from there is taken as a smooth stationary process, whose steps in a time
 have the variance (the structure function of a Gaussian correlation)
 
-    strayed(t) = STRAY^2 (1 - exp(-(t / STRAY_S)^2))
+    drift(t) = DRIFT^2 (1 - exp(-(t / DRIFT_S)^2))
 
 and the steps of two of the four fingers that are k apart correlate by ALIKE^k. So what the seen ones did since gives
-the conditional mean and variance of the hidden ones. A hand that defied habits when the marker went moves its fingers
+the conditional mean and variance of the hidden ones. A hand that defied it when the marker went moves its fingers
 one by one, and so does every hand its thumb.
 """
 
@@ -47,16 +47,16 @@ class HandState:
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
         z_ns: (1,) when they were stepped last, `stationary` (K,) variances to grow to, and `wrist_mean_rad` (2,) [rad]
             the bend of the wrist that is kept.
-        solver_mode: (5,) `SolverMode` codes of what a wrist device told each finger from last; 0: markers since.
-        searched: (5,) triples since the whole valley of a finger was searched.
+        solver_mode: (5,) `SolverMode` codes of what each finger was last solved from by the device; 0: markers since.
+        searched: (5,) strobe cycles since the whole cost map of a finger was searched.
         vague: (5,) whether that was not well enough to be tracked.
         coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.finger_coupling`).
-        natural: (1,) probability that it obeys habits.
-        speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing tells where it is.
+        natural_weight: (1,) probability that it follows the posture prior.
+        speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing measures where it is.
         hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
-        measured_rotation: (3, 3) of the palm by other sensors, and `measured_rotation_known` (1,) whether they said so.
+        measured_rotation: (3, 3) of the palm by other sensors, and `measured_rotation_known` (1,) if measured.
     """
 
     t_ns: Int
@@ -143,7 +143,7 @@ class Hidden:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
         sigma: (20,) [rad] standard deviations of these.
         gone_s: (5,) time since they were seen last; 0: seen now.
-        own: (5,) share of the variance of a step that the fingers that are seen do not tell.
+        own: (5,) share of the variance of a step that the fingers that are seen do not explain.
     """
 
     angles: Float
@@ -253,13 +253,13 @@ def predict(
     It goes to `EpochPrior.past`, `palm` and their weights.
 
     A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand that was
-    seen meanwhile is told by its marker, not by a hand that is let go for it.
+    seen meanwhile is measured by its marker, not by a hand that is let go for it.
 
     Args:
         hand, settings, state: The hand; `state.hidden_ns` and what goes with it are kept up.
         t_ns: The epoch.
         shown: (5,) fingers that are measured now.
-        hidden, belief: Written.
+        hidden, epoch_prior: Written.
     """
     hide(hand, settings, state, t_ns, shown, hidden)
     free_of(hand, hidden.angles, hidden.x)
@@ -290,7 +290,7 @@ def grow(
     """Add to the covariance what the hand may have done since.
 
     - a palm or finger that is seen: by as much as the fit lets go of its last pose in that time,
-    - a finger that is hidden: by how far hidden fingers stray,
+    - a finger that is hidden: by how far hidden fingers drift,
     - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
     """
     elapsed_noise_s = max(dt_s, settings.shortest_s)

@@ -6,7 +6,7 @@ solution the posterior is a normal distribution cut by a box, whose moments are 
 2001; for boxes: Cunningham, Hennig, Lacoste-Julien 2011, "Gaussian probabilities and expectation propagation"): each
 limit is stood for by a normal factor that leaves its own angle the mean and variance of the cut distribution.
 
-For hands that are free of habits only: natural ones rest at their limits, as flat ones do.
+For hands that are free of the posture prior only: natural ones rest at their limits, as flat ones do.
 """
 
 from math import erfc, exp, inf, pi, sqrt

@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
         palm, angles: (4, 4) palm, (20,) all angles [rad].
         position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
         cov: (26, 3, 3) [m^2] of the joints.
-        tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
+        tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this epoch alone.
         tilt_process_noise: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
         tracked: (26,), and `source` (26,) as of `HandPose`.
     """
@@ -146,7 +146,7 @@ def _depth_noise(
 
     The drift is along the line of sight, over the time in which that camera alone saw the hand.
 
-    Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
+    Perspective constrains a hand's depth to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
     triangulated, seen = ground.most[0] > 1, ground.seen[0] > 0
     if triangulated or state.triangulated_ns[0] == NEVER_NS:
@@ -237,10 +237,10 @@ def fit_epoch(
     The fit starts from the prediction of `predict_epoch`, or roughly from the task's hand.
 
     Args:
-        model, habits: What is the same at every epoch.
+        model, posture_prior: What is the same at every epoch.
         observed: What is measured.
         blank: Scratch.
-        boxed_space: (1,) `Workspace`, with the task and what is believed; what is found is in its `found`.
+        boxed_space: (1,) `Workspace`, with the task and the epoch prior; what is found is in its `found`.
 
     Returns:
         Chi square of the markers; of a rough search its cost.

@@ -23,7 +23,7 @@ class Task:
 
     Attributes:
         t_ns: (1,) the epoch.
-        palm_shown: (1,) whether something tells where the palm is.
+        palm_shown: (1,) whether something measures where the palm is.
         palm, angles: (4, 4), (20,) another hand of the epoch [rad].
         x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
         may_leave: (1,) whether there is another, and it may take the place of the state.
@@ -32,9 +32,9 @@ class Task:
         second_order: (1,) whether covariance is wanted to second order.
         process_noise_rad2: (1,) variance of what the heading has drifted since the last epoch.
         continuous: (1,) whether epochs follow each other.
-        scanned: (20,) angles of fingers whose valley was searched, where it is likeliest.
+        scanned: (20,) angles of fingers whose cost map was searched, where it is likeliest.
         refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
-        solver_mode: (5,) `SolverMode` codes of what fingers are told from.
+        solver_mode: (5,) `SolverMode` codes of what fingers are solved from.
         ambiguous: (5,) whether another pose explains as much.
     """
 

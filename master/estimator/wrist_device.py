@@ -26,7 +26,7 @@ _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0
 _BLUR_PX = 0.5
 _CURVED = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
 _WHOLE = 0.85  # of the line that is expected: a shorter one is hidden in part
-_AWAY_M = 0.1  # a fingertip of which no laser point tells the distance
+_AWAY_M = 0.1  # a fingertip of which no laser point measures the distance
 
 
 class Device:
@@ -134,7 +134,7 @@ class LinesOfSight:
         laser_px: (5,) length of the line [px]; 0: not known.
         tip: (5, 2) fingertips x, y, and `tip_W` (5, 2, 2) their information.
         depth: (5,) logarithm of their distance by light, in a unit of its own, and `depth_w2` (5,) how sure; 0: none.
-        teaches: (5,) 1 where a finger tells how its hinges are rolled.
+        teaches: (5,) 1 where a finger constrains how its hinges are rolled.
         laser_s, tip_s: (1,) how much later than the epoch laser points and fingertips were seen.
         rows: (1,) whether there is any row.
     """

@@ -9,8 +9,8 @@ The rows are LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
 
 What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
 A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
-the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`wrist_share`), for that all
-fingers seem bent by as much is mostly an error that they share; what its doubt makes of them is in their noise.
+the wrist, and not with where the hand is in the room. The bend they constrain little (`wrist_share`), for that all
+fingers seem bent by as much is mostly an error that they share; what its uncertainty makes of them is in their noise.
 """
 
 from math import sqrt, tan
@@ -51,7 +51,7 @@ def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
 
     The rotation goes to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
 
-    By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
+    By an IMU on the forearm it is  exp(axes . (tilt, heading less its prior)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
     R, extras_jacobian, F = search.palm_straight, search.extras_jacobian, epoch_prior.forearm
@@ -215,7 +215,7 @@ def finger_rows(
                 w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
             cost += 0.5 * w[i] * r[i]
         for a in range(size):
-            # What fingers tell of the bend counts for little: they err together, as the device is put on.
+            # What fingers measure of the bend counts for little: they err together, as the device is put on.
             of_wrist = a == count + 1 or a == count + 2
             share = search.wrist_share[0] if of_wrist else 1.0
             for i in range(rows):

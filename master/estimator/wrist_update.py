@@ -149,7 +149,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             task.solver_mode[f] = _IK if lines_of_sight.shown[f] > 0.0 else _FK
             curled = f > 0 and scan.out[f, 2] > settings.branch_rad
             task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
-            # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
+            # The unit of light is learnt a little at a time, and nothing of a finger that is ambiguous.
             excluded = task.ambiguous[f] or scan.chi2[f] > settings.teaching_gate
             lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not excluded else 0.0
             lines_of_sight.depth_w2[f] *= 0.0 if excluded else settings.light_share
@@ -206,7 +206,7 @@ def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> No
 
     The covariance of the epoch gives the step.
 
-    At the solution the pull of the past is that of the instant, reversed: a Newton step without it.
+    At the solution the pull of the past is that of the epoch, reversed: a Newton step without it.
     """
     n, K, off = found.x.shape[0], found.z.shape[0], search.off
     palm_off(found.palm, epoch_prior.palm, off)
@@ -232,7 +232,7 @@ def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: S
 
     The median is taken, and a covariance that holds all of the minimum.
 
-    What the others know of the finger beside its PIP, the fit's covariance given the PIP says.
+    What the others know of the finger beside its PIP is in the fit's covariance given the PIP.
     """
     hand, cov = rig.hand, found.cov
     angles_of(hand, found.x, work.angles, work.by)

@@ -8,7 +8,7 @@ channel is zero at rest. A joint turns by its three rotation channels, about z, 
     R = R_z R_x R_y        R_joint(rig) = up . product of R from the wrist on . R_joint(at rest)
 
 Where the bones of the poses are as long as those of the profile and turn with their joint, which the solver's are,
-that says all. A joint that stands elsewhere by more than 10 um in any frame has three position channels as well; they
+that is all. A joint that stands elsewhere by more than 10 um in any frame has three position channels as well; they
 hold its whole offset from its parent, in place of OFFSET, as readers take them.
 """
 
@@ -78,7 +78,7 @@ def write_bvh(
         skeleton: The hand at rest.
         rate_hz: That rate.
         axes: Unit and axes.
-        tell: Called with how many frames of how many are written.
+        progress: Called with how many frames of how many are written.
 
     Returns:
         The joints, without the wrist, that have position channels because their bone is not rigid.

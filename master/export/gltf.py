@@ -90,7 +90,7 @@ def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[
 
     Args:
         path: The file; replaced only by a complete one.
-        motion: Rig frame, one instant or more.
+        motion: Rig frame, one time or more.
         skeleton: The hand at rest.
         up: See `bvh.Axes`; y is what glTF means.
 

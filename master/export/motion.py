@@ -42,8 +42,8 @@ class Motion:
         t_ns: (T,) [ns], rising.
         position_m: (T, 26, 3) [m], rig frame; of `local` in the frame of the joint's parent, the wrist in the rig's.
         orientation_wxyz: (T, 26, 4) unit quaternions, joint -> the same frame.
-        held: (T, 26) not observed at that instant.
-        gap_ns: Two instants that are farther apart have nothing between them.
+        held: (T, 26) not observed at that time.
+        gap_ns: Two times that are farther apart have nothing between them.
     """
 
     t_ns: Int

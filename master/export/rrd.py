@@ -53,7 +53,7 @@ def write_take(
         take: The source: objects, contact, gestures and what cameras saw.
         batches: The poses, one batch or more.
         setup: What watched the hand.
-        tell: Called with how many poses of how many are written.
+        progress: Called with how many poses of how many are written.
 
     Raises:
         RecordingError: The file cannot be written, or the poses are not of one marker count.

@@ -70,8 +70,8 @@ def export(
     Args:
         source: poses.npz of a run, or an .mcap recording.
         wanted: What of it, and how.
-        say: Called with each file that is there, and what is to be known of it.
-        tell: Called with what is being done, and how much of how much.
+        notify: Called with each file that is there, and what is to be known of it.
+        progress: Called with what is being done, and how much of how much.
 
     Returns:
         The files, in the order of writing.

@@ -23,7 +23,7 @@ from master.mocap.track import Track, known
 from master.outputs.poses import Poses
 
 _ENOUGH = 0.1  # of the valid joints: if more are TRACKED, frame and clock are fitted by these alone
-_SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is said
+_SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is stated
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def compare_source(
         source: poses.npz of a run, or an .mcap recording.
         truth: The motion capture.
         wanted: Of what, and how.
-        say: Called with a line at a time.
+        notify: Called with a line at a time.
 
     Returns:
         All figures, for a program.

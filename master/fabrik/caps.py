@@ -28,14 +28,14 @@ class CapSettings(NamedTuple):
         flat_share: A flat marker that shows less of what the best camera sees is tilted by 53 degrees, or partly
             hidden.
         least_share: Least part of a whole cap's area that counts as whole: its radius is a tenth smaller than the
-            profile says.
+            profile states.
         alike_share: Least part of the share that another camera sees: what edges of two blobs of 200 px do not explain.
         reach: Least hidden part by the largest of all cameras. What hides a part from one is near the line of sight of
             the others, and none of them can measure what is hidden from all: of 20 rendered caps the lesser hidden
             part by the larger is 0.16 in the mean, 0.28 rms.
         rotation_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
         radius_share: Relative error of a profile's radii: 0.8 mm.
-        relief_m: [m] of a flat marker on a back that is not flat: 16 mm of paint on a radius of curvature of 50 mm
+        relief_m: [m] of a flat marker on a back that is not flat: 16 mm of colour on a radius of curvature of 50 mm
             bulge by 0.6 mm.
         most_tilt: Largest tangent of the tilt of a sigma point, which stays on its side.
         bent_rad: [rad] farthest from the camera that a cap of an unknown hand points: it still shows a strip.

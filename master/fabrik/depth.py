@@ -295,7 +295,7 @@ class CalibrationResidual:
 
     Attributes:
         rays_px: RMS reprojection error of the cameras together [px]: a bound on what lens and pose are wrong by at one
-            place. How much of it was the noise of the corners cannot be told afterwards.
+            place. How much of it was the noise of the corners cannot be separated afterwards.
         law: Relative error of the depth law, standard deviation.
     """
 

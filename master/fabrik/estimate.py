@@ -17,7 +17,7 @@ class MarkerPositions:
         points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it,
             or what they see is not one thing.
         cov_m2: (M, 3, 3) [m^2].
-        noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one instant to the next.
+        noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one epoch to the next.
         apart: (M,) what two cameras see is not one thing.
         rejected: (C, M) outliers of single cameras, without which the rays of three or more meet.
     """
@@ -38,7 +38,7 @@ class SolvedHand:
         angles_rad: (5, 4), inside the limits.
         joints: Forward kinematics of the two.
         cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
-        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone.
+        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this epoch alone.
         tilt_process_noise_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
     """
 
@@ -55,7 +55,7 @@ class HandEstimate:
     """Hand estimate of the pipeline at one epoch.
 
     Attributes:
-        t_ns: The instant.
+        t_ns: The epoch.
         markers: Positions as triangulated.
         smooth_m: (M, 3) [m] after the 1 € filter.
         back_normal: (3,) unit vector from the hand to the cameras that see its back.
@@ -65,7 +65,7 @@ class HandEstimate:
         residual_m: (5,) distance at which FABRIK left the marker on a finger's end from its target; NaN: not seen.
         iterations: (5,) of FABRIK.
         reached: (5,) FABRIK brought the marker onto its target.
-        solved: Whether the hand is solved from this instant, not held from an earlier one.
+        solved: Whether the hand is solved from this epoch, not held from an earlier one.
     """
 
     t_ns: int

@@ -71,7 +71,7 @@ class ChainResult(NamedTuple):
         iterations: Of all attempts.
         reached: Residual within the tolerance.
         reach: Verdict of the distance bounds.
-        degenerate: A bone has no length, or the target is at the root and says no direction.
+        degenerate: A bone has no length, or the target is at the root and gives no direction.
     """
 
     positions: Float

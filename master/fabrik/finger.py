@@ -183,7 +183,7 @@ class Finger:
     def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
         """Bring the finger's point to a target: FABRIK from the closed form.
 
-        Where the DIP is free (always the thumb's) the point does not tell all angles, and FABRIK starts from the given
+        Where the DIP is free (always the thumb's) the point does not fix all angles, and FABRIK starts from the given
         ones; from the closed form only where they are NaN or do not lead to the target.
 
         Args:

@@ -10,7 +10,7 @@ distance: its depth is then not determined.
 Rays of one point miss each other by noise alone: the squared error in standard deviations is chi-square distributed
 with 2 C - 3 degrees of freedom. Where the rays of three or more cameras do not meet, all subsets with one camera less
 are triangulated; the camera without which they meet is an outlier, if no other subset fits nearly as well. Otherwise
-the marker is not placed: two cameras cannot tell which of them is wrong. Of three in a row none is found where one is
+the marker is not placed: two cameras cannot show which of them is wrong. Of three in a row none is found where one is
 off along the epipolar line of another: each pair meets, elsewhere.
 """
 
@@ -38,7 +38,7 @@ class RaySettings(NamedTuple):
             alone: two sure cameras may miss each other by 6 px. Cheap lenses fit to about half a pixel, and a mount
             gives way when touched.
         false_alarm: Probability that noise alone exceeds the gate: 4.9 standard deviations for two cameras.
-        ambiguous: Least difference in chi-square by which one outlier is told from another: 1 in 100 by chance, one
+        ambiguous: Least difference in chi-square that distinguishes one outlier from another: 1 in 100 by chance, one
             degree of freedom.
         common: Part of the variance of whole caps' centroids that is the same in all cameras. Rendered and detected:
             0.7 of all together, 0.8 by medians, of single fingers 0.3 (little) to 0.8 (index).

@@ -2,20 +2,20 @@
 
 They are carried from the frames around the epoch to the epoch.
 
-A hand's way is known by what hands can do: about the instant it is a Taylor series whose speed, acceleration, jerk and
+A hand's way is known by what hands can do: about the epoch it is a Taylor series whose speed, acceleration, jerk and
 snap are random, with the sizes of real hands. Given up to four frames with their noise, the best linear estimate of the
 place and its variance follow (Gaussian process regression with an unknown constant: Rasmussen, Williams 2006, 2.7;
 "universal kriging"):
 
     S_ij = V^2 tt + A^2 (tt^2 / 2!^2 + w^2 tt^3 / 3!^2 + w^4 tt^4 / 4!^2) + sigma_i^2 [i = j],    tt = t_i t_j
-    x = 1' S^-1 y / c,    var = 1 / c,    c = 1' S^-1 1                     (t: times from the instant)
+    x = 1' S^-1 y / c,    var = 1 / c,    c = 1' S^-1 1                     (t: times from the epoch)
 
 Without noise this is the polynomial through the frames; a hand at rest is averaged, and a step into the future does
 not amplify its noise. How hard the hand moves (A) is not known, so every degree of vigour is tried, from a hand laid
 down to a brisk wave; each counts by its marginal likelihood, and where they disagree the variance grows. An error of
 the time adds in proportion to the marker's speed in the image.
 
-Where a slave named two places of a colour, the marker and its *rival*, it may have swapped them from one frame to the
+Where a slave named two places of a colour, a marker and its *alternative*, they may be swapped from one frame to the
 next, and a line from one thing to another is nowhere. The places of such a marker are first sorted into two tracks by
 nearness in the image. Which of the two is the marker is decided with the other cameras (`master.estimator.gate`).
 """
@@ -41,8 +41,8 @@ _SWAPPED = 3.0  # times nearer to the other track: the slave's names are contrad
 # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
 # no mean removes it. New in each is at most this part of the variance that the slave states, and this much.
 _INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1
-_EVIDENCE = 0.5  # so they also say less of the motion than as many independent ones
-# An error in time lies along the motion. One number for both axes cannot say so: all of it covers too much (98-99 %),
+_EVIDENCE = 0.5  # so they also constrain the motion less than as many independent ones
+# An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much (98-99 %),
 # half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %); this 93-97 %.
 _ALONG = 0.75
 _LEAST_SIGMA_PX = 0.01
@@ -58,7 +58,7 @@ class TrackHistory(NamedTuple):
         total: (C,) frames of each camera so far.
         times_ns: (C, HISTORY, 3) when the centre row and row 0 were exposed, when the frame was handed to its slave.
         t_sigma_ns: (C, HISTORY) standard deviation of the times, one error for all frames of a camera.
-        marks: (C, HISTORY, 6, M) u, v, u and v of the rival, sigma [px], area [px^2]; NaN: not seen.
+        marks: (C, HISTORY, 6, M) u, v, u and v of the alternative, sigma [px], area [px^2]; NaN: not seen.
         row_time_ns: (C,) from one row to the next.
         scale_px_m: (C,) pixels that a metre across the line of sight takes where hands are.
     """
@@ -81,16 +81,16 @@ def propagate(
 
     Args:
         recent: Of each camera.
-        t_ns: The instant.
+        t_ns: The epoch.
         reach_ns: How far away each of the frames that are used may be, the nearest first; negative: not used.
-        uv: (2, C, M, 2) [px], markers and rivals, written; NaN: not seen.
+        uv: (2, C, M, 2) [px], markers and alternatives, written; NaN: not seen.
         sigma: (2, C, M) [px] per axis, time error included, written.
         area: (C, M) [px^2] of the nearest frame, written.
         missing: (C,) written: the camera has no frame there.
 
     Returns:
-        When the last frame that was used was handed to its slave [ns] (none: the instant), and whether there are
-        rivals.
+        When the last frame that was used was handed to its slave [ns] (none: the epoch), and whether there are
+        alternatives.
     """
     used, track = np.empty(OBSERVATIONS, np.int64), np.empty((OBSERVATIONS, 2, 4))
     known, L, z = (
@@ -130,7 +130,7 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
     """Write the slots of the frames around an epoch, nearest first.
 
     Returns how many. None at all where even the nearest is too far: a track carried over two frames into the unknown
-    is off by decimetres in depth, and the ray of a camera that does see is worth more. Of the frames after the instant
+    is off by decimetres in depth, and the ray of a camera that does see is worth more. Of the frames after the epoch
     the first alone counts (two where there is none before), as if the others had not yet come: what comes out does not
     depend on how far a camera's messages ran ahead of another's.
     """
@@ -160,7 +160,7 @@ def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, t
 
     Returns whether the marker has an alternative.
 
-    `track`: (SIGHTINGS, 2, 4) u, v [px], time of the row from the instant [s], sigma [px].
+    `track`: (OBSERVATIONS, 2, 4) u, v [px], time of the row from the epoch [s], sigma [px].
     """
     alternative = False
     for k in range(n):

@@ -186,7 +186,7 @@ def _place(
     rays: Rays,
     views: Views,
 ) -> tuple[int, bool, int, float]:
-    """Triangulate marker m by the cameras that are not left out.
+    """Triangulate marker m by the cameras that are not rejected.
 
     Returns:
         How many see it; whether its point is determined; and as `_correct`.
@@ -324,7 +324,7 @@ class RayPositions(MarkerPositions):
         uv: (C, M, 2) [px] centroids without the bias of the caps; NaN: not seen.
         variance_px2: (C, M) per axis, of each camera's own errors; NaN: not seen, an outlier, or rays do not meet.
         own_m2: (M, 3, 3) covariance of what is wrong with the markers themselves: what all cameras see alike, the tilt
-            and the radius of caps; as large as a fit that starts from the same hand must believe.
+            and the radius of caps; as large as a fit that starts from the same hand must assume.
     """
 
     uv: Float
@@ -376,7 +376,7 @@ class RayTriangulator:
         if hand is not None:
             R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
             at = hand.joints.position_m[self._caps.joint]
-            # A fit believes that fingers move as fast as its priors allow. Told of less than it believes itself, it
+            # A fit assumes that fingers move as fast as its priors allow. Given less than it assumes itself, it
             # would follow its own error, and finger and cap would drag each other away.
             rotation_rad2 = 2.0 * (CAPS.rotation_rad_s * age_s) ** 2
             grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - rotation_rad2

@@ -60,16 +60,16 @@ class FabrikSolver:
             model: The hand.
             markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
-            sync: Brings cameras to one instant.
+            sync: Brings cameras to one epoch.
             triangulate: Centroids to points by the rig's depth model.
-            one_euro: Filter of the points; None: instants are unrelated, nothing is filtered or remembered.
+            one_euro: Filter of the points; None: epochs are unrelated, nothing is filtered or remembered.
             palm: Fits the palm, with the angles that go best with it, from the hand's markers.
             once: The same without memory; fingers that are not seen may be anywhere natural.
             stage: Opens a timer by stage name.
         """
         self._model, self.sync, self.triangulate = model, sync, triangulate
         self._one_euro, self._palm, self._once, self._stage = one_euro, palm, once, stage
-        self.continuous = one_euro is not None  # instants follow each other; else nothing is remembered
+        self.continuous = one_euro is not None  # epochs follow each other; else nothing is remembered
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])

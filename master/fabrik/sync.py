@@ -2,17 +2,17 @@
 
 It determines which frames belong together, and the markers at one epoch.
 
-An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
+An epoch is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
 delivered a dozen frames since its last), nor slow (it delivers less than half of its frames, by what others deliver),
 nor behind (its last frame was a dozen periods older than the newest when it came). It is *complete* when every other
 camera has delivered a frame at or after it, so that tracks can be interpolated; `predict` waits only for those whose
-next frame is nearer to the instant than their last, and carries the others forward, half a period at most. An instant
+next frame is nearer to the epoch than their last, and carries the others forward, half a period at most. An epoch
 is emitted when it is complete, or when the message time has passed its deadline, with whatever there is. Message time
-is the newest capture time seen: no clock is read here, so a replay synchronises exactly as the live run did. An instant
-that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and left out.
+is the newest capture time seen: no clock is read here, so a replay synchronises exactly as the live run did. An epoch
+that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and dropped.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier than the back
-of the hand. `master.fabrik.propagate` carries each to the instant; a sideways error Dt v would turn into a depth error
+of the hand. `master.fabrik.propagate` carries each to the epoch; a sideways error Dt v would turn into a depth error
 D v Dt / B, the largest of an unsynchronised rig.
 """
 
@@ -28,7 +28,7 @@ from common.messages import MarkerDetections
 from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
 
 SILENT_FRAMES = 12
-_SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files say, between so many of its own
+_SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files state, between so many of its own
 _REACH_M = 0.5  # where hands are, for what a camera makes of their motion
 
 
@@ -37,7 +37,7 @@ class FrameSet:
     """Every marker in every camera at one epoch.
 
     Attributes:
-        t_ns: The instant, master's clock.
+        t_ns: The epoch, master's clock.
         uv: (C, M, 2) [px], distorted image; NaN: that camera does not see that marker then.
         sigma_px: (C, M) standard deviation per axis, time error included.
         area: (C, M) [px^2] of the nearest frame.
@@ -62,7 +62,7 @@ class FrameSync:
     Push machine. Holds the last few frames of each camera and the epochs not yet emitted.
 
     Attributes:
-        outdated: Instants that were left out because they waited for as long as nothing came at all.
+        outdated: Epochs that were dropped because they waited for as long as nothing came at all.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class FrameSync:
             frame_rate_hz: Nominal rates; the slowest sets deadline and largest bridgeable gap.
             markers: How many each message has.
             policy: Wait for the other cameras' next frames and interpolate, or for those alone that are nearer to the
-                instant than the last ones, and predict.
+                epoch than the last ones, and predict.
             continuous: False: frames are unrelated poses, nothing is carried from one to another.
         """
         self._index = {name: c for c, name in enumerate(cameras)}
@@ -110,9 +110,9 @@ class FrameSync:
         self._frames = 0  # of all cameras
         # How many those were at the last ones of each.
         self._came: tuple[deque[int], ...] = tuple(deque(maxlen=HISTORY) for _ in models)
-        self._awaited = 0  # the camera that was waited for when an instant was last asked for
+        self._awaited = 0  # the camera that was waited for when an epoch was last asked for
         self._pending: deque[int] = deque()
-        self._newest_ns = self._last_ns = NEVER  # of all frames, of all instants
+        self._newest_ns = self._last_ns = NEVER  # of all frames, of all epochs
         self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:

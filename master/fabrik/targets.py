@@ -17,7 +17,7 @@ def back_normal_of(points: Float, area_px2: Float, centres: Float, focal_px: Flo
     """Write the unit vector from a hand to the cameras that see its back.
 
     A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by
-    what each sees, add up to where it faces, as far as they tell.
+    what each sees, add up to where it faces, as far as they constrain it.
 
     Args:
         points: (M, 3) [m] its markers, rig frame; NaN: not placed.

@@ -7,7 +7,7 @@ camera is rolled by 0.3 degrees, by 0.8 px at the edge of the volume, or 8 mm. B
 
     x(u, v, D) - x(axis, D) = a(u, v) + b(u, v) / D
 
-to a hundredth of a pixel, so a and b are tabulated over the left image and what they say is taken from the disparity
+to a hundredth of a pixel, so a and b are tabulated over the left image and their values are taken from the disparity
 before the law is asked. On the axis, and for parallel cameras without distortion, it is 0. In the same way the row at
 which the right camera must see the marker is tabulated: a marker whose rows disagree is two things, and dropped.
 
@@ -38,7 +38,7 @@ _ANYHOW_RAD = (
     1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
 )
 _ONE = constant(1)  # direction
-_ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing tells where the finger points
+_ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing measures where the finger points
 
 
 class DisparityTables(NamedTuple):
@@ -378,9 +378,9 @@ class Triangulate(Protocol):
         Args:
             uv: (C, M, 2) centroids [px]; NaN: not seen.
             sigma_px, area_px2: (C, M).
-            hand: A hand of `age_s` [s] ago, which tells what side of each cap is seen; None: any that shows it.
+            hand: A hand of `age_s` [s] ago, which determines what side of each cap is seen; None: any that shows it.
             age_s: Its age.
-            as_seen: Nothing tells of a hand: what is seen of a marker is taken for its centroid.
+            as_seen: There is no estimate of a hand: what is seen of a marker is taken for its centroid.
         """
         ...
 

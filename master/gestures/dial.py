@@ -8,10 +8,10 @@ beginning, not summed up from step to step, so that neither noise nor a moment o
 opens first: from when it begins to (`history`) the dial stands where it was, and goes on from there when it is gripped
 again.
 
-Tips that stand still to each other are a grip where most instants of the hold have its shape: which way the palm lies
-decides some of that, and cameras that see no more than fingertips doubt it from instant to instant.
+Tips that stand still to each other are a grip where most epochs of the hold have its shape: which way the palm lies
+decides some of that, and cameras that see no more than fingertips are uncertain of it from epoch to epoch.
 
-The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
+The axis begins as that of the tips' circle; a turn constrains its own axis the better the farther it goes, and
 what is known of it is the mean of both (`_rotate`).
 
 Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
@@ -30,9 +30,9 @@ from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_betw
 from master.gestures.grip_history import GripHistory
 from master.gestures.held_gesture import HeldGesture
 
-_AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
+_AXIS_RAD = radians(15.0)  # how well the circle of the tips constrains the axis of the knob
 _SWAY_RAD = radians(4.0)  # about other axes, by which a hand sways while it turns a knob
-_MOST = 0.6  # of the instants of a hold have the shape of a grip
+_MOST = 0.6  # of the epochs of a hold have the shape of a grip
 
 
 @dataclass(slots=True, eq=False)
@@ -179,7 +179,7 @@ class DialMonitor:
         """The angle of tips that turn the knob.
 
         Its axis is that of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is
-        far. A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of
+        far. A turn r sways by `_SWAY_RAD` about other axes, so it gives its axis to `_SWAY_RAD` / |r|: the weights of
         the two directions go with one over the square. The angle is the twist about it (Dobrowolski, 2015).
         """
         rotation = rotation_between(tips, grip.tips)

@@ -37,7 +37,7 @@ class HandFeatures(NamedTuple):
 
     Attributes:
         hand: Name of the hand profile.
-        t_ns: The instant [ns], that of the pose.
+        t_ns: The epoch [ns], that of the pose.
         known: (5,) the finger's tip is known to `KNOWN_SIGMA_M` or better.
         seen: (5,) a sensor observes the finger now: its tip, or a wrist device its laser line, and not ambiguously.
         sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
@@ -121,7 +121,7 @@ class FeatureExtractor:
     def of(self, pose: HandPose) -> HandFeatures | None:
         """Features of a pose; None where it has no hand.
 
-        A finger of which the pose has nothing is not known, its doubt is infinite, and it stands where fingers that
+        A finger of which the pose has nothing is not known, its variance is infinite, and it stands where fingers that
         hide are likely to be.
         """
         if not pose.valid[WRIST]:

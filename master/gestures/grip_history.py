@@ -3,9 +3,9 @@
 It is kept so that a grip that loosens rotates nothing.
 
 Fingers that let go of a knob go apart, and not alike: taken for a turn it is some degrees. They are quick, so that a
-grip that is suddenly wider than it was is loosening, or the instant is a bad one; a grip that slowly gets wider, as the
+grip that is suddenly wider than it was is loosening, or the epoch is a bad one; a grip that slowly gets wider, as the
 picture of a hand that turns does, is not. While it loosens the angle goes on as it went, ever less: a hand that rests
-before it lets go stands still, and a bad instant in a quick turn is led over.
+before it lets go stands still, and a bad epoch in a quick turn is led over.
 """
 
 from collections import deque
@@ -13,7 +13,7 @@ from math import exp
 from statistics import median
 
 _LATE_S = 0.1  # what counts as of late
-_FIRM = 0.3  # of what is quick: from there on the last instants before it may be of it
+_FIRM = 0.3  # of what is quick: from there on the last epochs before it may be of it
 _FADE_S = 0.06  # in which a turn that nobody sees fades
 _HOLD_S = 0.15  # a grip that is wider for so long is just wider
 

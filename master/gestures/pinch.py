@@ -5,7 +5,7 @@ They have the distance of the skins and how firmly the fingers close.
 A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the others
 are well away from the thumb, or they are at least farther, and then the pads face each other as far as that is known
 (the thumb over a fist lies on the backs of the fingers) and not all others are curled in. Where the others are away
-no bend is asked for: the tips tell it, which are measured however the palm lies.
+no bend is asked for: the tips determine it, which are measured however the palm lies.
 
 What decides is how sure the gap is, along the way from skin to skin; a thumb whose depth is doubtful may still be known
 to meet a finger beside it. A gap that is not known neither begins nor ends a pinch: one that has begun goes on at the

@@ -4,7 +4,7 @@ The ray goes on where the index finger points.
 
 The ray goes from the knuckle through the tip and begins at the tip. Both ends are what a hand is fitted to best, the
 tip by its own marker and the knuckle by the palm, and they are as far apart as anything that points: the same
-millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is habit more than
+millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is prior more than
 measurement (the DIP follows the PIP). It begins at the tip because there is no hand beyond it.
 
 How sure the ray is follows from what is known of both ends across it. One that may be off by more than a few degrees
@@ -29,7 +29,7 @@ from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.held_gesture import HeldGesture
 
-_HELD = 1.5  # the doubt of a ray that is told already may be larger by this
+_HELD = 1.5  # the standard deviation of a ray that is reported already may be larger by this
 _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 

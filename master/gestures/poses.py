@@ -2,12 +2,12 @@
 
 The poses are the six of the Digits study, and those of templates.
 
-Every pose says which quantities are to lie in which range (`common.gesture_settings`). It fits by
+Every pose defines which quantities are to lie in which range (`common.gesture_settings`). It fits by
 
     s = exp(-1/2 sum z^2),   z = distance to the range / sqrt(border^2 + sigma^2)
 
-with sigma the doubt of the quantity itself: a hidden finger speaks neither for nor against. That alone would make a
-hand of which little is known fit everything, so a pose is believed as far as it stands out of the others,
+with sigma the standard deviation of the quantity itself: a hidden finger is neutral. That alone would make a
+hand of which little is known fit everything, so a pose is accepted as far as it stands out of the others,
 
     confidence = s . w s / (sum of all w s)
 
@@ -35,8 +35,8 @@ from master.gestures.quantities import QUANTITIES, Quantities, known_bends
 _RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
 _VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
 _ANYTHING = 1e9  # standard deviation of a quantity that is not known: it is as good as anything
-_ENOUGH = 3  # fingers of index ... little: what is told by fewer must last longer
-_MEMORY_S = 0.15  # older frames tell nothing of how fast a finger is now
+_ENOUGH = 3  # fingers of index ... little: what is recognised from fewer must last longer
+_MEMORY_S = 0.15  # older frames do not measure how fast a finger is now
 
 
 class Fit(NamedTuple):
@@ -181,7 +181,7 @@ class FingerSpeed:
         gives it.
 
         Args:
-            t_ns: The instant [ns].
+            t_ns: The epoch [ns].
             bend_deg: (4,) bends of index ... little, MCP and PIP together.
             known: (4,) which of them are.
         """
@@ -273,7 +273,7 @@ class PoseRecogniser:
         if enough and confidence >= self._hold.end:
             self._going_ns, self._seen_ns, self._confidence = None, t_ns, confidence
             return [self._message(hand, t_ns, "update", confidence)]
-        # Fingers that hide speak neither for nor against it, and other poses begin where they are told.
+        # Hidden fingers count neither for nor against it, and other poses begin where they are measured.
         if fit.score[held] >= self._hold.end:
             self._going_ns = None
             return self._unsure(hand, t_ns, self._hold.hidden_s)

@@ -3,9 +3,9 @@
 The quantities are `common.gesture_settings.Quantity`.
 
 A tip that is off by s turns the finger's last two bones about the PIP, so that a bend is off by s over their length;
-that is the lever of all bends here. What is said of the thumb's tip is off as the tip is, gaps as both tips are.
+that is the lever of all bends here. What is measured of the thumb's tip is off as the tip is, gaps as both tips are.
 Places are in the palm and gaps between tips, so that only what the hand's shape leaves unsure counts: the part of a
-tip's doubt that the palm's place has as well moves all of them alike, and is left out.
+tip's covariance that the palm's place has as well moves all of them alike, and is excluded.
 """
 
 from dataclasses import dataclass
@@ -132,7 +132,7 @@ def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
     """Return how far a finger is taken for hidden, 0..1, and its sigma [deg].
 
     A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies behind the
-    hand or before the palm. That an unseen finger hides is joined with what is believed of it, as one more witness.
+    hand or before the palm. That an unseen finger hides is fused with its prior, as one more observation.
     """
     if not isfinite(sigma):
         return (0.0, 0.0) if seen else (1.0, _HIDDEN_SIGMA_DEG)

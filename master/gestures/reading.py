@@ -24,7 +24,7 @@ class Spoken:
         kind, name: As of the messages.
         began_t_ns, ended_t_ns: [ns]; where the poses end before it, its last message.
         confidence: The highest.
-        value: What it told last: a distance, a strength, an angle; empty for a pose.
+        value: What it reported last: a distance, a strength, an angle; empty for a pose.
     """
 
     kind: str

@@ -4,13 +4,13 @@ The thumb's tip touches a segment of a finger and leaves it again.
 
 The four fingers side by side are a keypad, held so that the index finger lies on top and the tips at the left: the rows
 are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch is the thumb's that comes from
-well away and goes away again; it is told when it goes, so that a hand that closes, pinches or rests its thumb tells
-no key. The finger is that of the least gap between skins, the segment is told by the planes that halve the bends of
+well away and leaves again; it is reported when it goes, so that a hand that closes, pinches or rests its thumb reports
+no key. The finger is that of least gap between skins, the segment is given by the planes that halve the bends of
 the finger, which the thumb's tip passes half a segment, a centimetre, from the middle of any key.
 
-Both are judged over the whole touch, from when the thumb is down until it has gone, each instant by how sure the
+Both are judged over the whole touch, from when the thumb is down until it has gone, each epoch by how sure the
 thumb's tip is in it: a finger that it touches hides part of its cap, so that it is known worst while it is down, and
-best as it leaves. Fingers that are too alike in their gaps tell nothing, nor do gaps that are not known, nor a finger
+best as it leaves. Fingers too alike in their gaps decide nothing, nor do gaps that are not known, nor a finger
 whose tip is seen while its bones may be anywhere, as those of a palm that one pair of cameras looks into.
 """
 

@@ -7,7 +7,7 @@ spread, which nobody repeats better than `FLOOR` another day; few examples widen
 holds 86 % of new ones, n - 1 degrees of freedom). The range is the mean and that much either way, the border is as wide
 again.
 
-Only what was known in every example is asked, and of what says the same twice only one. A pose is refused where an
+Only what was known in every example is asked, and of redundant quantities only one. A pose is refused where an
 existing one fits the examples: it would be called by both names. Where it is meant as a special case of that one, it
 has a greater weight, and so is preferred where both fit.
 """
@@ -52,7 +52,7 @@ class Example:
     """One hold.
 
     Attributes:
-        quantities: Medians over the frames in which each was known, and their doubt; unknown: inf.
+        quantities: Medians over the frames in which each was known, and their standard deviations; unknown: inf.
         known: (5,) fingers that were known in most frames.
     """
 
@@ -90,7 +90,7 @@ class PoseTemplate:
 
     Attributes:
         shape: What is asked of it.
-        said: Lines for the user: what it is told by, and what tells it from the other poses.
+        said: Lines for the user: what it is recognised by, and what distinguishes it from the other poses.
         residual: For the provenance.
     """
 
@@ -112,7 +112,7 @@ def learn(
 
     Raises:
         FitError: Too few or too different examples, too little is known of the hand, or it is too like another pose.
-            The text says which and why.
+            The text states which and why.
     """
     if not FEWEST <= len(examples) <= MOST:
         raise FitError(f"{name}: {len(examples)} examples, {FEWEST} to {MOST} are needed")
@@ -173,7 +173,7 @@ def _refuse_alike(
     A template pose whose middle fits this one is refused too.
 
     Raises:
-        FitError: Naming the pose, and what comes nearest to telling them apart.
+        FitError: Naming the pose, and what comes nearest to distinguishing them.
     """
     for other, of in others.items():
         if other == within:

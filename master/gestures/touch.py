@@ -154,7 +154,7 @@ def _sigma_m(
     """Return the standard deviation [m] of a gap.
 
     Of both skins along the way from one to the other, each as its bone has it there, between what its two joints have.
-    What both err alike by, the palm's doubt, counts twice: it is small beside the rest where tips are seen.
+    What both err alike by, the palm's uncertainty, counts twice: it is small beside the rest where tips are seen.
     """
     total = 0.0
     for i in range(3):
@@ -171,7 +171,7 @@ def _palmar(f: int, s: int, joints: Float, pads: Float) -> Vector:
 
     It is across the segment, in the plane of its bend.
 
-    The pad says it for the last one; the others are turned back by the bends between.
+    The pad gives it for the last one; the others are turned back by the bends between.
     """
     last = minus(_at(joints, CHAINS[f, 3]), _at(joints, CHAINS[f, 2]))
     out = minus(_at(pads, f), _on(joints, CHAINS[f, 2], CHAINS[f, 3], PAD_SHARE))

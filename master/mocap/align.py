@@ -5,7 +5,7 @@ d together by Gauss-Newton with the weights of Geman & McClure, from the rigid f
 
     p_ours(t) = R p_theirs(t - d) + s
 
-How sure they are is told by the jackknife over consecutive parts (Efron & Tibshirani, 1993, chapter 11), because errors
+Their sigma is estimated by the jackknife over consecutive parts (Efron & Tibshirani, 1993, chapter 11), as errors
 last from frame to frame. What is fitted hides what is constant: an error of where our frame lies, and a delay of ours.
 """
 
@@ -22,7 +22,7 @@ from master.mocap.track import Track, known
 _ITERATIONS = 30
 _PARTS = 8
 _LEAST_ROWS = 30
-_LEAST_SPREAD_M = 0.005  # across the line that points lie along: less does not tell a turn
+_LEAST_SPREAD_M = 0.005  # across the line that points lie along: less does not determine a rotation
 _MIRROR = 0.5  # of the residual
 _FLOOR_M = 1e-5
 

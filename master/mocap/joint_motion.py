@@ -32,7 +32,7 @@ class PointTable:
         names: (N,) as the file spells them.
         t_s: (T,) [s], rising.
         position: (T, N, 3) in `unit`; NaN: not seen.
-        unit: Of length; None: the file does not say.
+        unit: Of length; None: the file does not state it.
         ends: Those of `names` that are end sites, the end of a bone and no joint.
     """
 
@@ -51,7 +51,7 @@ class JointMotion:
         t_ns: (T,) [ns], rising, on the clock of the file.
         names: (J,) each a WebXR joint, `palm`, or a marker of ours (`MARKERS`).
         position_m: (T, J, 3) [m], frame of the file; NaN: not seen.
-        side: That the names say; None: they do not.
+        side: That the names state; None: they do not.
         source: The file.
         remarks: What was assumed, for a person.
     """

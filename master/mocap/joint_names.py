@@ -3,7 +3,7 @@
 `mixamorig:RightHandIndex1` is the right index's MCP.
 
 A name is cut into words at separators, digits and capitals. One word names the finger, one the joint: MCP, PIP and DIP,
-or the bone that begins there, as in WebXR. Where joints of a finger are numbered, how many there are says which is
+or the bone that begins there, as in WebXR. Where joints of a finger are numbered, their number determines which is
 which: 1 2 3 (and 4, or an end) are MCP, PIP, DIP (and tip), 0 1 2 3 begin with the metacarpal; of a thumb 1 2 3 are
 CMC, MCP, IP; `RightInHandIndex` is a metacarpal. A thumb whose joints are called like a finger's (proximal,
 intermediate, distal) begins at its CMC.
@@ -30,7 +30,7 @@ _PARTS = {
     **dict.fromkeys(("tip", "end", "nub"), _TIP),
 }
 _MARKER_NAMES = ("thumb", "index", "middle", "ring", "little")
-_COUNTED = 3  # joints of a finger: fewer numbers do not say which
+_COUNTED = 3  # joints of a finger: fewer numbers do not determine which
 _SHOWN = 80  # names of an error message
 
 Key = tuple[Side | None, str]
@@ -185,7 +185,7 @@ class MatchedNames:
     """The points of one hand.
 
     Attributes:
-        side: That the names say, or that was asked for; None: neither.
+        side: That the names state, or that was asked for; None: neither.
         names: Point of ours -> name in the file.
     """
 

@@ -36,7 +36,7 @@ def read_optical(rows: list[list[str]], path: Path, rate_hz: float | None) -> Po
     Args:
         rows: Cells.
         path: The file, for errors.
-        rate_hz: Of the frames, where the table does not say.
+        rate_hz: Of the frames, where the table does not state it.
 
     Raises:
         RecordingError: It breaks off, or a cell is no number.

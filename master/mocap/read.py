@@ -29,7 +29,7 @@ class Reading:
 
     Attributes:
         joints: JSON file: point of ours -> name in the file, or null for one that is to be left out.
-        unit: Of length; None: as the file says, else by the size of the hand.
+        unit: Of length; None: by the file, else by the size of the hand.
         side: Of a file with both hands.
         rate_hz: Of a table without times.
     """

@@ -3,7 +3,7 @@
 It is measured from the tracks themselves while they run.
 
 A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by exposure and
-transfer, 8 to 10 ms; and nothing that travels with the frame tells. The tracks do (`master.monitor.timing_evidence`).
+transfer, 8 to 10 ms; nothing that travels with the frame shows it. The tracks do (`master.monitor.timing_evidence`).
 
 `ResidualTiming` takes every message and compares a second at once, some frames later, one step of the work with each
 message: most cost no more than being kept, a few in a second a fraction of a millisecond. What it finds is corrected
@@ -23,10 +23,10 @@ from master.monitor.timing_fit import TENTHS, TimeOffset, fit_offset, unit_sums
 
 BLOCK_NS = 1_000_000_000
 KEPT_BLOCKS = 32
-RATE_HZ = 30.0  # a hand moves below 10 Hz: more frames tell the same
+RATE_HZ = 30.0  # a hand moves below 10 Hz: more frames add no information
 _MARGIN_FRAMES = 4  # the cubic reaches two frames out, and the slowest camera may be one late
 _GAP_PERIODS = 2.5
-_USELESS_S = 5e-3  # a block that could at best tell this much says nothing
+_USELESS_S = 5e-3  # a block that could at best resolve this much is uninformative
 _DONE = object()
 _SPARE = 2  # times as many frames are kept as a block needs
 

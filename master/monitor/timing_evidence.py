@@ -4,7 +4,7 @@ A frame of the second camera that was really taken `d` later than its stamp show
 later: x(t) = x_true(t) + d v, with v its velocity in that image. Two things that are constant in truth then change in
 step with the velocity:
 
-- **the epipolar misfit** of each marker, which should stay what lens and mount make it:  e = e0 + d (n . v), with n the
+- **the epipolar residual** of each marker, which should be what lens and mount make it: e = e0 + d (n . v), with n the
   normal of the epipolar line. It sees motion across the baseline.
 - **the distance between two markers**, which should stay what the hand makes it. Along the baseline a wrong time is a
   wrong depth D v d / B, which no epipolar line contradicts; but a hand that is taken for 10 % farther away is taken for

@@ -1,8 +1,8 @@
 """From evidence to the offset between two cameras, and how well it is known.
 
-Time is cut into blocks, and each item of each block (a *unit*: one marker's misfit, or one distance, for a
+Time is cut into blocks, and each item of each block (a *unit*: one marker's residual, or one distance, for a
 second) keeps its own constant: its sums are taken about its own means, so whatever changes slowly, lens errors across
-the image or another posture of the fingers, is no evidence. A unit then says `s_ze = d s_zg` with the covariances of
+the image or another posture of the fingers, is no evidence. A unit then gives `s_ze = d s_zg` with the covariances of
 instrument z, value e and rate g, and all together
 
     d = sum w s_ze / sum w s_zg
@@ -37,7 +37,7 @@ _AT_LEAST = 8  # equations of a unit
 _FAR = 6.0  # medians of a normal distribution: 4 sigma
 _STILL = 1e-3  # [1, normalised image]: half a pixel
 _BATCHES_AT_LEAST = 3.0
-_LONG_BATCHES_AT_LEAST = 5.0  # fewer tell little that shorter ones do not
+_LONG_BATCHES_AT_LEAST = 5.0  # fewer add little that shorter ones do not
 _LENGTHS = (1, 2, 5, 10, 20)  # of batches [tenths of a block]
 _TIMES = 8
 _LEVERAGE_AT_MOST = 0.95

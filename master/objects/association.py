@@ -44,7 +44,7 @@ class Association:
         """All that is seen; None: nothing.
 
         Args:
-            window: The sightings.
+            window: The observations.
             features: Of the object.
             cameras: Of the rig.
             T: A pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken. None: none.

@@ -57,7 +57,7 @@ class Views:
         uv = np.empty_like(xy)
         uv[:, 0] = x * radial + p1 * two_xy + p2 * (r2 + 2.0 * xx)
         uv[:, 1] = y * radial + p1 * (r2 + 2.0 * yy) + p2 * two_xy
-        # The tangential part turns the derivative by less than 1 % and is left out of it.
+        # The tangential part turns the derivative by less than 1 % and is neglected in it.
         by_own = np.empty((len(xy), 2, 3))
         scale = self.focal / z[:, None]
         by_own[:, 0, 0] = radial_derivative * xx + radial

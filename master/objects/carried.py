@@ -54,7 +54,7 @@ class Carried:
         """Whether the object is carried.
 
         Args:
-            t_ns: The instant; it rises.
+            t_ns: The epoch; it rises.
             T_rig_object: Where the object is (4, 4).
             palm_m: The palm (3,), rig frame; NaN: not known.
             distance_m: Between palm and object.

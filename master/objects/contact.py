@@ -2,7 +2,7 @@
 
 The skin of a finger is capsules from joint to joint with the radii of the profile (`common.tapered_capsules`). The
 distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
-bar often holds it with the middle ones. The object's poses around the hand's instant are brought to it: between two of
+bar often holds it with the middle ones. The object's poses around the hand's epoch are brought to it: between two of
 them by interpolation, behind the last by its motion, a tenth of a second at most.
 
 How sure a distance is follows from the covariances along the normal of the surface: that of the joints, that of the
@@ -41,7 +41,7 @@ NEAR_M, FAR_M = 2.5e-3, 5.0e-3
 SURFACE_SIGMA_M = 1.0e-3  # standard deviation of the skin about the profile's radii
 LED_S = 0.1  # by which an object's pose is led on, at most
 _POSES = 6
-_SURE_M = 0.02  # a distance less sure than this tells of no touch
+_SURE_M = 0.02  # a distance less sure than this is no evidence of touch
 _SIGMA_SHARE = 0.5  # of a standard deviation by which touching may begin early
 _LED_M_S2, _LED_RAD_S2 = 5.0, 50.0  # what a hand does to what it holds while nobody sees it
 _BONES: Int = np.concatenate(

@@ -3,7 +3,7 @@
 Its beads and the corners of its tags are one list of points; it states which of them face a camera.
 
 A camera is *expected* to see a feature that lies in its image, is turned to it, is large enough and is not behind the
-object itself. Some are at the edge of that, and a slave may find them or not: that these are missing tells nothing.
+object itself. Some are at the edge of that, and a slave may find them or not: that these are missing is no evidence.
 """
 
 from dataclasses import dataclass
@@ -116,7 +116,7 @@ class Features:
         Args:
             T_rig_object: The pose.
             camera: The camera.
-            ease: By what all that is asked of a feature is multiplied; below 1 those are told that may be seen.
+            ease: By what all that is asked of a feature is multiplied; below 1 those are returned that may be seen.
         """
         eye = (camera.centre - T_rig_object[:3, 3]) @ T_rig_object[:3, :3]
         uv = camera.project(transform(T_rig_object, self.points))

@@ -3,7 +3,7 @@
 The observations are those around the epoch.
 
 Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
-object's motion about the instant is a Taylor series of its place and of its turn (`master.objects.motion`), to the
+object's motion about the epoch is a Taylor series of its place and of its turn (`master.objects.motion`), to the
 fourth order, whose speed, acceleration, jerk and snap are drawn at random with the sizes of what hands do (as
 `master.fabrik.propagate` has it for single markers; Rasmussen, Williams 2006, 2.7).
 
@@ -53,7 +53,7 @@ class Fitted:
         weight: (n,) of each observation, 0..1.
         misfit: (n,) chi square of each observation's feature in its camera, per number measured.
         residual_m: (n,) by how much each misses the object [m].
-        alone: What is seen tells the pose, without what was known before.
+        alone: The observations determine the pose, without the prior.
     """
 
     motion: Motion
@@ -101,7 +101,7 @@ class PoseFit:
 
         Args:
             seen: Observations.
-            start: At the instant.
+            start: At the epoch.
             past: What else is known; None: nothing.
             feature: (n,) of what each observation is a part: what is weighed down together with it in its camera.
         """

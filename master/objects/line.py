@@ -2,11 +2,11 @@
 
 Detections of markers and tags go in, its pose at every frame of the leading camera comes out.
 
-`ObjectLine` is a push machine without clock, socket or thread. For each instant (`master.objects.window`) the pose is
+`ObjectLine` is a push machine without clock, socket or thread. For each epoch (`master.objects.window`) the pose is
 fitted (`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most of
 what is seen in the wrong place, from what is seen alone (`master.objects.start`), the best of all starts.
 
-**Too little is seen** to tell all of it, as two beads of three: then what was known before counts as well
+**Too little is seen** to determine all of it, as two beads of three: then the prior estimate counts as well
 (`master.objects.trajectory`), as it was at a time before all frames of this fit, so that nothing counts twice.
 
 **One tag** has two poses that nearly explain it (`master.objects.single_tag`).
@@ -39,13 +39,13 @@ from master.objects.start import poses_of_beads, poses_of_tags
 from master.objects.trajectory import Trajectory, unheeded
 from master.objects.window import Window, Windows
 
-# What light does to a ball's centroid beyond what a slave says, and to a corner.
+# What light does to a ball's centroid beyond what a slave reports, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
 _INCOMPLETE_M, _INCOMPLETE_RAD = (
     0.02,
     np.radians(12.0),
-)  # less sure than this it does not tell all of the pose
+)  # less sure than this it does not determine all of the pose
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_CHI2 = 25.0  # chi square per number of what a pose from nothing rests on

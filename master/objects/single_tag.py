@@ -2,13 +2,13 @@
 
 Chooses which of its two poses to use, and how certain that choice is.
 
-A flat tag has two poses that nearly explain it, tilted one way or the other. Both are fitted; the one that was believed
+A flat tag has two poses that nearly explain it, tilted one way or the other. Both are fitted; the one that was assumed
 stays unless the other is clearly better over several frames, and as far as the other is possible the covariance reaches
 over to it.
 
-The other is fitted for nothing where two cameras that see the tag leave no doubt, and costs as much as the first. So
+The other is fitted for nothing where two cameras that see it leave no ambiguity, and costs as much as the first. So
 while the same cameras see the same tag, and the other was out of the question when it was fitted last, it is taken to
-be as bad for the next frames (`_UNLOOKED`). What is told then differs by less than numbers are exact.
+be as bad for the next frames (`_UNLOOKED`). What is published then differs by less than numbers are exact.
 """
 
 from dataclasses import dataclass, replace
@@ -73,7 +73,7 @@ class SingleTag:
         The fit is returned unchanged where more than one tag is seen.
 
         Args:
-            window: The sightings.
+            window: The observations.
             seen: What was fitted.
             fitted: The pose.
             begins: There is no pose before it: the better one is taken at once.

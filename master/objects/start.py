@@ -38,7 +38,7 @@ class Sighted:
     Attributes:
         camera: Which.
         feature: Which.
-        uv: (K, n, 2) [px] n points; K places it may be: one, or two where the slave named a rival.
+        uv: (K, n, 2) [px] n points; K places it may be: one, or two where the slave named an alternative.
     """
 
     camera: int

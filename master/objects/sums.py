@@ -3,7 +3,7 @@
 Errors that stay from frame to frame are eliminated from them exactly.
 
 An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each frame. The
-first is an unknown of its own, eliminated by its Schur complement, so that four sightings of one bead at rest are not
+first is an unknown of its own, eliminated by its Schur complement, so four observations of one bead at rest are not
 taken for four measurements.
 
 A feature that misses the pose by more than noise and a bad calibration is weighed down as a whole, in its camera, by
@@ -28,7 +28,7 @@ class Observations:
     Attributes:
         camera: (n,) which camera.
         point: (n,) which row of `Features.points`.
-        tau_s: (n,) when, from the instant [s].
+        tau_s: (n,) when, from the epoch [s].
         uv: (n, 2) [px], distorted image.
         sigma_px: (n,) standard deviation per axis.
         t_sigma_s: (n,) of the times, the same error for all of a camera.
@@ -72,7 +72,7 @@ class Sums:
         independent = np.minimum(_INDEPENDENT_SHARE * variance, _INDEPENDENT_PX**2)
         correlated = variance - independent + floor_2
         _, first, group = np.unique(seen.camera * points + seen.point, return_index=True, return_inverse=True)
-        # What the surest sighting keeps is kept by all; others have more that is new.
+        # What the surest observation keeps is kept by all; others have more that is new.
         self._correlated = np.full(len(first), np.inf)
         np.minimum.at(self._correlated, group, correlated)
         kept = self._correlated[group]
@@ -96,7 +96,7 @@ class Sums:
 
         Args:
             miss: (n, 2) by which the observations miss the pose [px].
-            lag_2: (n,) variance that the doubt of their times makes [px^2].
+            lag_2: (n,) variance that the uncertainty of their times makes [px^2].
         """
         total = self._total + lag_2
         squared = 0.5 * np.vecdot(miss, miss)

@@ -4,7 +4,7 @@ The device is one that tracks itself.
 
     T_rig_object(t) = T_rig_tracking T_tracking_device(t) inv(T_object_tracker)
 
-No cameras, and so no instants of theirs: each pose of the device is one of the object, at its own time, which is the
+No cameras, and so no epochs of theirs: each pose of the device is one of the object, at its own time, which is the
 stamp and `stamp_offset_us`. How sure it is the registration knows: what was left of it against the cameras, which has
 the device's jitter in it, and how sure it is itself; both are of the object's own frame, the lever from the device to
 it included. The cameras' errors are in it, too, so the covariance is rather too large than too small.
@@ -57,8 +57,8 @@ class TrackerLine:
         """Set up.
 
         Args:
-            profile: The object; it has a tracker, and says where that sits.
-            rig: It says where the tracking system lies.
+            profile: The object; it has a tracker, and defines where that sits.
+            rig: It defines where the tracking system lies.
 
         Raises:
             CalibrationError: The tracker is not registered yet.
@@ -77,7 +77,7 @@ class TrackerLine:
         self._last: ObjectPose | None = None
         self._session: int | None = None
         self._newest_ns: int | None = None
-        self._leapt: tuple[int, Float] | None = None  # when the doubt began, and where
+        self._leapt: tuple[int, Float] | None = None  # when the leap began, and where
         self.counts: Counter[str] = Counter()
 
     def push(self, message: TrackerPose) -> list[SolvedObject]:

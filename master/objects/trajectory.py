@@ -110,13 +110,13 @@ def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) ->
     By what may have happened in these directions for so long [s].
 
     A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
-    rest on: its doubt grows as that of a thing that nobody sees.
+    rest on: its covariance grows as that of a thing that nobody sees.
 
     Args:
         fitted: With the past.
         alone: Without.
         since_s: For how long.
-        poor_m: What is less sure than this is not told [m].
+        poor_m: What is less sure than this is not reported [m].
     """
     size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
     unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]

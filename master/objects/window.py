@@ -2,12 +2,12 @@
 
 Also when an epoch has all the observations that it will get.
 
-An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
+An epoch is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
 `master.fabrik.sync`. It is complete when every other camera has delivered a frame at or after it, its tags included
 where the object has tags: those of a frame have come, or never will, when the markers of the next are there. It is due
 when the message time has passed its deadline. Message time is the newest capture time: no clock is read.
 
-Nothing is carried to the instant here: every point keeps the time of its own row (`master.objects.fit`).
+Nothing is carried to the epoch here: every point keeps the time of its own row (`master.objects.fit`).
 """
 
 from collections import deque
@@ -24,7 +24,7 @@ from master.fabrik.propagate import HISTORY, OBSERVATIONS
 from master.fabrik.sync import SILENT_FRAMES
 from master.objects.features import Features
 
-_PERIOD_NS = 16_666_667  # until frames have told
+_PERIOD_NS = 16_666_667  # until it is measured from frames
 _DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
 
 
@@ -61,9 +61,9 @@ class Window:
     """All observations around an epoch.
 
     Attributes:
-        t_ns: The instant, master's clock.
-        origin_ns: The first frame of all, to which the times of sightings count.
-        views: Of each camera up to four sightings by markers and four by tags, each kind the nearest first.
+        t_ns: The epoch, master's clock.
+        origin_ns: The first frame of all, to which the times of observations count.
+        views: Of each camera up to four observations by markers and four by tags, each kind the nearest first.
         ready_t_ns: When the last contributing frame was handed to its slave.
         period_ns: From frame to frame, of the slowest camera.
     """
@@ -104,7 +104,7 @@ class Windows:
         Args:
             cameras: Camera name -> model.
             features: Of the object.
-            predict: Do not wait for a camera whose last frame is nearer to the instant than its next.
+            predict: Do not wait for a camera whose last frame is nearer to the epoch than its next.
             late_ns: Camera -> how much later its frames are than their stamps.
         """
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
@@ -184,7 +184,7 @@ class Windows:
             point, sigma, area = np.arange(len(rows)), message.sigma_px[rows], message.area[rows]
             both = np.stack([message.uv[rows], message.alt_uv[rows]])
             if self._shift[c].any and len(rows):
-                # Of a rival the area is not told: about that of the marker.
+                # Of an alternative the area is not reported: about that of the marker.
                 both = (
                     self._shift[c]
                     .centres(both.reshape(1, -1, 2), np.tile(area, 2)[None])[0]

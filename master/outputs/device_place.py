@@ -4,7 +4,7 @@ The device is on the forearm, which the solved palm and the wrist's flexion plac
 
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
-with `T_camera_palm` of a straight wrist (`common.wrist_joint`). A bend that nobody tells counts as none.
+with `T_camera_palm` of a straight wrist (`common.wrist_joint`). A bend that is not measured counts as none.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class DevicePlace:
         wrist_m: (T, 3) the wrist [m], rig frame.
         R_rig_palm: (T, 3, 3).
         R_rig_forearm: (T, 3, 3).
-        wrist_angles_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as in the poses; NaN: nobody tells.
+        wrist_angles_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as in the poses; NaN: not measured.
     """
 
     wrist_m: Float

@@ -86,7 +86,7 @@ class RunFiles:
         self._contacts = {
             (hand, name): contact_file(folder, hand, name)
             for hand, count in marker_counts.items()
-            if count  # a wrist device alone tells of no contact
+            if count  # a wrist device alone measures no contact
             for name in objects
         }
         self._gestures = GesturesFile(folder)

@@ -54,7 +54,7 @@ def render_hand(view: View, position_m: Float, radius_m: Float) -> tuple[Pixels,
 
     Args:
         view: The eye.
-        position_m: Joints (26, 3) [m], rig frame. A bone with a NaN end is left out.
+        position_m: Joints (26, 3) [m], rig frame. A bone with a NaN end is not drawn.
         radius_m: (26,) [m].
 
     Returns:

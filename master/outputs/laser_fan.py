@@ -11,7 +11,7 @@ from master.outputs.palette import Rgb
 from master.wrist_setup import WristSetup
 
 LASER_RGB: Rgb = (235, 64, 52)
-_FAN_RAD = np.radians(105.0)  # of the laser line of Digits, where the rig does not say
+_FAN_RAD = np.radians(105.0)  # of the laser line of Digits, where the rig does not specify it
 _RAYS = 22  # about every 5 degrees
 _REACH_M = (0.06, 0.12, 0.18)  # arcs; the fingers of a large hand end within the last
 
@@ -21,7 +21,7 @@ def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
 
     Evenly spaced over the fan.
 
-    Where the rig does not say where its middle goes, that is the camera's view, as far as it lies in the plane.
+    Where the rig does not specify where its middle goes, that is the camera's view, as far as it lies in the plane.
     """
     laser = rig.laser
     ahead = np.array([0.0, 0.0, 1.0] if laser is None or laser.forward is None else laser.forward)

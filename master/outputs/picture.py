@@ -48,7 +48,7 @@ _LINE, _HALF_LINE = (
 )  # letters of what was tracked that fit in one line beside eight figures, and beside more
 _MOST_FIGURES = 10
 _FIGURE_STEP, _FIGURE_STEP_NARROW = 0.0845, 0.0735  # of the width, between eight figures and between more
-# Key figures of the summary, in the order of importance: key, what it says, format.
+# Key figures of the summary, in the order of importance: key, label, format.
 _FIGURES = (
     ("poses_per_s", "poses / s", "{:.1f}"),
     ("latency_p50_ms", "ms latency p50", "{:.1f}"),
@@ -82,7 +82,7 @@ def draw_summary(
 
     Args:
         path: The file; replaced only by a complete one.
-        poses: The run; without a valid pose the picture says so.
+        poses: The run; without a valid pose the picture states so.
         rig: Camera places.
         model: The hand; its name, side and limits are shown.
         summary: Key figures by the names of the summary JSON; others are left out.

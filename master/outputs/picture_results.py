@@ -23,7 +23,7 @@ from master.outputs.picture_panels import INK, PAPER, style, unit
 from master.outputs.result_files import Contacts, ObjectPoses
 
 STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the figure
-_NEAR_NS = 60_000_000  # an object is shown where it was this close to the instant
+_NEAR_NS = 60_000_000  # an object is shown where it was this close to the time shown
 _LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
 _TAP_S = 0.15
 _LETTER_SHARE = 0.0135  # of the strip's length that a letter takes
@@ -41,7 +41,7 @@ class ResultPicture:
         profiles: The objects' files.
         objects: Where they were.
         contacts: How near the hand was to each.
-        gestures: What the hand said, in the order of time.
+        gestures: What the hand signalled, in the order of time.
     """
 
     profiles: Sequence[ObjectProfile] = ()

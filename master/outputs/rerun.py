@@ -3,7 +3,7 @@
 Reads what a master publishes from the bus and never slows the tracking.
 
 It subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses pictures,
-not poses; the only thing it says is "preview" to the cameras, which then show themselves for three seconds.
+not poses; the only thing it sends is "preview" to the cameras, which then show themselves for three seconds.
 The native and the web viewer are child processes that listen on 127.0.0.1 only, with a memory limit and with
 their makers' usage statistics switched off (docs/viewer.md).
 """

@@ -35,7 +35,7 @@ class CameraImages:
     def log(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
         """Show an image of a camera at its full size, however small it is.
 
-        More than 10 a second are left out, and so are images of a camera that the rig does not have, bytes that are
+        More than 10 a second are dropped, and so are images of a camera that the rig does not have, bytes that are
         no JPEG, and what claims to be larger than the camera's picture.
 
         Args:

@@ -26,7 +26,7 @@ class ResultLayer:
 
     Holds tips and palm of the last poses.
 
-    Contact and gestures are drawn at the joints of their own instant.
+    Contact and gestures are drawn at the joints of their own epoch.
     """
 
     def __init__(self, recording: rr.RecordingStream, objects: Sequence[ObjectProfile]) -> None:

@@ -16,7 +16,7 @@ style.
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
     world/objects, contact               what else is tracked, and where fingers touch it: see `rerun_objects`
-    world/gestures; states; events       what the hands say: see `rerun_gestures`
+    world/gestures; states; events       what the hands signal: see `rerun_gestures`
     world/laser, ...                     of a wrist device, alone or beside the markers: see `rerun_wrist`
     world/truth/skeleton, markers        where a truth is known
     plots/...                            latency, rate, jitter, error, PIP angles, bend of the wrist, counts, health

@@ -3,8 +3,8 @@
 The fan of its laser, where that meets each finger, and what the device saw.
 
 world                                a device alone: all of it, turned as the forearm is held, up is up; where an IMU
-                                     tells it
-world/laser/fan                      the laser's light, as far as the rig says where it goes
+                                     measures it
+world/laser/fan                      the laser's light, as far as the rig specifies where it goes
 world/laser/points                   where it meets each finger, in the finger's colour
 world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
 world/cameras/CAM/laser              the same points as this camera should see them

@@ -2,7 +2,7 @@
 
 A process of its own, with an end of its own.
 
-It is there before the first message is taken, so that a replay is what was told live from the first pose on. Its
+It is there before the first message is taken, so that a replay is what was published live from the first pose on. Its
 standard input is a pipe from this process: when that closes, because we end it or because we died, it ends its file. It
 is in a group of its own, so that Ctrl-C stops the tracking first and the recorder then.
 """
@@ -44,7 +44,7 @@ class RecorderProcess:
             path: The file.
             files: Files of calibration of the rigs.
             endpoint: Of our bus, which is open already.
-            say: Called with each line that it says.
+            say: Called with each line that it prints.
             ended: Called, on another thread, once it is gone.
         """
         self._notify, self._ended, self._path = notify, ended, path

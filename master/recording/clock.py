@@ -2,7 +2,7 @@
 
 Where in the recording the player is; it can be paused, moved, and run at any speed.
 
-It reads no clock itself: it is told the time.
+It reads no clock itself: it is passed the time.
 """
 
 

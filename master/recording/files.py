@@ -51,7 +51,7 @@ def recorded_rigs(recording: MessageRecording) -> tuple[str, ...]:
     """The names of the rigs of a recording.
 
     Raises:
-        RecordingError: It does not say, or one is no plain name.
+        RecordingError: It does not state them, or one is no plain name.
     """
     text = recording.about.get("rigs")
     rigs = plain_names(recording.path, "rigs", text) if text is not None else ()

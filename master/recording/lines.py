@@ -46,7 +46,7 @@ class ProgressLine:
             self._stream.write(text)
             self._stream.flush()
         except OSError:
-            return  # nobody reads any more; what it tells of goes on
+            return  # nobody reads any more; what it reports on goes on
 
 
 def progress_text(now: Progress, lost: int, seconds: float | None) -> str:

@@ -43,7 +43,7 @@ class PlaySettings:
         from_s, to_s: The stretch, from the beginning of the recording [s]; None: all.
         out: Folder for poses.npz and what else there is, or None.
         loop: Begin again at the end.
-        solved: Tell what was told live instead of solving.
+        solved: Publish what was published live instead of solving.
     """
 
     path: Path
@@ -66,7 +66,7 @@ def run_play(
 
     Args:
         settings: What, and how.
-        bus: Where it is told; None: nowhere. Left open.
+        bus: Where it is published; None: nowhere. Left open.
         stop: Set by a signal handler, or by the command "stop".
         say: Called with a line when something happens.
         show: Called once a second where it is [s], of how much.

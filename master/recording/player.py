@@ -2,10 +2,10 @@
 
 What the master received goes through the very same `Dispatcher` again, at any speed, from any time.
 
-What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
-same, bit for bit, however fast; a `Backlog` among them says what the live master left out, and so does the player. To
+What comes out depends on nothing but the messages and their order, so that every pass over the same stretch yields the
+same, bit for bit, however fast; a `Backlog` among them gives what the live master dropped; the player drops it too. To
 begin anywhere but at the start, a new world is shown what came two seconds before, silently: filters and tracks have
-settled by then, but what it tells from there on is near to that of a whole pass, not equal to it.
+settled by then, but what it publishes from there on is near to that of a whole pass, not equal to it.
 """
 
 import threading
@@ -33,7 +33,7 @@ SETTLE_NS = 2_000_000_000
 GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
 _STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
-AUXILIARY = ("health", "checklist", "preview", "still")  # told again as they were told
+AUXILIARY = ("health", "checklist", "preview", "still")  # published again as they were
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
 
 
@@ -42,7 +42,7 @@ class Passed:
     """One pass over a recording.
 
     Attributes:
-        digest: Over all that was told.
+        digest: Over all that was published.
         seconds: How long it took [s].
         whole: From the beginning to the end that was asked for, without a jump.
     """
@@ -98,12 +98,12 @@ class Player:
         Args:
             recording: What is played.
             setups: What watched each hand.
-            sinks: Take what is told.
+            sinks: Take what is published.
             speed: 1: as it was; 0: as fast as it goes.
             from_ns, to_ns: The stretch that is played, log times [ns]; None: all.
-            solved: Tell what was told live instead of solving.
+            solved: Publish what was published live instead of solving.
             again: Takes reports, lists and pictures that were recorded beside.
-            taken: Shown each message that was taken, once all that it tells is out.
+            taken: Shown each message that was taken, once all that it yields is out.
             say: Called with a line where something happened that a replay cannot repeat.
 
         Raises:

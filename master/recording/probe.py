@@ -2,7 +2,7 @@
 
 In the order in which the master receives them.
 
-A message goes on the bus (stream `taken`) once all that it tells is out, with those of the same fifth of a second,
+A message goes on the bus (stream `taken`) once all that it yields is out, with those of the same fifth of a second,
 on a thread of its own: no pose waits for it. That thread may wait for a reader, so that none is lost on the way; where
 it waits for too long, what does not fit its queue is dropped and counted. While nobody taps, there is no thread, and a
 message costs one comparison.

@@ -177,7 +177,7 @@ class _Run:
                 (self._settings.frames_hz > 0.0, "still", 1.0 / max(self._settings.frames_hz, 1e-3)),
             ):
                 if wanted:
-                    # Nothing is said of one that is away: the recording's table shows how much of it there is.
+                    # Nothing is reported of one that is away: the recording's table shows how much of it there is.
                     asker = PictureAsker(bus, self._cameras, verb, period_s, lambda _line: None)
                     stack.callback(asker.close)
             self._raw.attach(bus)
@@ -257,7 +257,7 @@ class _Run:
         return self._gone_dropped + sum(now.dropped.values()) + sum(subscriber.values())
 
     def _close_subscriber(self, subscriber: StreamSubscriber) -> None:
-        # One that owns us has stopped, and all that it said is to be kept; another one goes on without us.
+        # One that owns us has stopped, and all that it sent is to be kept; another one goes on without us.
         subscriber.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
         self._gone_lost, self._gone_dropped = (
             self._lost(),

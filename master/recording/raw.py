@@ -3,7 +3,7 @@
 Begun, kept going, and ended here.
 
 A thread for each camera asks again and again: a slave goes on for as long as it is asked, so that a recorder that was
-killed, or lost its master, leaves ended recordings behind. A camera that refuses is told of, and asked no more; the
+killed, or lost its master, leaves ended recordings behind. A camera that refuses is reported, and asked no more; the
 recording of messages goes on in any case.
 """
 
@@ -30,7 +30,7 @@ class _Camera:
     name: str
     number: int = 1
     begun: bool = False
-    ended: int = 0  # by faults, as it told last
+    ended: int = 0  # by faults, as it reported last
     here: bool = False
     refused: bool = False
     silent: bool = False

@@ -6,7 +6,7 @@ One thread writes what is offered and monitors the disk.
                             └ queue full: dropped, and counted by stream
 
 Whoever offers never waits for the disk. Where less than a reserve would be left of it, where it is full or gone, the
-recording ends with what was written, and `failure` says why.
+recording ends with what was written, and `failure` states why.
 """
 
 import queue
@@ -115,7 +115,7 @@ class MessageRecorder:
         try:
             free = self._free(self._folder)
         except OSError:
-            free = 0  # the disk is gone; the writer will say so
+            free = 0  # the disk is gone; the writer will report it
         with self._lock:
             now, written = time.monotonic(), self._writer.bytes_written
             before, had = self._shown

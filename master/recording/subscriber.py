@@ -109,7 +109,7 @@ class StreamSubscriber:
         """
         there = came_ns(message, now_ns)
         if not 0 <= now_ns - there < _LONG_NS:
-            there = now_ns  # a master that plays tells the times of then
+            there = now_ns  # a master that plays publishes the times of then
         self._last_ns = max(self._last_ns, there)
         return self._last_ns
 

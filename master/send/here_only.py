@@ -3,7 +3,7 @@
 The library listens on every network, and has no setting to do otherwise.
 
 Linux gives a socket that is bound to a device only what comes through that device. The loopback device carries all that
-a machine says to itself, under each of its addresses, and nothing else.
+a machine sends to itself, under each of its addresses, and nothing else.
 """
 
 import os
@@ -44,7 +44,7 @@ def keep_here(before: Collection[Socket], ports: range) -> bool:
         ports: Where it may listen.
 
     Returns:
-        Whether each is bound; False: there is one that is not, or the system cannot tell, or do it.
+        Whether each is bound; False: there is one that is not, or the system cannot determine it, or do it.
     """
     bound = [
         _bound(one) for one in _listening((number for number, _ in sockets() - frozenset(before)), ports)

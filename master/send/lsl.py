@@ -2,7 +2,7 @@
 
 To be recorded beside EEG, EMG, eye trackers and markers.
 
-One outlet a hand, opened with its first pose; a sample a pose, at the instant at which the pose holds. The clock of LSL
+One outlet a hand, opened with its first pose; a sample a pose, at the time at which the pose holds. The clock of LSL
 is this machine's, so a recording aligns hands with whatever other machines measure.
 """
 

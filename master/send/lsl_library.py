@@ -100,10 +100,10 @@ def load_library(scope: str, bound_scope: str | None) -> Library:
 
     Args:
         scope: "machine" or "network".
-        told: What liblsl was told before in this process, which is for ever; None: nothing yet.
+        told: What liblsl was configured with before in this process, which is for ever; None: nothing yet.
 
     Raises:
-        PhalanxError: It is not installed, has no liblsl, or one that is too old or was told otherwise.
+        PhalanxError: It is not installed, has no liblsl, or one that is too old or was configured otherwise.
     """
     try:
         library = cast(Library, importlib.import_module("pylsl"))

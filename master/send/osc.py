@@ -2,7 +2,7 @@
 
 For sound and light, patches and sketches.
 
-Each message of the master is one bundle whose time tag is the instant it speaks of, in one datagram (addresses:
+Each message of the master is one bundle whose time tag is the epoch it describes, in one datagram (addresses:
 docs/outputs.md). What is not known has no message in its bundle. All is in the rig's frame, in metres and radians.
 """
 

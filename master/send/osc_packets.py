@@ -2,7 +2,7 @@
 
 python-osc writes a message once, after that only its numbers change.
 
-Encoding some 300 arguments afresh for every pose would cost a millisecond; filling them in costs some microseconds.
+Encoding some 300 arguments anew for every pose would cost a millisecond; filling them in costs some microseconds.
 (Open Sound Control 1.0: everything is big-endian and a multiple of four bytes, arguments come last, in their order;
 a bundle is `#bundle`, a time tag, and its elements, each behind its size.)
 """

@@ -25,7 +25,7 @@ class Output:
         takes: Types of messages that it is for; others never come to it.
         part: Its settings; where they differ, it is made anew.
         where: Where it sends to, for a person.
-        make: Opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is told, and it is tried again.
+        make: Opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is reported, and it is retried.
     """
 
     takes: tuple[type[ResultMessage], ...]

@@ -2,7 +2,7 @@
 
 Keys of topics, liveliness tokens of nodes and publishers, gids, attachments.
 
-ROS 2's middleware rmw_zenoh finds publishers by tokens that say everything about them, and reads each topic at a key
+ROS 2's middleware rmw_zenoh finds publishers by tokens that describe all about them, and reads each topic at a key
 that holds domain, topic, type and the hash of the type's description. Written from its public description
 (github.com/ros2/rmw_zenoh, docs/design.md and the token layout in liveliness_utils, Jazzy to Kilted).
 """
@@ -25,7 +25,7 @@ class Topic:
     """One topic that is published.
 
     Attributes:
-        name: As ROS says it, from the root: "/phalanx/right/joints".
+        name: As ROS writes it, from the root: "/phalanx/right/joints".
         type_name: "geometry_msgs/msg/PoseArray".
         type_hash: RIHS01_ and 64 hexadecimal digits (REP 2016).
     """

@@ -2,8 +2,8 @@
 
 Follows their settings file, obeys commands, reports.
 
-On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file says
-otherwise; `report` says how it is; `stop` ends it.
+On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file states
+otherwise; `report` states how it is; `stop` ends it.
 """
 
 import secrets
@@ -124,7 +124,7 @@ class Sender:
 
         An output that is on and is set otherwise is recreated; a changed `on` switches.
 
-        Outputs that were chosen by name (`only`) stay chosen, whatever the file says.
+        Outputs that were chosen by name (`only`) stay chosen, whatever the file states.
         """
         with self._lock:
             before, self._settings = self._settings, settings

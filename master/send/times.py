@@ -3,7 +3,7 @@
 The master's time on this machine's clock, and on the wall's.
 
 Messages of a master are stamped with its monotonic clock. Beside it, on one machine, that is our own; on another
-machine it is offset, which the echoes of its reports tell (`common.clock_offset`). A recording that is played has the
+machine it is offset, which the echoes of its reports give (`common.clock_offset`). A recording that is played has the
 times of its making, which other programs would take for long ago, or for a time to come and wait for it: its messages
 are stamped as they are played, and keep their distances where it is played as fast as it was made.
 

@@ -2,8 +2,8 @@
 
 It runs the slave as a process, then feeds its detections to the master's own pipeline.
 
-What the truth says the sensors would see without error can take the place of what they saw: whatever is wrong then
-comes from the model of the hand, its calibration, or from what a laser point and a fingertip cannot tell.
+What the sensors by the truth would see without error can take the place of what they saw: whatever is wrong then
+comes from the model of the hand, its calibration, or from what a laser point and a fingertip cannot determine.
 """
 
 import subprocess

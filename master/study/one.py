@@ -46,13 +46,13 @@ class Task:
     """A study as one participant needs it.
 
     Attributes:
-        rig, camera, hand: The device as its file says, its camera, and the usual hand.
+        rig, camera, hand: The device by its file, its camera, and the usual hand.
         seed: Of the study.
         blocks: How often the six poses are made.
         conditions: What is known and from what inputs fingers are solved, in which all trials are judged.
-        solver_mode: Of the master; None: what the rig file says.
+        solver_mode: Of the master; None: by the rig file.
         step: Pixels between the rays that shade skin.
-        guided: Triples of the guided motion.
+        guided: Strobe cycles of the guided motion.
         out: Folder of the study.
         resume: Take what is there from a study of the same settings: frames that it kept, or what was detected in them
             and calibrated, too. None: nothing.

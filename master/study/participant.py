@@ -65,7 +65,7 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
 
     The draw varies around a rig file with a palm pose, and the usual hand.
 
-    Fingers bend as the Digits paper says (preset D), up to how people stray from it.
+    Fingers bend as the Digits paper states (preset D), up to how people deviate from it.
     """
     rng = np.random.default_rng([study_seed, _STREAM, number])
     typical = replace(hand, couplings="D", limits_rad="D")

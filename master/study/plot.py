@@ -26,7 +26,7 @@ _COLOURS = ("#2b6cb0", "#2f855a", "#805ad5", "#b7791f", "#c2571a", "#718096")  #
 _GREY, _RED = "#8a8a8a", "#c53030"
 _NONE: dict[str, Any] = {"facecolor": "none", "edgecolor": "#cccccc", "hatch": "////", "linewidth": 0.0}
 _WIDTH = 0.13  # of a bar; a finger is 1 wide
-_TOP_DEG = 45.0  # taller bars are cut, and say so
+_TOP_DEG = 45.0  # taller bars are cut, and are marked
 
 
 def draw_study(path: Path, result: Result) -> None:

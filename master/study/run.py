@@ -99,12 +99,12 @@ def recorded(
     Args:
         folders: Recordings of wrist devices, with truth and the poses' names (`trials_of`).
         hand: Gives file and content of the hand that a rig names.
-        solver_mode: Of the master; None: what the recording's rig says.
+        solver_mode: Of the master; None: by the recording's rig.
         out: Folder for detections and poses.
         progress: As of `simulate`.
 
     Raises:
-        PhalanxError: A recording is broken or lacks something; the text says what. Two have the same name.
+        PhalanxError: A recording is broken or lacks something; the text states what. Two have the same name.
     """
     trials: list[Trial] = []
     names = [folder.resolve().name for folder in folders]

@@ -4,7 +4,7 @@ Every block has the six poses in an order of its own, each pose made anew.
 
 From one pose to the next the fingers go within half a second, then hold for a fifth of one: a trial is what is held.
 Nobody makes a pose twice alike: each trial has its own posture, near the pose, and drifts slowly as hands do
-(`common.sim.wrist.motion.Stations`). The truth is kept for every triple; trials.csv says which of them are held.
+(`common.sim.wrist.motion.Stations`). The truth is kept for every strobe cycle; trials.csv states which are held.
 """
 
 import csv
@@ -99,7 +99,7 @@ def record_guided(folder: Path, who: Participant, camera: CameraCalibration, cou
 
     It is rendered in `count` strobe cycles, evenly spread over it; arguments as above.
 
-    The motion is slow: within a triple the hand is taken to stand still.
+    The motion is slow: within a strobe cycle the hand is taken to stand still.
 
     Raises:
         RecordingError, CalibrationError: As of `record_trials`.

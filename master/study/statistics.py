@@ -22,9 +22,9 @@ class Cell:
 
     Attributes:
         trials: How many there were.
-        reached: In how many of them the finger was tracked: a laser point or fingertip told it.
-        laser_seen: In how many the truth says that enough of the laser line was seen on it; tip: that its tip was.
-        blind: In how many it was tracked although neither was: whatever told it was of something else. They count in
+        reached: In how many of them the finger was tracked: a laser point or fingertip measured it.
+        laser_seen: In how many the truth states that enough of the laser line was seen on it; tip: that its tip was.
+        blind: In how many it was tracked although neither was: whatever measured it was something else. They count in
             the error like all others.
         mean_deg, sd_deg: Of the absolute error of the PIP over the trials that were reached; NaN: not reached, fewer
             than half of them. sd_deg is that of single trials, n - 1.
@@ -52,7 +52,7 @@ class Repeated:
 
     It is the mean over the draws, with the number of targets.
 
-    Targets of one or two poses are alike, and what is small in itself makes a low coefficient: `cells` says of how many
+    Targets of one or two poses are alike, and what is itself small makes a low coefficient: `cells` gives of how many
     reached cells they are. `truth_icc` is that of the true angles of the same trials: nobody makes a pose twice alike.
     """
 

@@ -28,13 +28,13 @@ class Trial(Struct, frozen=True, kw_only=True):
     """One pose that one participant held once; fingers thumb ... little.
 
     Attributes:
-        pip_deg: Median over its triples in which the finger was tracked; if it was in none, of those where there is
+        pip_deg: Median over its strobe cycles with the finger tracked; if it was in none, of those where there is
             an angle. Of the thumb the MCP. NaN (null in a file): no angle at all.
-        truth_deg: Mean true angle over the triples that pip_deg is of.
-        tracked: In at least half of its triples a laser point or fingertip told the finger.
-        solver_mode: The highest `SolverMode` that half of the tracked triples have.
-        ambiguous: In at least half of the tracked triples another pose explained as much.
-        laser_seen, tip_seen: In at least half of its triples at least 2 mm of laser line, the fingertip, are in sight
+        truth_deg: Mean true angle over the strobe cycles that pip_deg is of.
+        tracked: In at least half of its strobe cycles a laser point or fingertip measured the finger.
+        solver_mode: The highest `SolverMode` that half of the tracked strobe cycles have.
+        ambiguous: In at least half of the tracked strobe cycles another pose explained as much.
+        laser_seen, tip_seen: In at least half of its cycles at least 2 mm of laser line, the fingertip, are in sight
             by the truth.
         cycles: How many were held.
     """
@@ -62,7 +62,7 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
         poses: The recording, solved.
 
     Raises:
-        RecordingError: There is no truth, or nothing that says which pose was held when; the text says what to do.
+        RecordingError: There is no truth, or nothing that states which pose was held when; the text states what to do.
     """
     truth = load_wrist_truth(recording, camera)
     if truth is None:

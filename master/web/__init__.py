@@ -18,7 +18,7 @@ To embed the hand in another page (the console does):
        view.setTheme("light"); view.resetCamera(); view.clear(); view.dispose();
 
    It follows the size of its element by itself, draws only when something changed, takes the arrow keys, + and -, and
-   0 (or Home) while it has the focus, and says to a screen reader what it shows. Options: `label`, `theme`, `grid`.
+   0 (or Home) while it has the focus, and reports to a screen reader what it shows. Options: `label`, `theme`, `grid`.
 
 Nothing here asks anything outside of the server that the page came from.
 """

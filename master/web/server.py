@@ -36,7 +36,9 @@ CLIENTS = 16
 ECHO_BYTES = 256  # the longest text of a client; one that begins with "ping" comes back, the rest is ignored
 SEND_BUFFER_BYTES = 32 * 1024  # about five poses: what lies in the system's buffer is old when it is read
 PING_S, SILENT_S = 10.0, 20.0
-OPEN_S = 5.0  # for who connects to say what is wanted; so long a stranger who says nothing keeps a connection
+OPEN_S = (
+    5.0  # for who connects to state what is wanted; so long an unknown sender of nothing keeps a connection
+)
 _JOIN_S = 3.0
 _COOKIE_S = 30 * 24 * 3600
 _TYPES = {
@@ -147,7 +149,7 @@ class WebServer:
             first = not self._newest
             self._newest[key] = text
         if not first:
-            return  # the loop has been told already, and takes this one with it
+            return  # the loop has been notified already, and takes this one with it
         try:
             self._loop.call_soon_threadsafe(self._deliver)
         except RuntimeError as error:

@@ -9,7 +9,7 @@ about x, which maps
     (x, y, z) -> (x, -y, -z)        w + xi + yj + zk -> i (w + xi + yj + zk) = -x + wi - zj + yk
 
 Joint axes need no turn: those of OpenXR (-z along the bone to the tip, +y dorsal) are those of WebXR. `rig` leaves all
-as it is. The message says which of the two it is in.
+as it is. The message states which of the two it is in.
 
 Numbers are rounded to 1 um and 1e-6 of a quaternion: far below the noise, and half the bytes.
 """

@@ -41,7 +41,7 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
     """What is wrong with the camera; by default nothing.
 
     Attributes:
-        exposes: How many times as long as it was told it exposes: an automatic that was not switched off.
+        exposes: How many times as long as it was set it exposes: an automatic that was not switched off.
         moved_px: How far the picture has moved since the calibration: somebody turned the camera a little.
         patches: Things before the camera that the scene does not have.
         keep_one_in: Of so many frames one is delivered: a camera, or a cable, that is too slow.
@@ -97,7 +97,7 @@ class FaultyCamera:
         `frozen` is the same for every opening of one camera.
 
         Raises:
-            CameraError: The file is broken, or says that the camera is unplugged.
+            CameraError: The file is broken, or states that the camera is unplugged.
         """
         self._source, self._camera, self._path = source, camera, path
         self._faults = Faults()

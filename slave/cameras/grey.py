@@ -122,7 +122,7 @@ def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
 
     As bytes they would be nearly black.
 
-    The kernel lets a driver call them Y16 and does not say at which end they lie. Values on top end with zeros.
+    The kernel lets a driver call them Y16 and does not state at which end they lie. Values on top end with zeros.
 
     Raises:
         CameraError: They are such.

@@ -3,7 +3,7 @@
 It is given as types; this is the one place that imports them.
 
 Both come with the Raspberry Pi's system, not from the package registry, so they are imported when a camera is
-opened and their absence is an error that says how to install them. The names and meanings below were read in
+opened and their absence is an error that states how to install them. The names and meanings below were read in
 picamera2 0.3.38 (picamera2.py, request.py, controls.py) and in libcamera's control_ids_*.yaml.
 """
 
@@ -121,7 +121,7 @@ def open_library(index: int) -> tuple[Library, Enums]:
     """Open the camera with number `index`.
 
     Raises:
-        CameraError: No picamera2, no such camera, or another program has it. The text says what to do.
+        CameraError: No picamera2, no such camera, or another program has it. The text states what to do.
     """
     try:
         picamera2 = cast(Any, importlib.import_module("picamera2"))

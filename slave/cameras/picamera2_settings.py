@@ -25,14 +25,15 @@ LIVE_CONTROLS = ("ExposureTime", "AnalogueGain", "ColourGains")  # that may chan
 RATE_CONTROL = "FrameDurationLimits"  # and this one where cameras run free
 
 GLOBAL_SHUTTER_ROW_US = (
-    30.0  # where the camera file says 0: no official sensor needs longer for a row at video rates
+    30.0  # where the camera file states 0: no official sensor needs longer for a row at video rates
 )
 EXPOSURE_SHARE = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
 COLOUR_GAIN = 0.01
 DIOPTRES = 0.05
 SYNC_FRAMES = (
-    100  # libcamera's default: the server tells the clients every 30 frames, so each hears it three times
+    100  # libcamera's default: the server notifies the clients every 30 frames, so each receives it three
 )
+times
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +123,7 @@ def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, objec
             f"--sync {options.sync}: this libcamera cannot synchronise cameras; update the system "
             "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one instant"
         )
-    # The number of frames until "ready" is the server's to say (control_ids_rpi.yaml, SyncFrames).
+    # The number of frames until "ready" is set by the server (control_ids_rpi.yaml, SyncFrames).
     return {"SyncMode": mode} | ({"SyncFrames": SYNC_FRAMES} if options.sync == "server" else {})
 
 
@@ -142,7 +143,7 @@ def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, An
             continue
         low, high = (as_values(bound) for bound in available[name][:2])
         values = as_values(asked[name])
-        if not (low and high and values):  # a range without numbers says nothing; reading back will
+        if not (low and high and values):  # a range without numbers constrains nothing; reading back will
             continue
         if not all(low[0] <= value <= high[0] for value in values):
             wrong.append(

@@ -15,13 +15,13 @@ clock to about a millisecond.
 The library has no frame number that counts what the sensor dropped. Frames come at a fixed duration, so the number
 follows from the time.
 
-In step (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server tells when one of its frames began and when
+In step (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server sends when one of its frames began and when
 all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer by that much;
-less it leaves alone. `SyncReady` says that the agreed moment has passed, and stays; `SyncTimer` is the time from the
-frame to that moment. After it the timer tells nothing about the lag: the server reckons the moment back over all frames
-since, so its error grows with their number. What tells is
+less it leaves alone. `SyncReady` shows that the agreed moment has passed, and stays; `SyncTimer` is the time from the
+frame to that moment. After it the timer does not measure the lag: the server reckons the moment back over all frames
+since, so its error grows with their number. The evidence is
 
-    that the server is heard     the agreed moment, FrameWallClock + SyncTimer, is reckoned anew with every message, and
+    that the server is received  the agreed moment, FrameWallClock + SyncTimer, is recomputed with every message, and
                                  stands still without any
     how far the client was off   the frame it made shorter or longer: FrameDuration against that of its neighbours
 
@@ -213,7 +213,7 @@ def wait_in_step(
         metadata = capture()
         timer = metadata.get(
             "SyncTimer"
-        )  # us until the agreed moment; a client that heard no server has none
+        )  # us until the agreed moment; a client that received from no server has none
         if metadata.get("SyncReady"):
             wall = metadata.get("FrameWallClock", "unknown")
             _LOG.info("%s: in step, %s us off; first frame at wall clock %s ns", where, timer, wall)

@@ -73,7 +73,7 @@ def _has_contrast(image: Image) -> bool:
 class ReconnectingCamera(ReconnectingDriver[Frame]):
     """A camera that is opened again with the settings it was given last.
 
-    A camera that repeats one picture with new stamps measures nothing: the copies are left out, and after a second of
+    A camera that repeats one picture with new stamps measures nothing: the copies are dropped, and after a second of
     them it is opened again as one that is lost. Holds its settings, its pictures, and since when it repeats one.
     """
 

@@ -55,7 +55,7 @@ class ReplayCamera:
         """Next frame in the order of time, or None after the last.
 
         Raises:
-            CameraError: A picture is missing, broken or of another size than the camera file says.
+            CameraError: A picture is missing, broken or of another size than the camera file states.
         """
         if self._next >= len(self._rows):
             return None
@@ -122,7 +122,7 @@ def read_png(path: Path, size: tuple[int, int], *, grey: bool = False) -> Image:
 
     Args:
         path: PNG file.
-        size: Height and width the camera file says.
+        size: Height and width by the camera file.
         grey: Whether one channel is wanted.
 
     Raises:

@@ -90,7 +90,7 @@ def change(
         new: What it is to have.
 
     Raises:
-        CameraError: `new` was not taken; the text says so, and what became of `old`.
+        CameraError: `new` was not taken; the text states so, and what became of `old`.
     """
     try:
         apply(new)

@@ -2,14 +2,14 @@
 
 It is the first-class stand-in for hardware.
 
-Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, says
+Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, reads
 `epoch + start offset + k periods`, until the rate is changed. It is handed over when a real sensor would have read out
 its last row. The picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame
 rate loses frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
 
 The camera of a wrist device takes what its lights had on while it exposed (`slave.lights.simulated`). Without lights
-it is a camera that switches them itself, frame k by what k modulo 3 says. Either way a slow process loses whole cycles,
-for of a strobe whose single frames are lost no triple would ever be whole.
+it is a camera that switches them itself, frame k by k modulo 3. Either way a slow process loses whole cycles,
+for of a strobe whose single frames are lost no cycle would ever be whole.
 
 The lamp of the simulated room is such that the settings in the camera file of the scene expose it well. Other exposure
 and gains, at the start or later, make the picture brighter or darker against that, and the exposure smears as long.
@@ -78,8 +78,8 @@ class SyntheticCamera:
 
         Args:
             scene: What it looks at.
-            camera: A camera of the scene's rig: its name, or a file of it that says how it is set. The files of the
-                scene say what lens it has, and how it would be set well.
+            camera: A camera of the scene's rig: its name, or a file of it that states how it is set. The files of the
+                scene state what lens it has, and how it would be set well.
             epoch_ns: Scene time 0, on the true clock [ns].
             clock: The slave's clock; stamps are on it, and its rate is that of the camera.
             start_offset_ns: How much later than the epoch frame 0 is taken [ns].
@@ -89,7 +89,7 @@ class SyntheticCamera:
             live: The scene does not wait for who draws it, so that is done as fast as looks right.
 
         Raises:
-            CalibrationError: The scene has no such camera, or one of another size, or a marker without paint.
+            CalibrationError: The scene has no such camera, or one of another size, or a marker without a colour.
             CameraError: The exposure does not fit into a frame.
         """
         name = camera if isinstance(camera, str) else camera.name

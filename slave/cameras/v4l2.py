@@ -6,7 +6,7 @@ Frames come in four mapped buffers. Each is decoded into an image of its own bef
 ever writes to a frame that was handed over. A slave that is late takes the newest frame and leaves the others; one that
 did not read at all (while it waited for the master) finds all buffers full of old frames, which are thrown away.
 
-When a frame was taken. The kernel stamps each buffer and says on which clock and at which event: the start of the
+When a frame was taken. The kernel stamps each buffer and states on which clock and at which event: the start of the
 exposure (USB: reckoned from the camera's own clock where it has one), or the end of the frame, that is the last row's
 read-out. From there it is half an exposure forward, or all rows and half an exposure back. `sequence` counts every
 frame of the camera, so a gap in it is a dropped one; a frame that arrived damaged is one, too.

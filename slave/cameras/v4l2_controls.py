@@ -199,7 +199,7 @@ def plan(
         pixels: What its frames are; without colours it may lack a white balance, but none that it has is left alone.
 
     Raises:
-        CameraError: A control is unknown, out of range, or needed and not given. The text says what to write.
+        CameraError: A control is unknown, out of range, or needed and not given. The text states what to write.
     """
     allowed = set(missing)
     if wrong := sorted(allowed - set(NEEDS)):
@@ -269,7 +269,7 @@ def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Se
     """Write all settings, in order.
 
     Raises:
-        CameraError: The camera refuses one; the text names it and says why.
+        CameraError: The camera refuses one; the text names it and states why.
     """
     for setting in settings:
         control = controls[setting.name]

@@ -63,7 +63,7 @@ class Offer:
         pixel_format: Number of the format.
         size: Width and height [px].
         rates_hz: Frame rates [Hz], rising; of a camera with a continuous range its ends; empty where the driver does
-            not say.
+            not state them.
         continuous: Whether everything between the ends is offered, too.
     """
 

@@ -113,7 +113,7 @@ class V4l2Settings:
         shown = [setting for setting in self._wanted if setting.name not in AUTOMATICS]
         try:
             got = self.ask(lambda device: read_back(device, self._controls, shown))
-        except CameraError:  # the loop will say so
+        except CameraError:  # the loop will report it
             return {}
         found = {f"control.{name}"[:64]: float(value) for name, value in got.items() if name != EXPOSURE}
         if EXPOSURE in got:

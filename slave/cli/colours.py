@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def colours(command: ArgumentParser) -> None:
-    """Finds the colours of the markers of a camera in a recording, writes its camera file, and says what collides with
+    """Finds the marker colours of a camera in a recording, writes its camera file, and reports what collides with
     what.
 
     Examples:

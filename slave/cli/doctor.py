@@ -1,4 +1,4 @@
-"""Options of `phalanx-slave doctor`; what it is not told, the files in /etc/phalanx say."""
+"""Options of `phalanx-slave doctor`; what is not passed is read from the files in /etc/phalanx."""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -9,8 +9,8 @@ from slave.drivers import SWITCHED_LIGHTS
 
 
 def doctor(command: ArgumentParser) -> None:
-    """Says what of this device is well, and what is not: machine, clock, libraries, keys, devices, camera, service, and
-    whether its master is heard; each line ok, warn or fail, with what mends it; exit 1 where something fails.
+    """Reports what of this device is well, what not: machine, clock, libraries, keys, devices, camera, service, and
+    whether its master is received; each line ok, warn or fail, with what mends it; exit 1 where something fails.
 
     With --lights it looks at laser and LEDs of a wrist device alone: what the strobe of a rig may do, and what share of
     every limit for eyes and supply that is; and switches them, if asked to.

@@ -13,7 +13,7 @@ _finite = number()
 
 
 def add_place(command: ArgumentParser, who: str, calibration: str = "calib_json", rig: str = "desk") -> None:
-    """Who this slave is, of which rig, and where its files are; the texts say the defaults."""
+    """Who this slave is, of which rig, and where its files are; the texts state the defaults."""
     command.add_argument("--name", metavar="NAME", help=who)
     command.add_argument("--rig", metavar="NAME", help=f"rig, a file in DIR/rigs (default: {rig})")
     command.add_argument(

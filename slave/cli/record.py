@@ -26,9 +26,9 @@ def record(command: ArgumentParser) -> None:
       phalanx-slave record --from takes/7 --calibration calib_json --times takes/7/times.csv -o recordings/take7
             a folder with a video, or a folder of pictures, for each camera; times.csv: camera,frame,time (seconds)
       phalanx-slave record --from left=GOPR0012.MP4 right=GOPR0944.MP4 --calibration calib_json -o recordings/gopro
-            whose each one is, where its name does not say so
+            whose each one is, where its name does not state it
       phalanx-slave record --imu-csv walk.csv --gyro-unit deg/s -o recordings/walk
-            reads a CSV with a header (docs/imu.md), says its rate, gaps, bias and orientation, and writes imu.csv;
+            reads a CSV with a header (docs/imu.md), reports its rate, gaps, bias and orientation, and writes imu.csv;
             against a quaternion in it, how right the tilt is. Without -o it is only looked at
     """
     what = command.add_mutually_exclusive_group(required=True)

@@ -18,7 +18,7 @@ def run(command: ArgumentParser) -> None:
     Examples:
       phalanx-slave run --name left --rig desk --camera picamera2 --keys keys
       phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
-            with a USB camera; docs/cameras.md says which settings are fixed and checked
+            with a USB camera; docs/cameras.md states which settings are fixed and checked
       PHALANX_RIG_KEY=$(cat rig.key) phalanx-slave run --name left --rig desk --camera replay:recordings/wave
             a recording in place of a camera
       phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
@@ -35,7 +35,7 @@ def run(command: ArgumentParser) -> None:
       phalanx-slave run --name left --rig desk --camera picamera2 --raw-folder recordings --key-file rig.key
             keeps raw frames while it tracks whenever `phalanx record FILE --raw` asks; docs/recording.md
       phalanx-slave run --rig wrist --imu ximu3:/dev/serial/by-id/PORT --key-file rig.key
-            an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
+            an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md lists what is set and checked
       phalanx-slave run --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
             an LSM6DSOX on I2C bus 1 of a Pi; `phalanx-slave doctor --ports` lists ports and buses
       phalanx-slave run --name tracker --rig desk-tracker --tracker openvr --key-file rig.key
@@ -44,7 +44,7 @@ def run(command: ArgumentParser) -> None:
             by libsurvive: starts survive-cli and reads its lines; survive:walk.rec.gz: what it recorded, at its pace
       phalanx-slave run --name left --camera replay:recordings/wave --calibration calib_json -o detections_left.npz
             offline: every frame of one camera; of a rig whose objects have tags those, too: tags_left.npz beside it;
-            of a wrist device laser points and fingertips of every strobed triple. All cameras, and then the hand:
+            of a wrist device laser points and fingertips of every strobe cycle. All cameras, and then the hand:
             `phalanx replay`
     """
     add_place(

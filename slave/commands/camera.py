@@ -47,7 +47,7 @@ def open_lit(
 
     Raises:
         CameraError: There is no such driver, or the camera cannot be opened.
-        LightsError: The lights are not said, do not fit, or cannot be opened.
+        LightsError: The lights are not given, do not fit, or cannot be opened.
         CalibrationError: A file of the simulated world is missing or broken.
     """
     lights = devices.choose_lights(options.lights, rig, str(options.camera))

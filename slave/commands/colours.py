@@ -15,7 +15,7 @@ def run(options: argparse.Namespace) -> int:
     """Find the colours, write the camera file and print which colours collide.
 
     Raises:
-        PhalanxError: The recording or a file is missing or broken, or the colours cannot be told apart.
+        PhalanxError: The recording or a file is missing or broken, or the colours cannot be distinguished.
     """
     from slave.markers.colours import report
     from slave.offline import calibrate_colours

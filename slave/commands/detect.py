@@ -11,7 +11,7 @@ from common.command_line import UsageError
 from common.errors import CalibrationError
 from common.terminal import remark
 
-_EVERY = 500  # frames, between two lines that say how far it is
+_EVERY = 500  # frames, between two lines that report the progress
 
 
 def detect(options: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ import argparse
 
 from common.terminal import echo, remark
 
-_EVERY = 500  # frames, between two lines that say how far it is
+_EVERY = 500  # frames, between two lines that report the progress
 
 
 def join(options: argparse.Namespace) -> int:

@@ -105,5 +105,5 @@ def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
 
     access = access_of(os.environ, options.name, options.keys, options.open)
     if access.folder is not None:
-        access.identity()  # said now, not when a master is heard
+        access.identity()  # reported now, not when a master is received
     return link_key(os.environ, options.key_file, options.keys, options.name), access

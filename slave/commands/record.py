@@ -88,7 +88,7 @@ def record_camera(options: argparse.Namespace) -> int:
             imu_recorder.keep()
     if imu is not None and done.frames:
         add_imu(options.output, imu, options.scene_epoch_ns, scene.clock)
-    os.sync()  # what was said to be recorded is there, also when the power goes now
+    os.sync()  # what was reported as recorded is on the disk, also when the power goes now
     if failure is None and imu_recorder is not None:
         failure = imu_recorder.failure
     if failure is not None:

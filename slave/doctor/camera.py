@@ -3,7 +3,7 @@
 It opens, has every setting of its file with all automatics off, and delivers frames.
 
 One that the running service has cannot be opened a second time. Of a V4L2 camera the automatics are read all the same;
-of another it is said that it was not looked at.
+of another it is reported that it was not checked.
 """
 
 import argparse

@@ -17,7 +17,7 @@ RELEASES = {"trixie": "13", "bookworm": "12"}  # of Debian, and of the Raspberry
 PYTHONS = ((3, 11), (3, 13))
 STATE = "/var/lib/phalanx"
 FEW_MB, NO_MB = 500.0, 100.0
-# Raspberry Pi documentation, "vcgencmd get_throttled": bit -> what it says; the same 16 bits higher: since the start.
+# Raspberry Pi documentation, "vcgencmd get_throttled": bit -> its meaning; the same 16 bits higher: since the start.
 BITS = {
     0: "under-voltage",
     1: "processor frequency capped",

@@ -12,7 +12,7 @@ from slave.doctor.system import System, pairs
 CURRENT = "/opt/phalanx/current"
 TIMEOUT_S = 60.0  # numpy and cv2 from a cold SD card
 NEEDED = ("numpy", "cv2", "zenoh", "cryptography", "msgspec")
-# One name after another, each said before the next is tried: of one that crashes, nothing is said.
+# One name after another, each printed before the next is tried: one that crashes prints nothing.
 PROBE = """
 import ctypes, importlib, sys
 for name in sys.argv[1:]:

@@ -20,7 +20,7 @@ class Ran:
     Attributes:
         code: Its exit code, negative for a signal; None: it is not there, or did not end in time.
         out: Its output.
-        error: What it said on standard error, or why there is no code.
+        error: Its standard error, or why there is no code.
     """
 
     code: int | None

@@ -72,8 +72,8 @@ def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dic
         Camera -> number of its frames.
 
     Raises:
-        PhalanxError: A file is missing or broken, of no camera or of another size than the camera file says, or has no
-            frame that can be decoded; the text says what to do.
+        PhalanxError: A file is missing or broken, of no camera or of another size than by the camera file, or has no
+            frame that can be decoded; the message states what to do.
     """
     paths = found_in(wish.paths)
     for path in wish.named.values():
@@ -226,7 +226,7 @@ def _write(out: Path, manifest: Manifest, imported: Sequence[_Imported]) -> None
 
     The pictures have their names in the recording; the rows follow, sorted by time.
     """
-    first = min(int(one.timed.t_ns[0]) for one in imported)  # tables may count from any instant
+    first = min(int(one.timed.t_ns[0]) for one in imported)  # tables may count from any time
     rows: list[FrameRow] = []
     for one in imported:
         shift = int(one.timed.t_ns[0]) if one.simultaneous else first  # or all begin at 0

@@ -29,7 +29,7 @@ def import_table(table: Table, source: str, folder: Path | None, notify: Callabl
         table: The recording.
         source: What the IMU is called.
         folder: Where imu.csv goes; None: it is only looked at.
-        say: Called with line by line.
+        notify: Called with line by line.
 
     Raises:
         RecordingError: There is an imu.csv already, or it cannot be written.

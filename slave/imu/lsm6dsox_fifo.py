@@ -2,13 +2,13 @@
 
 Pure: bytes in, measurements out.
 
-Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO says the same of itself, and what
+Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO's state the same, and what
 is used here is the same in it. A word of the FIFO is a tag and six bytes, little endian:
 
     tag   7..3  what: 1 gyroscope, 2 accelerometer, 4 time stamp    2..1  number of the time slot, modulo 4    0  parity
 
 All words of one time slot were measured together; the time stamp is among them, so that none is torn and each has its
-own time. One part's clock is up to some percent off: `INTERNAL_FREQ_FINE` tells by how much, in steps of 0.15 %, for
+own time. One part's clock is up to some percent off: `INTERNAL_FREQ_FINE` reports by how much, in steps of 0.15 %, for
 the time stamps and the rates alike.
 """
 

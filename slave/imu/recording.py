@@ -70,7 +70,7 @@ class ImuRecorder:
         self._source.close()
         file, self._file = self._file, None
         if file is not None:
-            with suppress(OSError):  # that a disk is full has been told
+            with suppress(OSError):  # that a disk is full has been reported
                 file.close()
             if not self._kept:
                 with suppress(OSError):  # the folder is not empty

@@ -12,8 +12,8 @@ nowhere else:
     stuffed: 0x0A -> 0xDB 0xDC, 0xDB -> 0xDB 0xDD
 
 A binary message carries no checksum: its length, its escapes and its letter are all that shows a broken one. What
-counts as broken, and by which name, is what the vendor's own library says of the same bytes (ximu3 1.9; the tests
-compare): text behind the last number is left out, a message longer than its buffer of 4096 bytes is broken.
+counts as broken, and by which name, is what the vendor's own library reports for the same bytes (ximu3 1.9; the tests
+compare): text behind the last number is ignored, a message longer than its buffer of 4096 bytes is broken.
 """
 
 import re

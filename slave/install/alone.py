@@ -25,7 +25,7 @@ def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], No
 
     Args:
         root: Where the machine's files are.
-        say: Notified that it has to wait.
+        notify: Notified that it has to wait.
         sleep: Waits so many seconds.
 
     Raises:

@@ -19,7 +19,7 @@ def add_install(parser: argparse.ArgumentParser) -> None:
       sudo phalanx-slave install --master 192.168.1.2 --rig wrist --imu lsm6dsox:1 --lights gpio:0:17,27 --keys keys
             a wrist device: its camera and its IMU, each a service
       sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run
-            only say what would be changed; the keys that are there stay
+            only print what would be changed; the keys that are there stay
       sudo phalanx-slave install --rollback
             go back to what was before the last installation
       sudo phalanx-slave install --uninstall

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = N
 
     Args:
         options: Of `add_install`.
-        say: Called with one line a step.
+        notify: Called with one line a step.
         systemd: The machine's services; None: those of this machine.
     """
     machine = steps.Machine(options.root, systemd or Systemd(), notify, options.ready_s, options.settle_s)
@@ -164,7 +164,7 @@ def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -
 
     The PC runs this before a slave is installed.
 
-    `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` says what the machine is like; `packages NAME...`
+    `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` reports the machine's state; `packages NAME...`
     calls apt.
     """
     action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])

@@ -158,7 +158,7 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
     if not _NAME.fullmatch(name):
         raise InstallError(f"--name {name!r}: letters, digits, - and _ only")
     place = ["--name", name, "--rig", options.rig, "--calibration", CALIBRATION]
-    names = _names(rig)  # what is said of another machine's camera is not for this one
+    names = _names(rig)  # options given for another machine's camera are not for this one
     more = [word for text in _all_of(name, options.more, names) for word in _split(text)]
     is_wrist = rig.get("kind") == "wrist"
     if options.role is not None and (options.role == "wrist") != is_wrist:

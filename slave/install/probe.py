@@ -2,7 +2,7 @@
 
 They are for `judge`. Writes nothing.
 
-An old Python runs this too, so that it is told and not a syntax error.
+An old Python runs this too, so that its version is reported instead of a syntax error.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Machine:
     Attributes:
         root: Where its files are.
         systemd: Its services.
-        say: Called with one line a step.
+        notify: Called with one line a step.
         ready_s: How long its slaves may take until they are ready, at most.
         settle_s: How long they then have to stay so.
     """
@@ -101,7 +101,7 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
         source: Packages of the release.
         name: Of the release.
         machine: Where.
-        dry_run: Only say what would change.
+        dry_run: Only print what would change.
 
     Raises:
         InstallError: It failed, and the machine is as before.

@@ -38,7 +38,7 @@ class UnitState:
 
     Attributes:
         start_s: From the start of its process until it was ready [s]; None: it is not running.
-        says: What it says of itself.
+        output: What it reports of itself.
     """
 
     active: bool
@@ -139,7 +139,7 @@ class Systemd:
                     steady.pop(unit, None)
                     asked = (unit, state.pid, state.output)
                     if asked not in patient and (found := _ASKS.search(state.output)):
-                        patient.add(asked)  # once: it does not live on what it said long ago
+                        patient.add(asked)  # once: a report of long ago extends nothing any more
                         ends[unit] = max(ends[unit], self._now() + float(found[1]))
                 elif unit not in steady or steady[unit][0] != state.pid:
                     steady[unit] = (state.pid, self._now())

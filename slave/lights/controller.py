@@ -1,8 +1,8 @@
 """Switch ambient -> laser -> LED in step with a camera.
 
-`Strober.step` does what is due and says when to come again; it never waits. The thread does nothing but wait and step.
+`Strober.step` does what is due and returns when to call it again; it never waits. The thread only waits and steps.
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
-exposure leaves that pulse out (`skipped`): a frame without its light is no triple, a light that smears into the next
+exposure skips that pulse (`skipped`): a frame without its light makes no cycle, a light that smears into the next
 frame might become a wrong one. A light that came on only after the exposure had begun goes off at once (`late`).
 """
 
@@ -23,11 +23,11 @@ _LOG = logging.getLogger(__name__)
 class Strober:
     """Makes the light of each frame.
 
-    Holds the pulse that is on, and the number of the last frame that was lit or left out.
+    Holds the pulse that is on, and the number of the last frame that was lit or skipped.
 
     Attributes:
         counts: Event -> how often.
-            skipped: pulses left out, as it was too late for them.
+            skipped: pulses not begun, as it was too late for them.
             late: pulses ended at once, as the driver took too long.
     """
 

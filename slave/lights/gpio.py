@@ -8,7 +8,7 @@ seen, and read back.
 
 A slave that is killed or stopped during a pulse darkens nothing, and what a pin does whose process is gone is the
 matter of the chip's driver: it may become an input, or keep its level. So a second process inherits the request, is
-told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`).
+sent every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`).
 None is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
 monostable in series (docs/safety.md).
 """
@@ -63,7 +63,7 @@ class Line:
 class GpioLights:
     """`Lights` behind two GPIO lines.
 
-    Holds the request of the lines and its heir; None while the chip is away.
+    Holds the request of the lines and its watchdog process; None while the chip is away.
     """
 
     def __init__(self, place: str, longest_s: float) -> None:
@@ -95,7 +95,7 @@ class GpioLights:
         """Set both lines; lines that were lost are requested again first.
 
         Raises:
-            LightsError: The chip or the heir is gone, or a line does not follow.
+            LightsError: The chip or the watchdog process is gone, or a line does not follow.
         """
         if self._closed:
             return

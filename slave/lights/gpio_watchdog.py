@@ -37,7 +37,7 @@ def main() -> int:
         received, _, _ = select.select([0], [], [], longest_s if state.endswith(LIT) else None)
         if received:
             state = os.read(0, 4096)
-        else:  # again and again until it says that it is dark: it may light late, when it goes on
+        else:  # again and again until it reports that it is dark: it may light late, when it goes on
             darken(lines)
     return darken(lines)
 

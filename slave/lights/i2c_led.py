@@ -27,7 +27,7 @@ from common.strobe_calibration import StrobeCalibration
 ADDRESS = 0x63  # 8.5.2.4
 # 8.6.1 to 8.6.12
 ENABLE, LED1_FLASH, LED2_FLASH, TIMING, FLAGS1, FLAGS2, DEVICE_ID = 0x01, 0x03, 0x04, 0x08, 0x0A, 0x0B, 0x0C
-STANDBY = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has a say
+STANDBY = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has an effect
 FLASH = {Illumination.LASER: 0x0D, Illumination.LED: 0x0E}  # 8.6.1: mode 11 (flash) with LED1, with LED2
 IS_ON = 0x0F  # 8.6.1: mode and LED bits
 TIMEOUT_10_MS = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset

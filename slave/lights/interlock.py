@@ -6,7 +6,7 @@ Wrapped around every driver. It knows nothing of cameras: it holds the two limit
 `max_duty`) against what is asked for and against what happens, on the clock of this machine. A pulse is refused before
 it begins if it is to be longer than allowed, or if with it a light would have been on for more than its share of the
 last second. A watchdog, on a thread of its own, ends what has lasted as long as it may. What a driver does when the
-whole process dies is its own matter, told in each driver's file and in docs/safety.md.
+whole process dies is its own matter, described in each driver's file and in docs/safety.md.
 """
 
 import atexit
@@ -65,7 +65,7 @@ class Interlock:
             pulses: begun.
             refused: not begun, as they would have been too long, or too much.
             off_by_watchdog: ended by the watchdog.
-            failed: the driver did not do what it was told.
+            failed: the driver did not do as commanded.
     """
 
     def __init__(

@@ -9,7 +9,7 @@ enough that an exposure is known to a part of the lead, and none beyond `AHEAD` 
 that stalls is not lit.
 
 Frame number k of the strobe's cycle is ambient, laser, LED as k modulo 3 is 0, 1, 2. Which frame is number 0 is agreed
-with nobody: what a frame is, its content says (`slave.wrist.strobe`).
+with nobody: a frame is classified by its content (`slave.wrist.strobe`).
 """
 
 from collections import deque
@@ -76,7 +76,7 @@ class StrobeSchedule:
             frame_rate_hz: Of the camera file: single frames.
             exposure_us: Exposure and, of a rolling shutter, the reading of all rows [us].
             lead_us: How much before an exposure a light goes on [us].
-            offset_us: How much later exposures are than their stamps say [us].
+            offset_us: How much later exposures are than their time stamps [us].
         """
         self._nominal_ns = 1e9 / frame_rate_hz
         self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)

@@ -2,9 +2,9 @@
 
 They come from a few seconds of a moving, painted hand.
 
-A paint is what keeps one hue, moves with the hand, and has skin beside it. The M strongest hues of that kind are
-the M paints; their pixels of all frames, lit side and shadow side, in every place the hand went, make the ranges
-by the rules of `colours`. Where the frames do not tell M paints for certain, a FitError says what is missing:
+A marker colour keeps one hue, moves with the hand, and has skin beside it. The M strongest hues of that kind are
+the M marker colours; their pixels of all frames, lit and shadow side, in every place the hand went, make the ranges
+by the rules of `colours`. Where the frames do not determine M colours for certain, a FitError states what is missing:
 nothing here is guessed.
 """
 
@@ -44,16 +44,16 @@ from slave.markers.colours import (
 FRAMES_LEAST, FRAMES_MOST = 8, 60
 PIXELS_MOST = 60_000_000  # of all frames together: 180 MB
 SMOOTH = 2.5  # hues: standard deviation with which the hues of things are smoothed before peaks are sought
-SEEN_SHARE = 0.1  # of the frames in which a paint must be seen,
+SEEN_SHARE = 0.1  # of the frames in which a marker colour must be seen,
 SEEN_LEAST = 4  # and at least so many
 SIZE_SHARE = 0.25  # of the typical area of all; a smaller thing is the fringe of another
-ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
+ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest marker colour, makes it ambiguous
 AMBIGUOUS_SIZE, AMBIGUOUS_SHARE = (
     0.3,
     0.4,
-)  # a second thing this large, in this share of the frames: two paints of one hue
+)  # a second thing this large, in this share of the frames: two marker colours of one hue
 BACKGROUND_FRAMES = 12  # from which the background's share is counted
-UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not paint
+UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not marker colour
 
 Notify = Callable[[str], None]
 Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
@@ -97,12 +97,12 @@ def calibrate_moving(
     Args:
         images: (H, W, 3) BGR each, of one resting camera, over a few seconds; 30 to 60 are plenty.
         names: Markers of the rig.
-        namer: Tells which paint is which marker.
-        say: Receives lines about what was found.
+        namer: Assigns the marker colours to the markers.
+        notify: Receives lines about what was found.
 
     Raises:
-        FitError: Too few frames, no motion, no skin, too few or too many paints, two paints too alike, or the
-            names are not certain; the text says what to do.
+        FitError: Too few frames, no motion, no skin, too few or too many marker colours, two too alike, or the
+            names are not certain; the message states what to do.
     """
     if len(images) < FRAMES_LEAST:
         raise FitError(
@@ -137,7 +137,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
     """Find the `count` marker colours among the things of every frame, by hue.
 
     Raises:
-        FitError: They cannot be told.
+        FitError: They cannot be distinguished.
     """
     frames = len(things)
     least = max(SEEN_LEAST, SEEN_SHARE * frames)
@@ -146,7 +146,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
     typical = float(np.median([colour.area for colour in near_skin])) if near_skin else 0.0
     near_skin = [colour for colour in near_skin if colour.area >= SIZE_SHARE * typical]
     moving = [colour for colour in near_skin if colour.moved]
-    # A paint that rested all the time looks like clutter but for the skin around it. It is taken when it is needed.
+    # A colour that rested all the time looks like clutter but for the skin around it. It is taken when it is needed.
     resting = [
         colour
         for colour in near_skin
@@ -301,7 +301,7 @@ def _others(
 def _scraps(hsv: Image, around: Surroundings, largest: int) -> Image:
     """Find small coloured pieces that touch skin.
 
-    They are paint nearly hidden, which is no background.
+    They are marker colour nearly hidden, which is no background.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         coloured(hsv, around).astype(np.uint8), connectivity=8

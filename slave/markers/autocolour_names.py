@@ -3,7 +3,7 @@
 It is by the shape of the hand, by an older calibration, or by clicks.
 
 By the hand: an open hand seen from its back is a turned, scaled picture of the profile's flat hand. In every frame
-that shows all paints, or all but one, all orders of names are held against it (a similarity without reflection,
+that shows all marker colours, or all but one, all orders of names are fitted (a similarity without reflection,
 least squares in the complex plane); a frame where one order fits well, and clearly better than every other, votes
 for it. A frame that fits the mirrored hand better votes against the side of the profile.
 
@@ -29,9 +29,9 @@ from slave.markers.classify import HUES
 
 Complex = npt.NDArray[np.complex128]
 
-MOST, LEAST = 7, 5  # paints whose orders are tried: 5040 at most; fewer than five have no shape to go by
+MOST, LEAST = 7, 5  # colours whose orders are tried: 5040 at most; fewer than five have no shape to go by
 MOST_RESIDUAL = 0.25  # relative; a fist, or a hand from the side, has more
-CLEARER = 0.75  # of the runner-up's misfit
+CLEARER = 0.75  # of the runner-up's residual
 VOTES_LEAST = 5
 VOTES_SHARE = 0.8  # of all votes
 HUE_CLEARER = 0.25  # of the runner-up's sum of squares
@@ -39,7 +39,7 @@ _OPEN = (
     "show the open hand, fingers spread, its back to the camera, for a second or more; or give clicks, or --like with "
     "a camera file whose colours are named"
 )
-CLICK_REACH = 6.0  # px between a click and the nearest pixel of its paint
+CLICK_REACH = 6.0  # px between a click and the nearest pixel of its marker colour
 
 
 def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambda _text: None) -> Namer:
@@ -47,7 +47,7 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambd
 
     Raises:
         CalibrationError: The profile has no such marker.
-        FitError: When called: too few or too many markers, or the frames do not tell.
+        FitError: When called: too few or too many markers, or the frames do not determine the names.
     """
     if len(names) == 1:
         return lambda colours, uv: names
@@ -102,7 +102,7 @@ def votes_of(uv: Float, pattern: Float, orders: Int) -> tuple[list[int], int]:
     Args:
         uv: (F, M, 2) centroids [px]; NaN where not seen.
         pattern: (M, 2) the flat hand.
-        orders: (P, M) row of the pattern of each paint.
+        orders: (P, M) row of the pattern of each marker colour.
 
     Returns:
         The order each voting frame is for, and how many frames see the mirrored hand better.

@@ -4,7 +4,7 @@ Its skin, the desk, and the coloured things that stand on it.
 
 background   median over the frames: what stands still for most of the time
 skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
-floor        saturation per hue that the desk itself has, noise included; paint has more
+floor        saturation per hue that the desk itself has, noise included; marker colours have more
 clutter      things of the background that stay whole in one place while the hand moves: a mug, a pen
 """
 
@@ -34,16 +34,16 @@ DIFFERENT = 25  # grey levels that no noise reaches, in any channel
 MOVING_LEAST = 0.002  # share of the image that must differ from the background in a typical frame
 SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
 SKIN_SATURATION = 30, 210
-DESK_FRAMES = 3  # that tell how saturated the desk is, noise included
+DESK_FRAMES = 3  # from which the saturation of the desk is measured, noise included
 TILES = 8  # the image in so many rows and columns:
 DESK_SHARE = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
 DESK_TILE = 100.0  # where one pixel in so many has it
-DESK_TAIL = 99.9  # percentile of the desk's saturation that paint must exceed
+DESK_TAIL = 99.9  # percentile of the desk's saturation that a marker colour must exceed
 HUE_NEAR = 3  # hues of one tint
 SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
 WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
 MOVED_FRAMES = 3
-SKIN_AROUND = 0.08  # share of skin around a paint in a typical frame; painted caps have 0.12 and more
+SKIN_AROUND = 0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
 RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
 SKIN_DESK = 0.2  # share of the background that has the colour of skin, from which skin proves nothing: wood
 
@@ -144,7 +144,7 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
 
 
 def _moved(thing: Thing, images: Sequence[Image]) -> bool:
-    """Return whether a thing of the background is a paint of a resting hand.
+    """Return whether a thing of the background is a marker colour of a resting hand.
 
     It is one if it is seen whole, but elsewhere.
 

@@ -15,7 +15,7 @@ from slave.markers.classify import HUES
 from slave.markers.colours import HUE_GROW, SMALLEST, circular_median, hue_distance, hue_separation
 
 SKIN_VALUE = 60
-SKIN_HALF_WIDTH = 12  # in hue; nearer than this no paint can be told from skin
+SKIN_HALF_WIDTH = 12  # in hue; nearer than this no marker colour can be distinguished from skin
 DARK = 40  # value below which hue is noise
 LARGEST = 0.05  # share of the image; a larger coloured thing is a sleeve
 RING = 2, 5  # px: skin is sought outside the mixed pixels of the rim, and near
@@ -111,7 +111,7 @@ def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = 
 
 
 def coloured(hsv: Image, around: Surroundings) -> Bool:
-    """Return the mask (H, W) of pixels that may be paint.
+    """Return the mask (H, W) of pixels that may be marker colour.
 
     They are more saturated than the desk, not dark, and not of the skin's hue.
     """
@@ -134,7 +134,7 @@ def hsv_of(image: Image) -> Image:
 def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
     """Split a piece into connected parts of one hue each.
 
-    The most frequent hue comes first: paints that touch are separated.
+    The most frequent hue comes first: marker colours that touch are separated.
     """
     parts: list[Bool] = []
     rest = piece.copy()

@@ -6,7 +6,7 @@ The scan looks at every fourth pixel of every fourth row, which any round marker
 smaller ones and slivers do now and then, so a colour that no point of the grid shows is sought on further grids.
 
 Labels are made per colour, never on the union of all colours: the hue runs through other markers' ranges on the
-rim between paint and skin, and such a fringe would split the blob. Points of a colour that fill their box are one
+rim between marker and skin, and such a fringe would split the blob. Points of a colour that fill their box are one
 blob without further looking; only scattered ones are labelled, in the box around them, so the cost follows the
 number of coloured points, not of markers.
 """
@@ -27,7 +27,7 @@ FULL = 0.6  # share of its box that one compact blob fills at least: an upright 
 FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest piece's size
 FRAGMENT_LEAST = 8.0  # px^2
-FRAGMENT_UNKNOWN = 0.3  # of the largest piece: what is larger is a rival, where the whole is not known
+FRAGMENT_UNKNOWN = 0.3  # of the largest piece: a larger one is an alternative, where the whole is not known
 POINT = float(SCALE * SCALE)  # px^2; areas are known to about this
 
 

@@ -2,7 +2,7 @@
 
 It finds none while no colour is known: for a slave that is still being set up.
 
-Its colours are fixed: few markers do not tell the light from their paint. With the last colour another detector takes
+Its colours are fixed: few markers cannot separate light from their colour. With the last colour another detector takes
 over (`changing`), which follows the light.
 """
 

@@ -1,14 +1,14 @@
-"""Sub-pixel centroids of the visible paint of every marker.
+"""Sub-pixel centroids of the visible area of every marker.
 
 They are measured in small windows of the full-resolution image.
 
-A threshold knows whole pixels only. At the rim a pixel holds paint and surroundings in proportion to the covered
-area, and light adds linearly, so in linear light the amount of paint is measurable:
+A threshold knows whole pixels only. At the rim a pixel holds marker and surroundings in proportion to the covered
+area, and light adds linearly, so in linear light the amount of marker colour is measurable:
 
-1. The colour table gives the mask. How full of it the 7 x 7 neighbourhood of a pixel is tells core (surely paint)
-   from rim (unsure) and ring (surely not paint).
-2. In linear light the share of paint in every pixel is found (`shares`): along the colour direction that tells paint
-   from its surroundings, divided by the shading of the paint.
+1. The colour table gives the mask. How full of it the 7 x 7 neighbourhood of a pixel is separates core (surely marker)
+   from rim (unsure) and ring (surely not marker).
+2. In linear light the share of marker colour in every pixel is found (`shares`): along the direction that separates it
+   from its surroundings, divided by the shading of the marker.
 3. Deep inside the share is 1, whatever a highlight does there; beyond the rim it is 0.
 4. Centroid, area and extent are the moments of the shares.
 
@@ -27,7 +27,7 @@ from slave.markers.classify import ColourTable
 from slave.markers.shares import EVERY, WHITE, Float32, grid_of, light_of, shares
 
 PAD = 4  # px around the box of a blob: 3 of rim, the rest ring
-SIDE = (7, 7)  # px, of the neighbourhood whose fullness tells core from rim
+SIDE = (7, 7)  # px, of the neighbourhood whose fullness separates core from rim
 CORE = 33  # of its 49 pixels: two pixels inside a straight edge it holds 35, one pixel inside 28
 DEEP = 42  # three pixels inside
 HOLE = 26  # not in the mask yet inside it: outside a straight edge the neighbourhood holds at most 21
@@ -42,7 +42,7 @@ class Measured(NamedTuple):
     """One marker, measured.
 
     Attributes:
-        u, v: Centroid of the visible paint [px], distorted image.
+        u, v: Centroid of the visible marker colour [px], distorted image.
         area: Visible area [px^2].
         contrast: Level of the core in standard deviations of what the filter leaves of the ring.
         colour: Mean of the core in linear light 0..1: blue, green, red.
@@ -79,7 +79,7 @@ def measure(
         table: Colour table of the camera.
         bits: Bit in the table of each blob's marker.
         blobs: Where the scan saw them.
-        alone: Whether the colour has no other blob; where it has, only paint inside the blob's box is the marker's.
+        alone: Whether the colour has no other blob; where it has, only pixels inside the blob's box are the marker's.
 
     Returns:
         One measurement per blob; None where the window holds no blob of at least `MIN_PIXELS`.
@@ -113,7 +113,7 @@ def _measure_stack(
 ) -> list[Measured | None]:
     """Measure the blobs in windows of one size.
 
-    `gap` empty rows and columns keep the windows apart where paint meets their border.
+    `gap` empty rows and columns keep the windows apart where marker pixels meet their border.
     """
     count = len(blobs)
     height = max([b.bottom - b.top for b in blobs]) + 2 * PAD + gap

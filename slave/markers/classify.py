@@ -31,7 +31,7 @@ PLANES = (
     16  # of the table that are made at once: a thread beside a busy loop waits for its turn at every step
 )
 COARSE = 0xF8F8F8  # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
-# Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red, orange
+# Skin of every tone lies between red and orange, less saturated than markers (Kalbfleisch: collides with red, orange
 # and yellow markers, which is why those are not used).
 SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 
@@ -126,7 +126,7 @@ class ColourTable:
     ) -> Codes:
         """Class codes on a grid: every `step`-th pixel of every `step`-th row.
 
-        Decimated, not averaged: an averaged pixel on the rim of a marker has a hue that no paint has.
+        Decimated, not averaged: an averaged pixel on the rim of a marker has a hue that no marker has.
 
         Args:
             image: (H, W, 3) BGR, C-contiguous.
@@ -164,7 +164,7 @@ def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, wher
     """The table of a camera's markers, in the order of the rig.
 
     Raises:
-        CalibrationError: A marker has no range; the text says where and which, and how to make it.
+        CalibrationError: A marker has no range; the message states where and which, and how to make it.
     """
     missing = [name for name in markers if name not in (ranges or {})]
     if missing or ranges is None:

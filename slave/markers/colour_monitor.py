@@ -3,7 +3,7 @@
 It warns while the marker is still detected, by the distance of its colour from the border of its range.
 
 Colours are undone to the light of calibration first, so what is left is what following the light does not mend: light
-beyond the bounds, a lamp whose colour von Kries' law does not describe, paint that has become dirty or worn. Each
+beyond the bounds, a lamp whose colour von Kries' law does not describe, a marker that is dirty or worn. Each
 marker's hue, saturation and value are averaged over half a second; the room to each border of its range is counted
 in the spread of that average, so a colour that flickers is warned of earlier.
 """
@@ -19,13 +19,13 @@ from common.srgb import to_srgb
 from slave.markers.classify import HUES
 
 TIME_S = 0.5
-LEAST_S = 0.3  # of sightings before a verdict
-GOOD = 0.4  # clarity of a sighting that counts: half covered paint is mixed with what covers it
+LEAST_S = 0.3  # of observations before a verdict
+GOOD = 0.4  # clarity of an observation that counts: a half covered marker is mixed with what covers it
 ROOM = 2.0  # spreads: less is a warning; a marker that is warned of is well again with
 WELL = 3.0
-# Smallest spread that is believed, of hue (of 180), saturation and value (of 255): what noise leaves of one pixel.
+# Smallest spread that is assumed, of hue (of 180), saturation and value (of 255): what noise leaves of one pixel.
 FLOOR = np.array([1.5, 8.0, 8.0])
-APART = 8.0  # hues: two paints nearer than this look the same
+APART = 8.0  # hues: two marker colours nearer than this look the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class ColourWarning:
     Attributes:
         marker: Its name; None: it concerns all.
         text: What is seen, and the fix.
-        twin: Another marker that looks like it; None: it is about this one alone.
+        ambiguous: Another marker that looks like it; None: it is about this one alone.
         hues: How far the two are apart, of 180.
     """
 

@@ -2,7 +2,7 @@
 
 The colours that other markers have are taken into account.
 
-The paint under the click is grown as for `phalanx-slave colours`, and the ranges of all markers picked so far are made
+The colour under the click is grown as for `phalanx-slave colours`; the ranges of all markers picked so far are made
 anew together, since how far each may reach depends on its neighbours: six picks give what six clicks in one picture
 give. Ranges that came from the camera file stay, but for hues that a picked one needs. Where colours follow the light
 the picture is seen as under the light of their calibration, so that old and new colours agree.
@@ -36,13 +36,15 @@ from slave.markers.colours import (
     surroundings,
 )
 
-NEAR_SHARE = 0.02  # of the image width: a click as far beside a paint is meant for it
-SLIP_PX = 4.0  # a click on the rim of a paint is meant for what lies so far inside
+NEAR_SHARE = 0.02  # of the image width: a click as far beside a marker is meant for it
+SLIP_PX = 4.0  # a click on the rim of a marker is meant for what lies so far inside
 LARGEST_SHARE = 0.1  # of the image; a larger patch is no marker
-UNEVEN = 7.0  # hues: the 95th percentile of the distance from the median, of one paint in one light less
-OWN_LEAST = 0.8  # share of the paint that its range must hold
+UNEVEN = (
+    7.0  # hues: the 95th percentile of the distance from the median, of one marker colour in one light less
+)
+OWN_LEAST = 0.8  # share of the marker's pixels that its range must hold
 SKIN_MOST = 0.1  # share of the skin around that it may hold
-PIXELS_MOST = 4000  # of one paint that are kept
+PIXELS_MOST = 4000  # of one marker colour that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +84,13 @@ class SampledColours:
         Args:
             image: (H, W, 3) BGR.
             log_gains: (3,) of the light against calibration, blue first.
-            marker: Whose paint it is.
+            marker: Whose colour it is.
             uv: A pixel on or near it [px].
             ranges: Of the markers that have one.
 
         Raises:
-            FitError: There is no paint of one colour, or one like skin, like another marker's, or as large as no
-                marker; the text says what to do.
+            FitError: There is no area of one colour, or one like skin, like another marker's, or as large as no
+                marker; the message states what to do.
         """
         hsv = undone(image, log_gains)
         mask = colour_region(hsv, marker, uv)

@@ -1,8 +1,8 @@
 """HSV range of every marker from one click on each, with collision report.
 
-A tight range around the clicked paint fails under the next lamp ("a broader range at calibration worked better"), so
+A tight range around the clicked colour fails under the next lamp ("a broader range at calibration worked better"), so
 each range is as broad as its neighbours allow: in hue half-way to the next marker or to the skin, at most
-`HUE_MARGIN`; in saturation down to `SATURATION_SHARE` of the paint's, where a rim pixel is about half paint, but
+`HUE_MARGIN`; in saturation down to `SATURATION_SHARE` of the marker's, where a rim pixel is about half marker, but
 above what the background shows in that hue; in value down to the shadow side of a cap and up to a highlight.
 """
 
@@ -20,17 +20,17 @@ from common.errors import FitError
 from common.srgb import to_linear
 from slave.markers.classify import HUES, in_range
 
-HUE_GROW = 10  # how far the hue of one paint wanders between its lit and its shadow side
-HUE_MARGIN = 14  # widest half range; other paints and skin narrow it
-HUE_SEPARATION = 8  # two paints nearer than this look the same
-SATURATION_SHARE = 0.45  # of the paint's median: a rim pixel is about half paint
+HUE_GROW = 10  # how far the hue of one marker varies between its lit and its shadow side
+HUE_MARGIN = 14  # widest half range; other marker colours and skin narrow it
+HUE_SEPARATION = 8  # two marker colours nearer than this look the same
+SATURATION_SHARE = 0.45  # of the marker's median: a rim pixel is about half marker
 SATURATION_LEAST = 50
-VALUE_SHARE = 0.3  # of the paint's median: the shadow side belongs to the cap
+VALUE_SHARE = 0.3  # of the marker's median: the shadow side belongs to the cap
 VALUE_LEAST = 25  # below, hue is noise
-PALE = 60  # saturation below which nothing is a paint that can be told from a grey desk
+PALE = 60  # saturation below which no marker colour can be distinguished from a grey desk
 AROUND = 25  # px around the markers in which skin is sampled
-RIM = 4  # px around a marker that are partly paint
-SMALLEST = 6  # px of paint
+RIM = 4  # px around a marker that are partly marker colour
+SMALLEST = 6  # px of marker colour
 VISIBLE_PX = 24  # background pixels inside a range that may look like a marker; fewer are a speck
 BACKGROUND_TAIL = 99.9  # percentile of the background's saturation that a range stays above
 
@@ -42,9 +42,9 @@ class ColourRow:
     Attributes:
         name: Marker.
         range: Its HSV range.
-        pixels: Paint pixels grown from the click.
+        pixels: Pixels of the marker colour grown from the click.
         own: Share of them inside the range.
-        others: Other markers -> share of their paint inside the range; only those above zero.
+        others: Other markers -> share of their pixels inside the range; only those above zero.
         skin: Share of the skin pixels inside the range.
         background: Share of the background pixels inside the range.
         background_px: How many that is in one frame.
@@ -65,10 +65,10 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
 
     Args:
         image: (H, W, 3) BGR.
-        clicks: Marker -> (u, v) [px], a pixel on its paint.
+        clicks: Marker -> (u, v) [px], a pixel on its colour.
 
     Raises:
-        FitError: A click is outside the image or not on a paint, or two paints have the same hue.
+        FitError: A click is outside the image or not on a marker colour, or two colours have the same hue.
     """
     hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
@@ -84,11 +84,11 @@ def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: 
     Args:
         paint: Marker -> (N, 3) HSV of its pixels, of one frame or of many.
         skin: (K, 3) HSV of skin pixels; may be empty.
-        background: (B, 3) HSV of all that is neither paint nor its rim.
+        background: (B, 3) HSV of all that is neither marker colour nor its rim.
         frames: How many frames `background` was taken from.
 
     Raises:
-        FitError: Two paints have the same hue.
+        FitError: Two marker colours have the same hue.
     """
     hue = {name: circular_median(pixels[:, 0]) for name, pixels in paint.items()}
     _refuse_ambiguous(hue)

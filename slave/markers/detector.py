@@ -8,7 +8,7 @@ detector (`fresh`).
     scan     one table look-up, all colours at once; the whole frame or windows   scan, classify
     blobs    connected blobs per colour                                          blobs
     decide   by prediction where a track answers; else by what belongs together  roi, group
-    measure  sub-pixel centroid of the visible paint, full resolution            centroid
+    measure  sub-pixel centroid of the visible marker colour, full resolution    centroid
     outline  where the colour fills a part of a round marker only: its circle    outlines, outline
     judge    how probable it is a marker; how far it may be off                  quality, sigma
 """
@@ -45,13 +45,13 @@ from slave.markers.sigma import COVERED_PX, sigma_of
 
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
-SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
+SLIVER = 14.0  # px^2; a thinner sliver cannot be distinguished from a fringe
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
 NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
-NEAR = 3.0  # sides of the marker: a rival so near may be taken for it in the next frame
+NEAR = 3.0  # sides of the marker: an alternative so near may be taken for it in the next frame
 ALTERNATIVES = 2  # that are measured in one frame
-ALTERNATIVE = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
+ALTERNATIVE = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
 JUDGED = (
     6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
 )
@@ -62,15 +62,15 @@ class Detections:
     """Markers of one frame, in marker order; a row that is NaN in all was not seen.
 
     Attributes:
-        uv: (M, 2) centroids of the visible paint [px], distorted image; of the whole cap where something covers a
-            part of it and the edge that is left tells; of the whole disc where the colour is only a part of it.
+        uv: (M, 2) centroids of the visible marker area [px], distorted image; of the whole cap where something covers
+            a part and the visible edge constrains it; of the whole disc where the colour is only a part of it.
         area: (M,) area [px^2] of what `uv` is the centroid of.
         quality: (M,) 0..1, the probability that it is a marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
-            would see of the whole cap: noise, doubt of occlusion, size, motion.
+            would see of the whole cap: noise, uncertainty of occlusion, size, motion.
         alt_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
             many only as the scan saw it, to a pixel or so; NaN: none.
-        clarity: (M,) 0..1, how far `colour` is that of the paint alone: 1 is a whole, clear marker.
+        clarity: (M,) 0..1, how far `colour` is that of the marker alone: 1 is a whole, clear marker.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
 
@@ -186,7 +186,7 @@ class MarkerDetector:
                 alternative = self._alternative(m, chosen[m], blobs, windows[m])
                 if alternative is not None:
                     alternatives[m] = alternative
-        # A rival costs as much as a marker, so a frame full of them is not measured through.
+        # An alternative costs as much as a marker, so a frame full of them is not measured through.
         closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:ALTERNATIVES]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]

@@ -9,13 +9,13 @@ channels (a cap turned from the lamp):
     log colour[m, k] - log reference[m, k] = x[k] + s[m] + e[m, k]
 
 x, the log gains, are solved from all markers of a frame together by weighted least squares. A channel weighs by
-what it can tell: paint is nearly black in one or two channels, and what is seen there is sheen and stray light, which
+what it can measure: a marker is nearly black in one or two channels; what is seen there is sheen and flare, which
 come and go with the pose (`OUTLIER`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
 worse it fits (Cauchy weights, Holland and Welsch 1977). The estimate follows the solution slowly, and never leaves
 its bounds.
 
-What a few markers cannot tell stays near an anchor: the light that many markers last agreed on. Without it, one
-marker whose paint differs a little from its reference would, look by look, carry the light away with it.
+What a few markers cannot constrain stays near an anchor: the light that many markers last agreed on. Without it, one
+marker whose colour differs a little from its reference would, look by look, carry the light away with it.
 """
 
 import math
@@ -33,15 +33,17 @@ RATE_PER_S = 0.5  # largest rate of each of the three: 3000 -> 6500 K within 10 
 TIME_S = 1.0  # time constant of following
 ANCHOR_S, MANY = 5.0, 4  # time constant of the anchor, and how many markers move it
 EVERY_NS = 100_000_000  # colours are looked at so often; light has no need of more
-# How far the light may be from the anchor (sd of each channel, and of all together): where a look tells much it
-# decides, and a lone marker, which tells of two channels at most, moves the third one little.
+# How far the light may be from the anchor (sd of each channel, and of all together): what a look constrains well it
+# decides, and a lone marker, which constrains two channels at most, moves the third one little.
 WEAK, WEAK_TOGETHER = 0.3, 0.6
 KNOWN = np.asarray(np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2), np.float64)
-OUTLIER = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
+OUTLIER = 0.01  # linear light of sheen and skin on a marker, as it comes and goes
 UNEVEN = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
 SHADING = 0.35  # relative: the light on one marker against another's
-CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it tells no gain
-CAUCHY = 2.5  # standard deviations (of a triple, whose mean is 1.6) at which a marker has half its weight
+CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it constrains no gain
+CAUCHY = (
+    2.5  # standard deviations (of three channels, whose mean is 1.6) at which a marker has half its weight
+)
 ROUNDS = 3
 EYE = np.eye(3)
 GAP_NS = 500_000_000  # a step in time is taken as no longer than this
@@ -53,7 +55,7 @@ class GainFit:
 
     Attributes:
         log_gains: (3,) natural logarithms, blue, green, red.
-        misfit: (M,) distance of each marker from them, in standard deviations; NaN: not seen.
+        residual: (M,) distance of each marker from them, in standard deviations; NaN: not seen.
     """
 
     log_gains: Float
@@ -66,8 +68,8 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
     Args:
         colour: (M, 3) linear light of each marker's core, blue first; NaN or 0: not seen.
         reference: (M, 3) the same at calibration, positive.
-        weight: (M,) 0..1, how far each sighting is trusted.
-        known: (3,) log gains known before; where the markers tell nothing, they stay.
+        weight: (M,) 0..1, how far each observation is trusted.
+        known: (3,) log gains known before; where the markers constrain nothing, they stay.
     """
     residual = np.full(len(colour), np.nan)
     seen = np.flatnonzero((np.nan_to_num(colour) > 0.0).all(axis=1) & (np.nan_to_num(weight) > 0.0))

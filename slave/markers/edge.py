@@ -6,7 +6,7 @@ What is left of the cap has its centroid elsewhere: 15 % hidden moves it by an e
 the cap had before is known (an ellipse with the second moments of its shares), so only its place is sought: rays
 from a point inside meet the visible edge at some distance, the ellipse at another; the difference of the two along
 all rays that see the cap's own edge gives the shift by least squares. Rays on which the cap ends too early see the
-edge of the thing in front; they are told by their residual and left out, one side only, until nothing changes.
+edge of the thing in front; they are identified by their residual and rejected, one side only, until nothing changes.
 Where too little is left, or the rest does not fit the ellipse, there is no answer.
 """
 
@@ -29,7 +29,7 @@ DONE_PX = 0.06  # a shift that changes nothing
 SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
 LEFT = 0.45  # share of the rays that must be left
 FIT_PX = 0.35  # RMS of their residuals
-UNSURE = 0.05  # by so much the hidden share may be larger than the areas tell,
+UNSURE = 0.05  # by so much the hidden share may be larger than estimated from the areas,
 UNSURE_PX = 0.3  # and a centre off: two standard deviations
 _ANGLES = np.arange(RAYS, dtype=np.float64) * (2.0 * math.pi / RAYS)
 DIRECTIONS: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1).astype(np.float64)
@@ -66,7 +66,7 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     """Centre of a partly covered cap.
 
     Args:
-        share: (H, W) share of paint of every pixel of a window, 0..1.
+        share: (H, W) share of marker colour of every pixel of a window, 0..1.
         shape: The cap's shape when it was whole.
         u, v: A point inside what is visible [px], in the window: its centroid.
 
@@ -99,7 +99,7 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         try:
             shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
         except np.linalg.LinAlgError:
-            return None  # no edge about the centroid: that of a thin crescent lies beside its paint
+            return None  # no edge about the centroid: that of a thin crescent lies beside its pixels
         centre += shift
         if iteration >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
             break
@@ -135,6 +135,6 @@ def _edge(share: Float32, start: Float, reach: float) -> Float:
     x = (start[0] + DIRECTIONS[:, :1] * steps).astype(np.float32)
     y = (start[1] + DIRECTIONS[:, 1:] * steps).astype(np.float32)
     along = cast(Float32, cv2.remap(share, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
-    # Paint beyond a gap is not on this ray's stretch: only what comes before the first empty step counts.
+    # Marker pixels beyond a gap are not on this ray's stretch: only what comes before the first empty step counts.
     gone = np.maximum.accumulate(along < 0.1, axis=1)
     return np.where(gone, 0.0, along).sum(axis=1) * STEP_PX

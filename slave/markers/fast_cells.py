@@ -22,7 +22,7 @@ class Cells(NamedTuple):
 
     Attributes:
         first: Of the cell's first colour, whose lowest three bits are 0: what a scan asks for.
-        markers: Of all its colours, markers alone; the bit of skin says that they differ.
+        markers: Of all its colours, markers alone; the bit of skin indicates that they differ.
         skin: (1,) that bit.
     """
 

@@ -3,7 +3,7 @@
 One window after the other, with a few passes over each.
 
 The formulas are those of `centroid` and `shares`; here they are written pixel by pixel. In place of stacks and
-masks, each window has its own size, sums are taken only where the paint is, and pixels outside count as nothing.
+masks, each window has its own size, sums are taken only where the marker is, and pixels outside count as nothing.
 """
 
 from collections.abc import Sequence

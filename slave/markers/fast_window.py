@@ -3,7 +3,7 @@
 Its masks, the share of marker colour in every pixel, and their moments.
 
 The masks of a window lie in flat arrays of rows of `stride`, `EDGE` of nothing around them, so that no neighbourhood
-leaves them: pixel (x, y) of the window is at (y + EDGE) * stride + EDGE + x. `classes` says what the colour table
+leaves them: pixel (x, y) of the window is at (y + EDGE) * stride + EDGE + x. `classes` holds what the colour table
 makes of a pixel, `kinds` what its neighbourhood does. The formulas stand in `centroid` and `shares`.
 
 All in one file: the cache of compiled code looks for changes only in the file of the function that is called, so code
@@ -141,7 +141,7 @@ def _measure_window(
         image: (H, W, 3) BGR.
         table: (2^24,) codes.
         places: (3, 256) what each byte of blue, green and red adds to the place in the table.
-        cells: (32^3,) codes of cells; skin: (1,) the bit that says that a cell has none (`fast_cells`).
+        cells: (32^3,) codes of cells; skin: (1,) the bit that indicates that a cell has none (`fast_cells`).
         curve: (256,) byte -> linear light.
         ask: (7,) box, bit, whether alone, where its window starts in `windows`.
         rules: Constants.
@@ -313,7 +313,7 @@ def _box_of_own(whole: Frame, classes: Image, room: Image) -> tuple[int, int, in
 def _look_around(part: Frame, rules: Rules, classes: Image, kinds: Image, room: Image) -> None:
     """Fill `kinds` from how full of the mask the neighbourhood of 7 x 7 is.
 
-    Row by row without a break, over the gaps between rows too: one long loop, and what it says of a gap is not asked.
+    Row by row without a break, over the gaps between rows too: one long loop, and its result in a gap is not used.
     """
     stride = part.stride
     begin, end = (part.y0 + EDGE) * stride, (part.y1 + EDGE) * stride

@@ -3,7 +3,7 @@
 Those are chosen that belong together, as markers of one hand do.
 
 Used when the past does not answer: at the start, when a marker comes back, or when something in the marker's
-colour (a green mug, a blue pen) competes with it. Three facts tell markers from clutter, none of which knows the
+colour (a green mug, a blue pen) competes with it. Three facts separate markers from clutter, none of which knows the
 hand: markers are close together for their size, skin touches them, and those of the past have a place.
 
 Two blobs are linked when their distance is at most `REACH` times the geometric mean of their sizes, more where skin
@@ -26,7 +26,7 @@ SPECK = 24.0  # px^2; smaller blobs are rarely markers
 FRINGE = 0.3  # what a fringe counts
 SAME = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
 FRINGE_RATIO = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
-CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every rival of its marker
+CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every alternative of its marker
 TRACKED = 1.0  # bonus of the blob where the marker is expected: as much as being there
 SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
 STRANGE_SIZE = 2.5  # typical areas of the group, and

@@ -2,8 +2,8 @@
 
 Nothing else is known of the image.
 
-Under a light much warmer or cooler than that of calibration every hue has moved, and one paint looks like another one
-at calibration. What none of them can imitate is the whole set: only under the right light do all paints in the picture
+Under a light much warmer or cooler than that of calibration every hue has moved, and one marker looks like another one
+at calibration. What none of them can imitate is the whole set: only under the right light do all markers seen
 fit all references. So lights are tried: for each, its picture is undone to the light of calibration, blobs are
 found as ever, and the better their colours fit the references together, the more the light explains.
 
@@ -11,7 +11,7 @@ The lights tried lie on the line of black bodies. In the logarithms of red/green
 Wien's law a channel at wavelength l gains -c2/l (1/T' - 1/T) (Finlayson and Hordley 2001, J. Opt. Soc. Am. A 18, 253).
 The fit to the blobs then leaves the line as far as they ask for it.
 
-Where little but skin is seen, a light far warmer than any lamp explains it best: skin is the paint of a thumb there,
+Where little but skin is seen, a light far warmer than any lamp explains it best: skin is the colour of a thumb there,
 its shadow that of a finger. So a light beyond what is followed proves nothing, and one that nobody expects needs
 more markers than the one that is expected.
 """
@@ -33,7 +33,9 @@ STEP, REACH = 15e-6, 210e-6  # reciprocal kelvin: 3000 to 6500 K is 180e-6
 STRIDE = 2  # pixels of every second row and column are plenty
 SPECK = 6  # of these pixels; smaller blobs prove nothing
 LARGEST = 0.1  # of the image; a larger blob is no marker
-FITS = 3.0  # standard deviations (of a triple, whose mean is 1.6) at which a blob proves nothing any more
+FITS = (
+    3.0  # standard deviations (of three channels, whose mean is 1.6) at which a blob proves nothing any more
+)
 TINT = 0.25  # log gain of red against green by which lamps of rooms may lie off the line of black bodies
 PROOF = 2  # markers that must fit: one colour fits some light always
 PROOF_ELSEWHERE = 3  # of a light that is clearly not the expected one: two colours fit some other light often
@@ -53,7 +55,7 @@ class Evidence:
         log_gains: (3,) of the light, blue, green, red, after the fit to its blobs.
         score: Markers that fit, each 0..1.
         matched: How many of them.
-        misfit: (M,) of each marker in standard deviations; NaN: none found.
+        residual: (M,) of each marker in standard deviations; NaN: none found.
         proven: At least `PROOF` markers fit, `PROOF_ELSEWHERE` where it is clearly not the expected light, and no
             clearly different light comes near.
         excluded: `PROOF` markers fit a light that leaves the expected one far behind.

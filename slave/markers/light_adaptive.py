@@ -5,7 +5,7 @@ that see the picture as under that light. A table takes a few frames to make on 
 `workers`: a thread of its own on a live slave, `Inline` where every run must give the same.
 
 Where the table is far from the light, or the light is not known and the markers do not fit it, one marker could be
-taken for another: then nothing is reported seen, and a warning says why.
+taken for another: then nothing is reported seen, and a warning states why.
 """
 
 from collections.abc import Collection, Mapping

@@ -4,8 +4,8 @@ The same few hundred pixels of every frame are compared.
 
 A camera of a rig does not move, so most of its picture is the same desk in every frame. The median over all
 points of the log ratio to what each point showed before is the change of the light; a hand in front of some of them
-does not move a median, and where a hand or a card covers too many, there is no answer. It says only how the
-light *changes*; where it stands against calibration only the paints know (`drift`).
+does not move a median, and where a hand or a card covers too many, there is no answer. It measures only how the
+light *changes*; where it stands against calibration only the marker colours determine (`drift`).
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from common.arrays import Float, Image
 from common.srgb import to_linear
 
 GRID = 16  # points along each side
-DARK, BRIGHT = 12, 250  # bytes beyond which a point tells nothing: noise, or clipped
+DARK, BRIGHT = 12, 250  # bytes beyond which a point measures nothing: noise, or clipped
 ALIKE = 0.25  # a point agrees when its log ratios are this near the median: three standard deviations of a dark desk
 AGREE = 0.55  # share of the points that must agree
-LEAST = 48  # points that tell something
+LEAST = 48  # points that measure something
 EVERY_NS = 50_000_000  # a slow change is measured so often,
 LEAP, LEAPING = (
     8,
@@ -35,7 +35,7 @@ class Change:
     """How the light changed since it was last measured.
 
     Attributes:
-        log_gains: (3,) natural logarithms, blue, green, red; 0 where nothing can be said.
+        log_gains: (3,) natural logarithms, blue, green, red; 0 where nothing can be estimated.
         sure: Enough points agree.
         agreeing: Share of all points that agree, 0..1.
     """

@@ -78,7 +78,7 @@ def outline_of(image: Image, seen: Measured) -> Outline | None:
 
     Args:
         image: (H, W, 3) BGR, full resolution.
-        seen: The measurement; its shares tell where the colour is.
+        seen: The measurement; its shares show where the colour is.
     """
     mask = (seen.window >= 0.5).astype(np.uint8)
     borders, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -125,7 +125,7 @@ def _edges(image: Image, u: float, v: float, size: float) -> Float32:
 
 
 def _grid(*axes: Sequence[float] | Float) -> Float:
-    """Return all triples (N, 3) of three axes."""
+    """Return all combinations (N, 3) of the values of three axes."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 

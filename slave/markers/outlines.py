@@ -2,7 +2,7 @@
 
 An outline costs as much as a frame of clear markers.
 
-Where the contrast is low, the surroundings may be the marker as well. Where it is clear, nothing but an outline tells:
+Where the contrast is low, the surroundings may be the marker as well. Where it is clear, only an outline decides:
 a large marker is looked at when it is found, from time to time, and as long as it has one that holds more than its
 colour.
 """
@@ -16,7 +16,7 @@ from slave.markers.outline import Outline, outline_of
 from slave.markers.quality import CLEAR_CONTRAST
 
 MOST = 2  # that are sought in one frame
-LEAST_PX2 = 60.0  # from which an outline can be told from its pixels
+LEAST_PX2 = 60.0  # from which an outline can be distinguished from its pixels
 LARGE_PX2 = 500.0  # from which the outline of one of clear contrast is looked at,
 RARELY = 120  # in one frame of so many while its colour fills it,
 SURE = 0.8  # and taken with an edge in this share of the directions,
@@ -42,7 +42,7 @@ class Outlines:
             anew: Rows of those that were not tracked.
 
         Returns:
-            Marker row -> its outline, where it has one that is to be believed rather than its colour.
+            Marker row -> its outline, where it has one that is to be used rather than its colour.
         """
         self._frame += 1
         sought: list[tuple[float, int]] = []

@@ -1,14 +1,14 @@
 """Probability that a detection is a marker, from its appearance.
 
 A field, a window frame or a face holds pixels of every colour, and what a colour table finds there has an area and a
-centroid like a marker. But paint is of one colour against its surroundings, near the middle of its range, and a cap
+centroid like a marker. But a marker is of one colour against its surroundings, near the middle of its range, and a cap
 or bead is compact. A logistic regression weighs that:
 
     P(marker) = 1 / (1 + exp(-(w0 + w . evidence)))
 
-`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, paint drawn into photographs)
-and to what is found in photographs without paint, half and half: where things in the colours of the markers are more
-frequent than markers, less of what is found is right than it says.
+`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, markers drawn into photographs)
+and to what is found in photographs without markers, half and half: where things in the colours of the markers are more
+frequent than markers, less of what is found is right than it reports.
 """
 
 import math
@@ -22,7 +22,7 @@ from slave.markers.classify import HUES
 CLEAR_CONTRAST = (
     6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
 )
-SMALL = 40.0  # px^2 below which a colour is hardly that of the paint alone
+SMALL = 40.0  # px^2 below which a colour is hardly that of the marker alone
 LARGEST_CONTRAST = 20.0  # no marker is the more certain beyond it
 
 
@@ -30,13 +30,13 @@ class Evidence(NamedTuple):
     """What speaks for a marker; every entry is free of the camera's resolution.
 
     Attributes:
-        contrast: Logarithm of the contrast between paint and surroundings, at most that of `LARGEST_CONTRAST`.
+        contrast: Logarithm of the contrast between marker and surroundings, at most that of `LARGEST_CONTRAST`.
         unclear: 1: the contrast is below `CLEAR_CONTRAST`.
         outlined: Then the share of directions in which a round outline was found, else 0.
         fullness: Area over that of the ellipse with the same second moments: 1 is an ellipse, less has gaps or arms.
         slender: Logarithm of the ratio of the axes of that ellipse.
         hue: Distance of the hue from the middle of the range in half ranges, squared.
-        rival: 1: a second blob of the colour may be the marker.
+        alternative: 1: a second blob of the colour may be the marker.
         ragged: 1: hardly a pixel has four neighbours of the colour.
         cut: 1: it touches the border of the image.
     """
@@ -76,7 +76,7 @@ def evidence_of(
         gains: Of the light against that of calibration, blue, green, red.
         colour: The marker's range.
         support: Of its outline, 0: none was found, or none was sought.
-        rival: Whether a second blob of the colour may be the marker.
+        alternative: Whether a second blob of the colour may be the marker.
     """
     hue = _hue(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
     middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)

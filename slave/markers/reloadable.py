@@ -4,7 +4,7 @@ The change happens between two frames; tracks are kept.
 
 A colour table takes as long as some tens of frames to make, so the new detector is made on another thread. Where it
 follows the light it must know the light before it is of use: it looks at some frames beside the old one, on that thread
-too, and takes over as soon as it may tell markers by their colours.
+too, and takes over as soon as it may distinguish markers by their colours.
 """
 
 import time

@@ -4,7 +4,7 @@ In linear light.
 
 1. A linear discriminant between core and ring, w = (S_ring + q m m' + N)^-1 (m - m_ring), m the mean of the core, is
    the colour direction along which the surroundings vary least: skin on one side and table on the other both become
-   0. The term q m m' allows for paint that is lighter and darker than its mean (after Fisher 1936).
+   0. The term q m m' allows for marker pixels lighter and darker than their mean (after Fisher 1936).
 2. Coordinate along w, 0 at the ring's mean and 1 at the core's, is share times shading. The shading is a plane
    fitted to the pixels whose four neighbours are all in the mask, so coordinate / shading is the share.
 
@@ -28,10 +28,12 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 WHITE = 4095  # light of a full byte
 # Added to the scatter: one grey level of noise, so that a flat colour stays solvable.
 NOISE = 4e-6 * WHITE**2 * np.eye(3)
-SHADED = 0.002  # variance of the paint's brightness, relative, that the discriminant allows for
-EVERY = 3  # of the ring's pixels one in so many is looked at: hundreds of them tell what one number in three tells
+SHADED = 0.002  # variance of the marker's brightness, relative, that the discriminant allows for
+EVERY = (
+    3  # of the ring's pixels one in so many is used: of hundreds, one in three suffices for the statistics
+)
 DARKEST = 0.3  # of the mean level of the core: shading is followed no further
-STIFF_PX2 = 0.7  # a core that spreads less has no shading that could be told from noise
+STIFF_PX2 = 0.7  # a core that spreads less has no shading that could be distinguished from noise
 TILT = np.diag([1e-6, STIFF_PX2, STIFF_PX2])  # the first: a window without a core stays solvable
 # Where 1, x, y, xx, xy, yy stand in the symmetric 3 x 3 matrix of products of (1, x, y).
 PRODUCT_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

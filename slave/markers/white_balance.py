@@ -2,13 +2,13 @@
 
 The sources differ in what they can estimate.
 
-    initial_white_balance   the first picture: all colours together prove one light      at the start, and after doubt
+    initial_white_balance   the first picture: all colours together prove one light      at the start, or if uncertain
     light_meter   what stands still: how the light changes, at once             every frame
     drift         the markers: where the light stands, slowly but for certain   10 times a second
 
-The light is *proven* when two or more markers of one picture agree on it and on no other. It is in doubt again when
+The light is *proven* when two or more markers of one picture agree on it and on no other. It is uncertain again when
 much of the picture changes at once and no marker vouches for the old light, or when the markers fit it badly. A light
-in doubt, the last one known is used on, but not where the picture excludes it.
+uncertain, the last one known is used on, but not where the picture excludes it.
 """
 
 from concurrent.futures import Future
@@ -39,7 +39,7 @@ SUDDEN = (
 CLEAR = 0.75  # share of still points that must agree on a sudden change that the markers do not vouch for
 DIM = 0.15  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
 AGAIN_NS = 500_000_000  # between two attempts to prove the light
-POOR_FITS = 5  # looks in a row, half a second, in which the markers fit badly and put the light in doubt
+POOR_FITS = 5  # looks in a row, half a second, in which the markers fit badly and make the light uncertain
 
 
 class WhiteBalance:
@@ -141,7 +141,7 @@ class WhiteBalance:
             )
             if before + AHEAD > after:
                 if before < AHEAD:
-                    self._lose_proof()  # no marker says that the light stayed, either
+                    self._lose_proof()  # no marker shows that the light stayed, either
                 return
         self._drift.shift(change.log_gains)
         if self._proof is not None:  # what is being proven is the light of an earlier frame

@@ -5,8 +5,8 @@ measurement over the milliseconds since (position by velocity, and the same for 
 asked for and needs no stamp of the device. Poses are in the raw frame of the base stations, y up: to set the room's
 floor or middle anew moves nothing, to move a base station does.
 
-A pose counts only where SteamVR says that it is valid, of a connected device, and tracked by light (`Running_OK`);
-what it leads by the gyroscope alone is NaN here. It is told when SteamVR ends, acknowledges, and lets go: a program
+A pose counts only where SteamVR reports that it is valid, of a connected device, and tracked by light (`Running_OK`);
+what it leads by the gyroscope alone is NaN here. It is notified when SteamVR ends, confirms, and lets go: a program
 that holds on is ended by SteamVR (ValveSoftware/openvr, issues 878 and 1490).
 """
 
@@ -73,7 +73,7 @@ class OpenVrTracker:
 
         Raises:
             TrackerError: SteamVR is ending.
-            TrackerChoiceError: There are several trackers, and nobody said which one is meant.
+            TrackerChoiceError: There are several trackers, and none was selected.
         """
         while not self._stop.is_set() and self._system is not None:
             left_ns = self._next_ns - self._clock.now_ns()

@@ -4,7 +4,7 @@ The program is started here and its lines are read; or the lines of a file are.
 
 The library has no Linux wheel, so nothing of it is loaded: whoever wants it builds it (docs/tracker.md). The program
 writes its lines into a pseudo terminal, because into a pipe C's stdio would write blocks of 4 kB, half a second of
-poses at once; what it tells people goes to stderr, as ever. It ends with its slave, also with one that was killed: the
+poses at once; its messages to people go to stderr, as ever. It ends with its slave, also with one that was killed: the
 terminal is that of its session, and hangs up when nobody has the other end any more (setsid(2), termios(3)).
 """
 
@@ -64,7 +64,7 @@ class SurviveTracker:
             clock: The slave's clock.
             stop: Set when the slave is to end.
             program: Name or path of survive-cli.
-            options: What it is told.
+            options: What it is called with.
 
         Raises:
             TrackerError: There is no such program, or it cannot be started.
@@ -81,7 +81,7 @@ class SurviveTracker:
 
         Raises:
             TrackerError: The program has ended.
-            TrackerChoiceError: Several devices have poses, and nobody said which one is meant.
+            TrackerChoiceError: Several devices have poses, and none was selected.
         """
         while not self._stop.is_set() and self._terminal is not None:
             if self._came:
@@ -165,7 +165,7 @@ class SurviveFile:
 
         Raises:
             TrackerError: The file cannot be read, or has no pose of the device.
-            TrackerChoiceError: Several devices have poses, and nobody said which one is meant.
+            TrackerChoiceError: Several devices have poses, and none was selected.
         """
         self._clock, self._stop = clock, stop
         self._device = SurviveDevice(name, wanted)

@@ -182,7 +182,7 @@ class SurviveDevice:
         """Take bytes that were there at `arrival_ns`; return the poses in them.
 
         Raises:
-            TrackerChoiceError: A second device has poses, and nobody said which one is meant.
+            TrackerChoiceError: A second device has poses, and none was selected.
         """
         ours = [one for found in self._decoder.push(data) if (one := self._ours(found)) is not None]
         dated = [(one, self._observe(one, arrival_ns)) for one in ours]  # all, before one becomes a time

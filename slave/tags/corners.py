@@ -27,7 +27,7 @@ from common.srgb import to_linear
 
 LIGHT = to_linear(np.arange(256) / 255.0)  # of a byte
 ALONG, ACROSS = 18, 9  # samples of a side: places on it, and steps from black to white
-ENDS_PX = 1.6  # of a side that are left out at either end: there the next side begins
+ENDS_PX = 1.6  # of a side that are not sampled at either end: there the next side begins
 REACH_PX = 3.5  # to either side of the edge, at most
 CELL = 0.55  # of the border's width that is looked at
 PASSES, STEPS = 2, 3
@@ -261,7 +261,7 @@ def _met(
     contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
     floor = FLOOR_PX**2 + (BLURRED * np.maximum(width - CLEAR_PX, 0.0)) ** 2
     variance = noise[..., None] * line.variance.reshape(n, 4, 2) + floor[..., None]
-    # Corner k ends side k - 1 and begins side k. Each line tells how far it moved across itself, there.
+    # Corner k ends side k - 1 and begins side k. Each line measures how far it moved across itself, there.
     normals = np.stack([np.roll(outward, 1, axis=1), outward], axis=-2)
     moved = np.stack([np.roll(offset[..., 1], 1, axis=1), offset[..., 0]], axis=-1)
     edge_variance = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=-1)

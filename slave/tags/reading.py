@@ -21,7 +21,7 @@ from slave.tags.corners import LIGHT, Corners, normal_law
 SPOTS = np.array(
     [[0.0, 0.0], [-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]]
 )  # of a cell, where it is looked at
-SURE = {4: 0.97, 5: 0.88, 6: 0.82}  # cells of code -> correlation from which a tag is believed
+SURE = {4: 0.97, 5: 0.88, 6: 0.82}  # cells of code -> correlation from which a tag is accepted
 EXPECTED = {4: 0.8, 5: 0.7, 6: 0.6}  # and where it is expected
 DARK_BORDER = 0.4  # of the way from black to white that no cell of the border may pass
 

@@ -17,7 +17,7 @@ def lit_line(frame: Image, ambient: Image) -> Image:
 
     White where the light that was added made the frame white.
 
-    In the sun a line has less room up to white the brighter the skin is: what is left of it says nothing of the line.
+    In the sun a line has less room up to white the brighter the skin is: what is left of it does not measure the line.
     """
     out = lit(frame, ambient)
     white = cv2.threshold(frame, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
@@ -28,12 +28,12 @@ def lit_line(frame: Image, ambient: Image) -> Image:
 def lit(frame: Image, ambient: Image) -> Image:
     """Subtract the ambient frame; the difference saturates at 0 (Kim et al. 2012).
 
-    The black level cancels. Where the ambient frame is saturated nothing can be told of the light that was added, and
+    The black level cancels. Where the ambient frame is saturated the light that was added cannot be measured, and
     the difference is 0 there by itself.
 
     Args:
         frame: (H, W) laser or LED frame, uint8.
-        ambient: (H, W) ambient frame of the same triple, uint8.
+        ambient: (H, W) ambient frame of the same strobe cycle, uint8.
 
     Returns:
         (H, W) uint8.

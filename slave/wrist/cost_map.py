@@ -14,7 +14,7 @@ DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
 SURFACE = 20.0  # energy of a bright, even surface: no seam crosses a finger
 OPEN = 1.0  # energy in the dark beside one finger only
 BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
-ASIDE = 3.0  # energy at the edge of a corridor
+ASIDE = 3.0  # energy at the edge of a search band
 ACROSS = 0.3  # energy where the thumb would lie across all fingers
 WIDTHS = tuple(n + 2 * MARGIN for n in LATERAL)
 STARTS = np.cumsum([0, *WIDTHS[:-1]]).tolist()
@@ -31,7 +31,7 @@ def energy(straightened: Image, crossed: int) -> Float32:
 
     From 0 in a black minimum to `SURFACE` on a finger, and `PRIOR`.
 
-    A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
+    A pixel is as much of a minimum as it lies below the darker of its two sides, and below what is brightest right
     beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
     counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
     no thumb at all beyond it would mean that the seam lies outside of the thumb.

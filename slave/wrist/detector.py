@@ -2,7 +2,7 @@
 
 From frames to what its laser and its LEDs show of five fingers.
 
-frame -> strobe -> triple -- LED less ambient ---> seams between the fingers
+frame -> strobe -> cycle --- LED less ambient ---> seams between the fingers
                          \\-- laser less ambient -> where the laser meets each finger -> fingertips
 """
 
@@ -26,7 +26,7 @@ from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
-RECENT = 4  # triples
+RECENT = 4  # strobe cycles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,7 @@ class WristDetector:
     Holds the strobe, which knows the frames since the last strobe cycle, the view that the next strobe cycle is seen
     with, and recent detections, for whoever shows them.
 
-    Of a pose nothing is used again: two triples have nothing to do with each other.
+    Of a pose nothing is used again: two strobe cycles have nothing to do with each other.
     """
 
     def __init__(self, view: WristView, frame_rate_hz: float, engine: Engine = NUMPY) -> None:
@@ -77,7 +77,7 @@ class WristDetector:
 
         Args:
             view: What the device knows of itself and of the hand.
-            frame_rate_hz: Of the camera file: single frames per second, three per triple.
+            frame_rate_hz: Of the camera file: single frames per second, three per strobe cycle.
             engine: What does the inner loops.
         """
         self._strobe = Strobe(frame_rate_hz)
@@ -124,7 +124,7 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
 
     That is what depends on the view alone (search bands, templates).
 
-    A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
+    A cycle in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
     postures_of(view)
     for rotated_view in prepare(view):

@@ -27,7 +27,7 @@ class Engine:
     """The steps in which much is done with few numbers.
 
     Attributes:
-        energy: Straightened corridors, and how many circles the thumb crosses -> energy (`valleys.energy`).
+        energy: Straightened search bands, and how many circles the thumb crosses -> energy (`valleys.energy`).
         minimum_cost_paths: As `seams.minimum_cost_paths`.
         lines: As `runs.lines`.
         measure: As `finger_lines.measure`.

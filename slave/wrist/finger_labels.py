@@ -3,7 +3,7 @@
 By where each part lies on the laser's plane, where the seams cannot be right.
 
 A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
-axis of its own (`LaserWorkspace.place`), even where seams lie in another valley. A wrist that deviates by 5 degrees
+axis of its own (`LaserWorkspace.place`), even where seams lie in another minimum. A wrist that deviates by 5 degrees
 moves all of them by half a finger, and a palm that holds something does not show it; but where four lines lie side by
 side their middle is between the second and the third. The thumb crosses the plane near its MCP or beside the palm:
 what lies as near to its root is its own, and what lies before the knuckles and farther away than that never is.

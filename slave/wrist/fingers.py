@@ -3,12 +3,12 @@
 Seams of least energy by dynamic programming, as in Kim et al. 2012.
 
 How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
-fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.search_bands`). Along the
-stations of a corridor a seam is the path of least energy, found by dynamic programming: first the three among index
+fingers of this hand can do sets the search band of each of the four seams (`slave.wrist.search_bands`). Along the
+stations of a search band a seam is the path of least energy, found by dynamic programming: first the three among index
 ... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
-valley, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
+minimum, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
 ones, near the LEDs and far from them. The skin of a finger costs so much that no seam crosses one. Of paths alike the
-one nearer to the middle of its corridor is taken: in an image that shows nothing the seams are those of the hand's
+one nearer to the middle of its band is taken: in an image that shows nothing the seams are those of the hand's
 geometry alone.
 """
 
@@ -28,8 +28,8 @@ from slave.wrist.view import WristView
 
 _SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
-_SAME_MINIMUM = 0.35  # of the distance of two corridors, and of the rows of the hand
-_HALF_WIDTH = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
+_SAME_MINIMUM = 0.35  # of the distance of two search bands, and of the rows of the hand
+_HALF_WIDTH = 3.0  # samples of the thumb's search band: half the breadth of such a minimum
 _CREASE = np.ones((5, 5), dtype=np.uint8)
 
 

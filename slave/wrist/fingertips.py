@@ -3,9 +3,9 @@
 Postures that the laser allows are compared with what is seen.
 
 The laser gives a point of each finger's skin in space, and with it the abduction and one of the flexions: of the
-finger's table (`postures`) few rows are left. Each says how bright its samples would be; the scale of brightness comes
+finger's table (`postures`) few rows are left. Each predicts its samples' brightness; the scale of brightness comes
 from the laser points too, whose distance is known. The best ones are where the end of the finger may be, and its
-outline, measured at full resolution (`outline`), says which it is and where exactly.
+outline, measured at full resolution (`outline`), determines which it is and where exactly.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ CORRELATED = 2.5  # samples that differ for one reason
 LEAST_SHOWN = np.array([0.75, 0.6])
 MOST_RESIDUAL, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
-# the camera; and the misfit at which they are twice as large.
+# the camera; and the residual at which they are twice as large.
 PIXEL, SURFACE, PULP, COST_SCALE = 0.7, 0.05, 0.08, 20.0
 OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
@@ -148,7 +148,7 @@ class Hypotheses:
         abduction: (N,) by ABDUCTION_RAD.
         aside: (N,) how far the laser's point is beside where the posture has it [m].
         uv: (N, SAMPLES, 2) [px].
-        cost: (N,) of what the laser says.
+        cost: (N,) of the laser measurement.
     """
 
     table: Postures
@@ -165,7 +165,7 @@ def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32, Flo
 
     The fingers are (5, 2) [m]. Returns also the `abduction`, `aside` and `cost` of the rows.
 
-    The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser tells little of it, and rows
+    The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser measures little, and rows
     come in three abductions.
     """
     x, z = plane[1:, :1], plane[1:, 1:]
@@ -314,7 +314,7 @@ class Candidates:
         uv: (K, 2) [px].
         sigma_px: (K,).
         radius_px: (K,) of its outline.
-        misfit: (K,) minus twice the logarithm of its likelihood, by samples and outline.
+        residual: (K,) minus twice the logarithm of its likelihood, by samples and outline.
         shown: (K,) share of the outline that is seen.
         seen: (K,) probability that the finger itself leaves its end to be seen.
     """
@@ -438,7 +438,7 @@ def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
 
     The outlines lie `off` (M, 2) by `sigma` (M,), in radii.
 
-    An outline lies beside where it should be for abduction, which the laser tells, or for a twist of the finger.
+    An outline lies beside where it should be for abduction, which the laser measures, or for a twist of the finger.
     """
     table, rows, by = some.table, some.rows[which], some.abduction[which]
     radius = table.end[rows, :1].astype(np.float64)
@@ -484,7 +484,7 @@ def fingertips(
 
     Args:
         led: (H, W) difference of LED and ambient frame.
-        frame: (H, W) the LED frame itself, which says where the image is saturated.
+        frame: (H, W) the LED frame itself, which shows where the image is saturated.
         laser_uv: (5, 2) where the laser meets the fingers [px]; NaN: not seen, then its tip is not sought.
         view: Device and hand; the wrist is straight.
         search: The engine's.

@@ -9,11 +9,11 @@ ambient light that swings, explain:
     thin       much brighter, and in its column lower than 72 px: the line of the laser
     flash      thin, and brighter than both other frames: light that was there in one frame alone
 
-LEDs are told by broad light. The laser is told by a flash on what the LEDs light, or at its edge, and nowhere else: a
+LEDs are detected by broad light; the laser by a flash on what the LEDs light, or at its edge, and nowhere else: a
 window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
 hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds. Nothing is compared
 with a frame before them, so it does not matter what the ambient light was then.
-Where both frames are saturated neither is brighter: such cells tell nothing and are not counted.
+Where both frames are saturated neither is brighter: such cells measure nothing and are not counted.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ LASER_LEAST = 8  # cells of flash: the line on one finger
 LASER_OF_ELSEWHERE = 4.0  # of flash elsewhere
 LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
 LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
-VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
+VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Find the laser segment of each finger and its centroid (Kim et al. 2012).
 
 The line runs from side to side, so each column of the image holds it as short bright runs (`slave.wrist.runs`), one
-per surface. The seams say whose a line is; where they cut one, the cut is moved to the crease. What is left to each
+per surface. The seams assign a line; where they cut one, the cut is moved to the crease. What is left to each
 finger is measured (`slave.wrist.finger_lines`).
 """
 

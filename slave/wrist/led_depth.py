@@ -71,7 +71,7 @@ def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px:
 
     Within a radius [px], of nearness (h, w).
 
-    The nearest faces the camera, so it is the least inclined. NaN: too dark to tell.
+    The nearest faces the camera, so it is the least inclined. NaN: too dark to measure.
     """
     row, column, reach = round(v / SHRINK), round(u / SHRINK), max(round(radius_px / SHRINK), 1)
     about = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))

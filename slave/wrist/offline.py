@@ -2,7 +2,7 @@
 
 Deterministic, without clock or network, a row per strobe cycle.
 
-What the recording says of the illumination of a frame is not used: the strobe tells it from the frames. Where the two
+The illumination label of a frame in the recording is not used: the strobe estimates it from the frames. Where the two
 disagree it is counted, because one of them is wrong then.
 """
 
@@ -73,10 +73,10 @@ class WristRecordingFound:
     """A recording of a wrist camera, detected.
 
     Attributes:
-        detections: A row per triple.
+        detections: A row per strobe cycle.
         frames: Frames read.
         counts: What the strobe counted: event -> how often.
-        mislabelled: Frames of recognised triples that frames.csv says were lit otherwise.
+        mislabelled: Frames of recognised strobe cycles that were lit otherwise by frames.csv.
     """
 
     detections: RecordedWristDetections

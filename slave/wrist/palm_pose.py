@@ -3,14 +3,14 @@
 Found in each LED image, with a straight wrist as prior.
 
 The device sits on the forearm. A bent wrist turns the palm in the image, ten degrees aside by nearly the breadth of a
-finger, so that what a straight wrist says of roots and corridors names the neighbour. Two things of the palm are plain
+finger, so that roots and search bands of a straight wrist name the neighbour. Two things of the palm are plain
 whatever the fingers do: up to the webs the skin is whole, beyond them a gap or a crease parts every two fingers; and
-along the little finger's side skin ends. Each of some hundred bends says where in the image both would be, and what is
+along the little finger's side skin ends. Each of some hundred bends predicts where in the image both are, and what is
 seen there is compared (contrast of the roots of light, so that neither distance nor power of the LEDs matters):
 
     E(bend) = gaps beyond the webs - gaps below them + edges at the sides, less (bend / usual bend)^2 / 2
 
-Of a triple alone, nothing is kept. Where the image does not say so clearly that it is bent, the wrist is straight.
+Of a strobe cycle alone, nothing is kept. Where the image does not clearly show that it is bent, the wrist is straight.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees
 _TYPICAL_RAD = np.radians((15.0, 8.0))  # standard deviations of the prior
 _EVIDENCE = 14.0  # logarithm of probability per unit of E
-_TOP = 0.4  # contrast that an open gap exceeds: a deeper one says no more
+_TOP = 0.4  # contrast that an open gap exceeds: a deeper one adds no evidence
 _DARK = np.float32(2.0)  # root of grey levels: noise
 _WEB = 0.4  # of the proximal phalanx: where the webs end (`search_bands`)
 _BELOW_M = (-16e-3, -11e-3, -6e-3, -1e-3)  # of that: whole skin
@@ -42,12 +42,12 @@ _METACARPAL, _LITTLE, _INDEX = (
     (0.2, 0.4),
 )  # along these bones
 _EDGE_WEIGHT = 0.125
-# A bend is believed that shows so much of what it should, and is so much more probable than a straight wrist: fists
+# A bend is accepted that shows so much of what it should, and is so much more probable than a straight wrist: fists
 # have gaps of their own. One that shows less of it must be more probable.
 _ACCEPTED = ((0.6, 3.0), (0.45, 5.0))
 # So little changes no name, and webs of one hand lie that much beside those of the next.
 _NEAR_STRAIGHT_RAD = 1.01 * STEP_RAD * np.array([3.0, 1.0])
-_VIEW_STEPS = np.array([4, 1])  # steps between two views that corridors and reach are made for
+_VIEW_STEPS = np.array([4, 1])  # steps between two views that search bands and reach are made for
 _MOST_VIEWS = np.array([1, 3])  # on either side of the straight one
 
 
@@ -58,7 +58,7 @@ class PalmPose:
     Attributes:
         wrist_angles_rad: (2,) bend of the wrist (`common.wrist_joint`).
         T_camera_palm: (4, 4) with it [m].
-        view: One as if the palm lay about like that: what corridors and reach are made of.
+        view: One as if the palm lay about like that: what search bands and reach are made of.
     """
 
     wrist_angles_rad: Float

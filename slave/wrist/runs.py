@@ -3,7 +3,7 @@
 Rows are known to parts of a pixel. Lines are the laser segments of Kim et al. 2012.
 
 A run's row is its centre of mass above a share of its own peak: a line that saturates has a flat top and a glow on
-either side of it, and only the flanks of the top tell where it is. Runs of adjacent columns are one line where they
+either side of it, and only the flanks of the top measure where it is. Runs of adjacent columns are one line where they
 overlap; a jump is the border of another surface.
 """
 

@@ -2,7 +2,7 @@
 
 By dynamic programming from both of their ends.
 
-The two halves of every corridor lie beside each other in one array, so that one loop over half of the stations serves
+The two halves of every search band lie side by side in one array, so that one loop over half of the stations serves
 all. Which way each sample was reached is then worked out for the whole array in a few passes, and going back along a
 path only reads it.
 """
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from common.arrays import Int
 
-FENCE = 1e6  # energy of samples between corridors, two or more: no path leaves its own
+FENCE = 1e6  # energy of samples between search bands, two or more: no path leaves its own
 STEP_COST = np.float32(0.02)  # energy of a step aside between stations
 _MOVES = (
     (-1, STEP_COST),
@@ -31,8 +31,8 @@ def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
     As its sample at every station; at most two aside a step.
 
     Args:
-        energy: (S, K), the corridors side by side, `FENCE` at both ends of each.
-        widths: Samples of each of the C corridors, K in all.
+        energy: (S, K), the search bands side by side, `FENCE` at both ends of each.
+        widths: Samples of each of the C search bands, K in all.
     """
     stations, whole = energy.shape
     half = (stations + 1) // 2

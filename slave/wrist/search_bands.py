@@ -3,7 +3,7 @@
 Made once, from what its fingers can do.
 
 The three seams among index ... little have rows of the image as stations, the thumb's has circles about the thumb's
-root (CMC). A corridor is a middle and a half width at each station, in pixels along the row or in radians along the
+root (CMC). A search band is a middle and a half width at each station, in pixels along the row or in radians along the
 circle, from a sweep of the hand model through the ranges of its joints.
 """
 
@@ -31,14 +31,14 @@ Float32 = npt.NDArray[np.float32]
 
 STATION_PX = 10.0
 _FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
-_UNUSED_PX = 80.0  # rows left out: the fingers end below the upper edge of the image
+_UNUSED_PX = 80.0  # rows not used: the fingers end below the upper edge of the image
 LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
-MARGIN = 12  # samples beyond either edge of a corridor: about a finger's breadth
+MARGIN = 12  # samples beyond either edge of a search band: about a finger's breadth
 _NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
-_RARE = 0.02  # share of the postures of a sweep left out at either end
+_RARE = 0.02  # share of the postures of a sweep rejected at either end
 _OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
 _LEAST_OF_SPACING = 0.25
-_MOST_OF_SPACING = 0.7  # half width of a corridor, in spacings of fingers: beyond lies another seam
+_MOST_OF_SPACING = 0.7  # half width of a search band, in spacings of fingers: beyond lies another seam
 _WEB = 0.4  # of the proximal phalanx: where the webs between the fingers end, and the palm begins
 _WEB_OFF_M = 4e-3  # how far the palm may lie from where it is thought to: 3 degrees at the knuckles
 _OF_PALM = 0.05  # weight of what the palm shows, against fingers
@@ -55,12 +55,12 @@ class SearchBands:
         root: (2,) the thumb's root in the image [px]; angles about it are `angle_of`.
         up: (2,) image direction of angle 0, from the root to the middle finger's knuckle.
         thumb_side: +1.0 where the thumb is to the right in the image, -1.0 to the left.
-        middle: (4, S) middle of each corridor: u [px], or angle [rad].
+        middle: (4, S) middle of each search band: u [px], or angle [rad].
         half: (4, S) half width.
         weight: (S, sum of the first three LATERAL + 2 MARGIN each) of what the image shows there: little on the palm,
             whose skin every seam must cross, and one farther aside less of it than one between fingers.
         thumb_crosses: How many of the circles the thumb crosses however it is held.
-        map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the image, float32; the corridors side
+        map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the image, float32; the search bands side
             by side, each with its margins.
         palm: (P, 2) columns and rows of the image where the palm is; none where the image does not show it.
     """

@@ -4,17 +4,17 @@ The frames are joined to strobe cycles.
 
 The strobe is that of Kim et al. 2012.
 
-Three frames are a triple if
+Three frames are a strobe cycle if
 
     1. each followed the one before by one period, by time and by counter,
     2. they show ambient, laser, LED with a margin above 0 (`illumination.evidence`),
-    3. the triple before them, given or not, had the same place in the cycle, which is three periods long.
+    3. the strobe cycle before them, accepted or not, had the same phase, three periods earlier.
 
-Each three frames are looked at by themselves, so that ambient light which is switched costs the triple that it is
+Each three frames are classified by themselves, so that ambient light which is switched costs the cycle that it is
 switched in, and no other. The last rule is for pictures that were exchanged while their times were not: after two such
 swaps A1 L1 E0 may follow one another, of the right kinds and of two poses, but not where the cycle has them. A cycle
-that has slipped (a frame lost or added that no time tells of) is known anew with its second triple. Counting thus only
-ever takes triples away. A frame that is a copy of the one before, pixel by pixel, is left out.
+that has slipped (a frame lost or added, unseen in the times) is known anew with its second cycle. Counting thus only
+ever rejects cycles. A frame that is a copy of the one before, pixel by pixel, is dropped.
 """
 
 from collections import Counter
@@ -63,21 +63,21 @@ class Strobe:
 
     Attributes:
         counts: Event -> how often since the start.
-            triples: given.
-            doubled: frames that are copies of the frame before, left out.
+            cycles: accepted.
+            doubled: frames that are copies of the frame before, dropped.
             gaps: frames that do not follow the one before by one period.
-            out_of_step: triples elsewhere in the cycle than the one before, not given; cycles with the LEDs on in
-                another frame than the last, or, after a triple, in none.
-            unsure: other cycles of three frames that are no triple.
+            out_of_step: cycles of another phase than the one before, not accepted; cycles with the LEDs on in
+                another frame than the last, or, after a strobe cycle, in none.
+            unsure: other groups of three frames that are no strobe cycle.
             unlit: cycles more in which the LEDs light nothing: there is no hand.
-        margin: Of the last triple, given or not [octaves]; NaN: none yet.
+        margin: Of the last strobe cycle, accepted or not [octaves]; NaN: none yet.
     """
 
     def __init__(self, frame_rate_hz: float) -> None:
         """Start with no frame and no cycle.
 
         Args:
-            frame_rate_hz: Of the camera file: single frames per second, three per triple.
+            frame_rate_hz: Of the camera file: single frames per second, three per strobe cycle.
         """
         self._period_ns = 1e9 / frame_rate_hz
         self._seen: list[_Seen] = []

@@ -35,7 +35,7 @@ class LaserCurve:
         rays: Unit directions (K, 3) from the laser's origin, along the fan.
         points: (K, 3) [m], camera frame.
         body: Which body is lit (K,).
-        group, segment: As `HandCapsules.parts` says (K,).
+        group, segment: As in `HandCapsules.parts` (K,).
         seen: Whether the camera sees it (K,).
         joined: (K,) whether it and the next one are neighbours on one part of the hand.
     """

@@ -2,8 +2,8 @@
 
 It is written as a recording; the order of the frames can be spoiled.
 
-The form is that of every recording of a wrist device: strobed triples in the order ambient, laser, LED, and a truth
-with one row per triple, under the keys of rendered recordings.
+The form is that of every recording of a wrist device: strobe cycles in the order ambient, laser, LED, and a truth
+with one row per strobe cycle, under the keys of rendered recordings.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -86,12 +86,12 @@ def record_wrist(
     Args:
         folder: New or empty.
         scene: What to render.
-        seconds: How long [s]; at least one triple is written.
+        seconds: How long [s]; at least one strobe cycle is written.
         start_s: Scene time of the first frame [s].
-        poses_s: Scene times [s] instead: every triple is a pose of its own, in which the hand stands still.
+        poses_s: Scene times [s] instead: every strobe cycle is a pose of its own, in which the hand stands still.
         faults: Makes of all frames those that are delivered, such as `with_faults`; stamps and numbers go on rising.
         step: Pixels between the rays that shade skin (`WristRenderer`).
-        rig: What the manifest says of the device; None: the truth.
+        rig: The device by its manifest; None: the truth.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.

@@ -27,7 +27,7 @@ LIVE_STEP = 4
 LIVE_WRIST_RAD = np.radians(
     0.25
 )  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
-_ILLUMINATIONS = tuple(Illumination)  # frames of one instant differ in their noise, too
+_ILLUMINATIONS = tuple(Illumination)  # frames of one strobe cycle differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 

@@ -39,7 +39,7 @@ class WristTruth:
     In the frame of the wrist camera; groups palm, thumb ... little, thenar.
 
     Attributes:
-        t_s: The instant [s], scene time.
+        t_s: Time [s], scene time.
         angles_rad: (5, 4).
         joints: All joints, camera frame.
         laser_uv: (7, 2) centroid [px] of the lit and seen part of the laser line, by its length in the image; NaN

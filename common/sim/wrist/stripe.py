@@ -4,7 +4,7 @@ Its exact curve widened by the thickness of the sheet, with the glow of the skin
 
 A lit point moves along its ray by s where the sheet is looked at h off its middle: the point stays on the skin when
 n . (h m + s r) = 0, with n the normal of the skin, m that of the sheet, r the ray. So each piece between two rays is a
-ribbon of parallelograms, each as bright as Gauss's curve says and as large as its picture.
+ribbon of parallelograms, each as bright as the Gaussian profile gives and as large as its picture.
 """
 
 import cv2

@@ -13,7 +13,7 @@ from common.arrays import Float
 from common.sim.held import Cylinder
 from common.tapered_capsules import Capsules
 
-ALBEDO = 0.05  # of matt black paint or rubber in the near infrared, against usual skin
+ALBEDO = 0.05  # of matt black coating or rubber in the near infrared, against usual skin
 
 
 def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:

@@ -127,7 +127,7 @@ def _robust(
     bundle = Bundle(lens[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn))
     free = np.ones((1, 9), dtype=np.bool_)
     free[0, 8] = False
-    # From a lens without distortion everything is wrong a little: k1 must be found before outliers can be told.
+    # From a lens without distortion everything is wrong a little: k1 must be found before outliers can be detected.
     for _ in range(3 if first else 1):
         residuals = [seen_.uv - predict(bundle, seen_) for seen_ in observations]
         # The median of a two-dimensional normal distance is 1.1774 standard deviations.

@@ -47,7 +47,7 @@ def page_for(board: Board, paper: str) -> Page:
     """The board in the middle of the paper, laid whichever way it fits.
 
     Raises:
-        CalibrationError: No such paper, or the board does not fit; the text says how large it may be.
+        CalibrationError: No such paper, or the board does not fit; the message states how large it may be.
     """
     if paper not in PAPERS_MM:
         raise CalibrationError(f"--paper {paper!r}: there are {', '.join(PAPERS_MM)}")

@@ -123,7 +123,7 @@ def orderings(board: Board) -> tuple[Int, ...]:
 
     Orders (N,) of corner numbers, the unrotated one first.
 
-    A ChArUco board has one. A checkerboard with an odd sum of columns and rows has one too, because its colours tell
+    A ChArUco board has one. A checkerboard with an odd sum of columns and rows has one too, because its colours set
     its ends apart; other checkerboards look the same after half a turn, square ones also after a quarter.
     """
     rows, columns = grid_shape(board)

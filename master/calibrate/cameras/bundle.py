@@ -127,7 +127,7 @@ def solve(
         observations: At least one; every view of `start` is in one of them.
         start: Near the optimum.
         free: What to estimate.
-        cauchy_px: Residual [px] at which a corner begins to lose its say; None: plain least squares.
+        cauchy_px: Residual [px] at which a corner begins to lose its weight; None: plain least squares.
         sigma_px: Standard deviation of a corner [px], against which the prior of the shape is weighed.
 
     What the observations do not determine has an enormous standard deviation in the result.

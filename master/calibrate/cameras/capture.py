@@ -28,7 +28,7 @@ from master.ingest import Ingest
 ROUND_S = 0.3
 ANSWER_NS = 1_000_000_000
 _ASK_S = 0.5
-_LOG_NS = 2_000_000_000  # the same words are not said more often
+_LOG_NS = 2_000_000_000  # the same text is not logged more often
 NOTES = "capture.json"
 
 
@@ -66,7 +66,7 @@ def capture(
         folder: Where CAMERA/NUMBER.jpg go, as they came; made by `new_folder`.
         wanted: Views to keep.
         stop: Ends it early.
-        say: Called with what the person should read.
+        notify: Called with what the person should read.
         advise: Called after each view that was kept: what is still missing.
 
     Raises:
@@ -102,7 +102,7 @@ class StillTaker:
     def __init__(self, bus: Bus, ingest: Ingest, sizes: Mapping[str, Size]) -> None:
         """Listen for stills from now on.
 
-        Of the cameras in `sizes`, whose files say these widths and heights [px].
+        Of the cameras in `sizes`, whose files state these widths and heights [px].
         """
         self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
         self._cameras = tuple(sizes)

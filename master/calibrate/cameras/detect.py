@@ -1,6 +1,6 @@
 """Finds a board's corners in one image, to a fraction of a pixel.
 
-Checkerboards: OpenCV's classic finder, where it fails the sector-based one; both only say where the corners are about.
+Checkerboards: OpenCV's classic finder, where it fails the sector-based one; both only locate the corners roughly.
 The place is refined by `cornerSubPix` in a window of half the distance to the next grid line, which on rendered
 boards is twice as good as the sector-based finder's own (0.05 against 0.10 px). Corners of the outermost row look
 out on squares that print shops and scissors often cut to half; their window is smaller. On a ChArUco board the window

@@ -22,7 +22,7 @@ def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_p
     The middle one: up to half of the images may be wrong altogether.
 
     Args:
-        sightings: Numbers (n,) and places (n, 2) [px] of the corners of each image.
+        observations: Numbers (n,) and places (n, 2) [px] of the corners of each image.
         drawn_m: Corners of the board (N, 3) [m].
         size_px: Width and height of the images.
     """

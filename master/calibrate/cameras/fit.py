@@ -82,7 +82,7 @@ def fit_cameras(
             one that predicts views better that were held out of the fit, flat where that is not certain.
 
     Raises:
-        FitError: The views do not determine what is asked for; the text says what is missing.
+        FitError: The views do not determine what is asked for; the message states what is missing.
     """
     held = held or {}
     alone = {camera: fit_alone(views, camera, held.get(camera)) for camera in views.cameras}

@@ -22,7 +22,9 @@ from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, solve
 from master.calibrate.cameras.judge import Seen, Shot, place_boards
 
-MIN_VIEWS = 8  # dealt into five folds they leave six to fit: fewer cannot tell a bent board from a bent lens
+MIN_VIEWS = (
+    8  # dealt into five folds they leave six to fit: fewer cannot distinguish a bent board from a bent lens
+)
 CHANCE = 0.01  # that a flat board is taken for a bent one
 _FOLDS = 5  # Hastie et al., section 7.10: five or ten
 _MIN_IMAGES = 3  # of each camera in every fit: three views determine a lens

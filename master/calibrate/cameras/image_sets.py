@@ -64,7 +64,7 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[str, dict[str, Path]]:
-    """Camera -> rest of the name -> file; files of other cameras are left out."""
+    """Camera -> rest of the name -> file; files of other cameras are ignored."""
     prefixes = sorted({_NUMBER.sub("", file.stem) for file in files} - {""})
     names = list(cameras) or prefixes
     if len(names) == 1 and not any(file.stem.startswith(names[0]) for file in files) and len(prefixes) <= 1:

@@ -2,7 +2,7 @@
 
 An image is judged by its own camera, whatever the others saw: one that fails is not used at all. A view is judged by
 whether its cameras agree on where the board is: where they do not, the board moved between the exposures or images of
-two instants were put together. Such images are good in themselves, so each still helps the lens of its own camera.
+two epochs were put together. Such images are good in themselves, so each still helps the lens of its own camera.
 """
 
 from collections.abc import Mapping, Sequence

@@ -62,7 +62,7 @@ class CamerasResult:
         shape_mm: How far the board's corners are from the drawn ones, in its plane and out of it, root mean square.
         pairs: Audit of each two cameras that share views.
         views: Number of views that cameras share; one camera: of all.
-        rejected: What was left out, and why.
+        rejected: What was excluded, and why.
     """
 
     lenses: Mapping[str, LensResult]

@@ -18,7 +18,7 @@ class View:
 
     Attributes:
         name: How the view is called in reports, such as "07".
-        sightings: Camera -> the board in its image; a camera that did not see it is absent.
+        observations: Camera -> the board in its image; a camera that did not see it is absent.
     """
 
     name: str
@@ -67,7 +67,7 @@ def look(
 
     Raises:
         FitError: There is no image, images of one camera differ in size, or the board is in none of them; then the
-            text says which board was looked for, and which one is there instead, if one was recognised.
+            message states which board was looked for, and which one is there instead, if one was recognised.
     """
     sizes: dict[str, tuple[int, int]] = {}
     views: list[View] = []

@@ -108,7 +108,7 @@ def measured_from(
     """The sweep of a recording or a table.
 
     Raises:
-        PhalanxError: What the user gave does not make one; the text says what is missing.
+        PhalanxError: What the user gave does not make one; the message states what is missing.
     """
     if source is None:
         raise CalibrationError("what to read is missing: give the folder of a recording, a .csv, or --live")

@@ -40,7 +40,7 @@ def draw_errors(
         title: Heading.
         distance_m: (N,) [m], rising.
         errors: Model -> relative error of depth (N,).
-        used: (N,) False: shown hollow, left out of a fit.
+        used: (N,) False: shown hollow, rejected from a fit.
         band: (N,) standard deviation to be expected, relative.
 
     Raises:

@@ -30,7 +30,7 @@ class DepthReport:
 
     Attributes:
         sweep: What was measured, nearest first.
-        used: (N,) False: contradicts the others and was left out of the fits.
+        used: (N,) False: contradicts the others and was rejected from the fits.
         power_law, affine_disparity: Fitted.
         errors: Law -> relative error of depth (N,), of the laws before the fit and after.
         rejected: Fitted law -> relative error (K,) of each used point by the law of the others.

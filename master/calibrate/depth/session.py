@@ -120,7 +120,7 @@ def measure(
     """Read the target that stands before the cameras now.
 
     Raises:
-        FitError: It did not stand still, or was not seen, for ten seconds; says which.
+        FitError: It did not stand still, or was not seen, for ten seconds; the message states which.
     """
     while source.get(0.0) is not None:  # what was seen while it was being put there
         pass
@@ -161,7 +161,7 @@ def run_session(
         seconds: Time over which, at least.
         clock: The master's.
         ask: Shows a prompt and returns the answer; None: nobody answers any more.
-        say: Called with one line for each result.
+        notify: Called with one line for each result.
         progress: Called with the share of a reading that is done.
         keep: Given the sweep so far after each reading, to save it.
 

@@ -60,7 +60,7 @@ class Measured:
         sweep: Unchecked, as measured but for the lens' shift of the centroids.
         pair: The cameras.
         data: Names of what it was read from, for the provenance.
-        about: One line that says what it is.
+        about: One line that describes it.
     """
 
     sweep: Sweep
@@ -162,7 +162,7 @@ def from_recording(
         outline: Shape of the target, see `blob_bias`.
 
     Raises:
-        RecordingError, CalibrationError: Something is missing; the text says how to make it.
+        RecordingError, CalibrationError: Something is missing; the message states how to make it.
     """
     recording = open_recording(folder)
     pair = pair_for(recording)

@@ -2,7 +2,7 @@
 
 Also checks what makes a sweep unfit for a fit.
 
-Refused is what would give a law that looks well and is not: see `checked`. Every refusal names the points and says
+Refused is what would give a law that looks well and is not: see `checked`. Every refusal names the points and states
 what to do.
 """
 
@@ -14,11 +14,11 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
 
-POINTS = 8  # two constants, and enough points to tell a wrong one from the others; the paper has 17
+POINTS = 8  # two constants, and enough points to distinguish a wrong one from the others; the paper has 17
 RANGE = 2.5  # farthest over nearest distance; the paper has 5
 IN_EACH_HALF = 2  # points nearer, and farther, than the geometric middle of the range
 FARTHEST_M = 10.0  # beyond it, 75 mm of baseline give less than 4 px: these are centimetres
-SAME_M = 0.0005  # distances that a ruler does not tell apart
+SAME_M = 0.0005  # distances that a ruler does not distinguish
 RULER_M = 0.002  # to which a target can be put back to a mark
 DISAGREE_PX = 0.5  # five standard deviations of a disparity from two centroids of 0.07 px
 _WHOLE = 0.85  # area x distance^2 of a target that faces the cameras is constant; a tilt by 30 deg costs 13 %
@@ -121,7 +121,7 @@ def check_enough(sweep: Sweep) -> None:
     Too few, too near each other, or all at one end.
 
     Raises:
-        FitError: Says what is missing.
+        FitError: The message states what is missing.
     """
     if sweep.size < POINTS:
         raise FitError(

@@ -96,7 +96,7 @@ def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, 
         sweep: Nearest first.
         laws: Laws of raw disparity.
         cameras: The calibrated pair, for the full stereo model; None: not calibrated.
-        noise: Its sigma is taken where the sweep does not say how much its disparities scatter.
+        noise: Its sigma is taken where the sweep does not report how much its disparities scatter.
     """
     d = sweep.distance_m
     errors = {name: law.depth(sweep.disparity_px) - d for name, law in laws.items()}

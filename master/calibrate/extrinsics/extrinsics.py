@@ -2,7 +2,7 @@
 
 Estimated from ten seconds that marker rig and device see together.
 
-What is made of it is in `start`, `fit` and `unknown`, what is told of it in `report`; here are what goes in and out.
+What is made of it is in `start`, `fit` and `unknown`, what is printed of it in `report`; here is what goes in and out.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ MOTION = (
     "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
     " forearm about all its axes, before the marker cameras"
 )
-_MOST = 200  # triples: more of the same motion add time, not knowledge
+_MOST = 200  # strobe cycles: more of the same motion add time, not information
 _FEWEST, _LEAST_S = 60, 5.0
 _LINES_OF_SIGHT = 2  # fingers with a laser point or a tip
 _MARKERS = 4
@@ -83,7 +83,7 @@ def calibrate_extrinsics(
         source: Name of the data, for the provenance.
 
     Raises:
-        FitError: The motion was not done, or not seen, or does not tell the mounting; the text says what to do.
+        FitError: The motion was not done, not seen, or does not fix the mounting; the message states what to do.
         CalibrationError: The rig lacks its laser plane, palm pose or IMU.
     """
     if rig.imu is None:

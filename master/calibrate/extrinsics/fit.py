@@ -14,7 +14,7 @@ from master.calibrate.extrinsics.seen import Fit, StrobeCycles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 from master.calibrate.extrinsics.unknown import Unknown
 
-_COARSE, _COARSE_ROUNDS = 40, (4, 4, 4)  # instants and steps of a first look
+_COARSE, _COARSE_ROUNDS = 40, (4, 4, 4)  # epochs and steps of a first look
 _ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
 
 

@@ -2,7 +2,7 @@
 
 Given markers and posture priors.
 
-The residuals are the markers' distances, whitened by their covariances; habits add a quadratic of the free angles.
+The residuals are the markers' distances, whitened by their covariances; priors add a quadratic of the free angles.
 The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.body_points` has it.
 """
 
@@ -56,7 +56,7 @@ class HandProblem:
     Attributes:
         model: The hand.
         markers: The M markers on it.
-        habits: Those of one hypothesis.
+        posture_prior: Those of one hypothesis.
         points_m: (T, M, 3) [m] where markers were seen, rig frame.
         whiten: (T, M, 3, 3) inverse square roots of their covariances [1/m]; 0: not seen.
     """

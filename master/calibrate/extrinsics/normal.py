@@ -13,7 +13,7 @@ from master.calibrate.extrinsics.unknown import CAMERA_LATE, UNKNOWN
 from master.estimator.parameters import HandParameters
 
 _DIFFERENCE_STEP = 1e-5
-_NOTHING = 1e-9  # information of what nothing tells
+_NOTHING = 1e-9  # information of what nothing constrains
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,10 +2,10 @@
 
 Given what marker rig, wrist camera and IMU saw of one motion.
 
-Unknown in each instant is the hand, palm and fingers, as markers and the loosest habits have it (`hands`); all instants
+Unknown in each epoch is the hand, palm and fingers, as markers and the widest priors have it (`hands`); all epochs
 share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
 
-- **markers**, where they were at that instant of the rig's clock;
+- **markers**, where they were at that epoch of the rig's clock;
 - **laser points and tips**, of the palm as it lies before the camera. Camera and IMU are one body, so that is
 
       R_camera_palm = R_camera_imu (R_rig_world R_world_imu)' R_rig_palm
@@ -16,9 +16,9 @@ share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
   (`common.wrist_joint`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
-The hand of each instant is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
-Marquardt; sights that stray are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
-all instants of a second together count as a few.
+The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
+Marquardt; outliers are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
+all epochs of a second together count as a few.
 """
 
 from collections.abc import Sequence
@@ -56,10 +56,10 @@ from master.estimator.priors import PosturePrior, posture_prior_of
 
 _SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
 _CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
-_PRIOR_SHARE = 1e-2  # of their information: what sensors tell is to count
+_PRIOR_SHARE = 1e-2  # of their information: what sensors measure is to count
 _TWIST_RAD = np.radians(1.0)
 _WRIST_RAD = np.radians(15.0)
-_PER_S = 4.0  # independent instants
+_PER_S = 4.0  # independent epochs
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
 _EYE = np.eye(3)

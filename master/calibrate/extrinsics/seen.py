@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.calibrate.extrinsics.unknown import Unknown
 
-STRAYS = 2.5  # standard deviations from which a sight is believed less
+STRAYS = 2.5  # standard deviations from which an observation is down-weighted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Fit:
     Attributes:
         unknown: It.
         covariance: (UNKNOWN, UNKNOWN) of steps on it.
-        wrist_angles_rad: (T, 2) flexion and deviation of the wrist in each triple.
+        wrist_angles_rad: (T, 2) flexion and deviation of the wrist in each strobe cycle.
         twist_rad: (T,) what no wrist does.
         off: (T, 4, SEEN) seen minus fitted, in standard deviations; NaN: not seen.
         sigma: (T, 4, SEEN) these [m, px].

@@ -7,11 +7,11 @@ two constant turns. In quaternions the sum of the cosines of half of what is lef
 
     sum_t <q_rig_palm, q_rig_world q_world_imu q_imu_palm> = q_rig_world' M q_imu_palm,
 
-so the first singular vectors of M (4, 4) are the turns, and its singular value tells how well the two tracks agree: it
+so the first singular vectors of M (4, 4) are the turns, and its singular value is how well the two tracks agree: it
 is greatest where the IMU's clock is right.
 
 **Tips.** Camera and IMU are one body, which is carried by the wrist joint. So where the camera should see a marker on a
-fingertip is told by markers and IMU, however the wrist is bent and fingers are. The camera's clock is right where the
+fingertip is given by markers and IMU, however the wrist is bent and fingers are. The camera's clock is right where the
 tips that it sees move as these do.
 """
 
@@ -27,7 +27,7 @@ from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 from master.calibrate.extrinsics.unknown import Unknown
 
 _SEARCH_S = np.arange(-0.12, 0.1201, 0.01)
-_FEWEST = 20  # instants
+_FEWEST = 20  # epochs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Start:
     Attributes:
         T_camera_palm: (4, 4) of the rig file.
         R_palm_imu, R_rig_world: (3, 3).
-        imu_late_s, camera_late_s: How much later the samples, the frames are than their stamps say.
+        imu_late_s, camera_late_s: How much later the samples, the frames are than their stamps state.
     """
 
     T_camera_palm: Float
@@ -74,7 +74,7 @@ def started(
 
     Args:
         hand, imu: What was seen of the hand, and felt.
-        tips_m: (N, 4, 3) the markers on index ... little of the hand's instants, rig frame; NaN: not seen.
+        tips_m: (N, 4, 3) the markers on index ... little of the hand's epochs, rig frame; NaN: not seen.
         optics: The wrist camera.
         T_camera_palm: (4, 4) first guess of the rig file.
         cycles: What was seen from the wrist.

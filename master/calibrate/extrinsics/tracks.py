@@ -2,8 +2,8 @@
 
 The hand's markers with how they move, and the IMU's rotation with its rate.
 
-Cameras, IMU and marker rig have no instants in common, and by how much their clocks differ is to be found. So markers
-and orientations are asked for at instants that shift while the fit goes on: each answer comes with its derivatives.
+Cameras, IMU and marker rig have no epochs in common, and by how much their clocks differ is to be found. So markers
+and orientations are queried at times that shift while the fit goes on: each answer comes with its derivatives.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rot
 from common.hand_model import WRIST, HandModel
 from common.messages import HandPose, ImuSample
 
-_NEAR_S = 0.08  # of an instant: fingers move smoothly for twice as long
+_NEAR_S = 0.08  # of an epoch: fingers move smoothly for twice as long
 _SUPPORT = 10  # frames to either side
 _TERMS, _NEIGHBOURS = 4, 2  # of a cubic; frames to each side that it needs
 _POOR_M = 0.03  # a cap of which so little is seen that its place is off by as much as this
@@ -96,7 +96,7 @@ class HandTrack:
 
         By a cubic through what was seen within 80 ms of each time.
 
-        One through four neighbours would pass on their noise to the speed, and both to the clock's error: triples are
+        One through four neighbours would pass on their noise to the speed, and both to the clock's error: cycles are
         often taken at the same share of the time between two frames.
         """
         near = self.nearest(t_s)
@@ -145,8 +145,8 @@ class ImuTrack:
 
     The orientation that comes with the samples leans by some degrees whenever the arm is accelerated, since gravity
     holds it; for ten seconds rates alone are better, once their errors are known. The two worlds agree in the middle.
-    Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row: what it says is too much by
-    zero + gain @ what it says.
+    Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row: what it reads is too much by
+    zero + gain @ what it reads.
 
     Attributes:
         t_s: (S,) [s], by its stamps.

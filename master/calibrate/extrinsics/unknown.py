@@ -23,7 +23,7 @@ _REACH_M = 2e-3
 class Unknown:
     """Unknowns that all epochs share.
 
-    Camera and IMU are one body, so their turn against each other is told by every motion; how both are turned against
+    Camera and IMU are one body, so their turn against each other is fixed by every motion; how both are turned against
     the palm of a straight wrist, by what the wrist does.
 
     Attributes:
@@ -32,7 +32,7 @@ class Unknown:
         R_forearm_imu: (3, 3) IMU axes -> forearm, which is the palm of a straight wrist.
         R_rig_world: (3, 3) the world of the IMU's track -> rig.
         gyro: (12,) errors of its gyroscope, as of `tracks.ImuTrack`.
-        camera_late_s, imu_late_s: How much later frames, samples are than their stamps say.
+        camera_late_s, imu_late_s: How much later frames, samples are than their stamps state.
         thick, reach_m: (4,) of the fingers, as of `lines_of_sight.LinesOfSight`.
     """
 

@@ -2,7 +2,7 @@
 
 Answers when the user did what.
 
-Users begin late, hurry and dawdle. So the markers are compared with those of a template hand that does the routine,
+Users begin late and vary their pace. So the markers are compared with those of a template hand that does the routine,
 and the two are matched monotonously in time (dynamic time warping: Sakoe & Chiba, 1978). The palm of the template is
 put where the flat hand is: the stretch of stillness whose markers fit the flat template best.
 """
@@ -19,7 +19,7 @@ from common.hand_routine import MOVES, ROUTINE_S, STEPS, posture_at
 from master.calibrate.hand.observed import Observed
 
 GRID_S = 0.1
-_FAR_M = 0.08  # farther off than this says no more
+_FAR_M = 0.08  # farther off than this carries no more information
 _TEMPO = 3  # the user's fastest, times the routine's
 _STEP_COST = 1e-5  # [m^2] of leaving the routine's tempo
 _STILL_S, _STILL_M = 0.4, 4e-3

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from common.arrays import Float, Int
 
-_WIDTH = 4  # coefficients that one instant depends on
+_WIDTH = 4  # coefficients that one epoch depends on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class Knots:
     Attributes:
         spacing_s: Between coefficients [s].
         time_s: (K,) middle of each coefficient's bump [s].
-        first: (T,) first of the four coefficients of each instant.
+        first: (T,) first of the four coefficients of each epoch.
         weight: (T, 4) theirs; they add up to one.
     """
 
@@ -94,7 +94,7 @@ class BorderedNormal:
         """Add residuals of every epoch.
 
         Args:
-            knots: Where the instants lie.
+            knots: Where the epochs lie.
             jacobian: (T, r, n) of the whitened residuals by the curves.
             by_constants: (T, r, g).
             off: (T, r) whitened: observed less predicted.

@@ -85,7 +85,7 @@ def _spread(problem: HandRoutineProblem, residual_m: Float) -> tuple[float, floa
     The factor is how much more the residual counts because neighbours in time err alike.
 
     Errors that last, such as a cap's hidden part, do not average out: with a correlation r from frame to frame, n
-    frames tell as much as n (1 - r) / (1 + r) independent ones.
+    frames carry as much information as n (1 - r) / (1 + r) independent ones.
     """
     whitened = (problem.whiten @ np.nan_to_num(residual_m)[..., None])[..., 0]
     seen = np.isfinite(residual_m[..., 0])

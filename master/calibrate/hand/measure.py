@@ -2,8 +2,8 @@
 
 Which lengths are measured, how well, and the profile with nothing made up.
 
-A length counts as measured when it is within 1 mm with 99 % certainty, and when the markers and not the beliefs say so.
-With caps on the tips alone the length of a finger is told, and often not its division: then the sum is measured, and
+A length counts as measured when it is within 1 mm with 99 % certainty, and by the markers, not by the priors.
+With caps on the tips alone the length of a finger is found, and often not its division: then the sum is measured, and
 its parts stay in the proportion of the template.
 """
 
@@ -27,14 +27,14 @@ from master.calibrate.hand.shape import PER_FINGER, Shape
 
 WITHIN_M = 1e-3
 CERTAIN = 2.576  # standard deviations of 99 %
-PRIOR_SHARE = 0.5  # of the sd before: more is told by beliefs
+PRIOR_SHARE = 0.5  # of the sd before: more comes from the priors
 BONES = ("proximal", "middle", "distal")
 THUMB_BONES = ("metacarpal", "proximal", "distal")
 _GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
 _SHORTEST_M, _LONGEST_M = 0.1, 0.25
 _OTHER_SIDE = 0.6  # the mirrored hand fits with this share of the distance: it is the other one
 _UNLIKE_M = 0.025
-_RESTLESS = 1.2  # times the wandering that is believed of a palm that rests
+_RESTLESS = 1.2  # times the wandering that is assumed of a palm that rests
 _WRIST_TO_CREASE = 1.0246  # the wrist joint of generated profiles lies behind the crease
 _FREE_WITH = 3  # markers on the back that measure the palm's pose
 
@@ -49,7 +49,7 @@ class Length:
         length_m: Fitted.
         scaled_m: As the template, scaled to this hand, has it.
         sigma_m: Posterior standard deviation.
-        before_m: That of the belief.
+        before_m: That of the prior.
     """
 
     finger: int
@@ -123,7 +123,7 @@ def measure_hand(
         progress: Called with the share that is done.
 
     Raises:
-        FitError: A step is missing, the palm moved, it is the other hand, or none at all; the text says what to do.
+        FitError: A step is missing, the palm moved, it is the other hand, or none; the message states what to do.
     """
     model = _scaled(observed, template, hand_length_m)
     alignment = align(observed, model)

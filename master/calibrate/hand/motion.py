@@ -3,8 +3,8 @@
 Bones and hinges from its joints, couplings where it is long enough.
 
 Bones are the mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
-(`common/hand_fitting.py`). What no motion capture tells is taken from the generated profile of the same length: radii,
-where the paint sits on the tips, where the marker on the back is.
+(`common/hand_fitting.py`). What no motion capture gives is taken from the generated profile of the same length: radii,
+where the marker sits on the tips, where the marker on the back is.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class MotionHand:
         profile: The hand file.
         motion: What it is from.
         palm: Its palm.
-        couplings: Its couplings; where it tells any, the profile has a posture prior, too.
+        couplings: Its couplings; where it determines any, the profile has a posture prior, too.
         bone_m, bone_sigma_m: (5, 3) [m] mean and spread over frames.
         frames: How many were used.
         length_m: From the wrist to the end of the middle finger.
@@ -67,12 +67,12 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     """Make a hand file of a motion.
 
     Args:
-        motion: Wrist and the four joints of each finger at least; its `side` None: as the geometry says.
+        motion: Wrist and the four joints of each finger at least; its `side` None: by the geometry.
         name: Of the hand.
 
     Raises:
         RecordingError: Joints are missing.
-        FitError: Too few good frames, no hand by its size, or the fingers do not tell which side is the back.
+        FitError: Too few good frames, no hand by its size, or the fingers do not determine which side is the back.
         CalibrationError: A finger never bends.
     """
     require(motion, _NEEDED, "a hand")

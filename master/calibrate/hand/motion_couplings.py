@@ -6,8 +6,8 @@ How the joints flex together: the couplings of the hand file.
 
 Zero is the straight finger in the palm's plane, which is where profiles from joints have it. Noise of the joints, which
 shows in bones that change their length, turns short bones; it is taken out of the spread. A DIP that keeps its ratio
-to half a degree was not measured: trackers make it from the PIP (the Leap does so). An MCP that strays by more than 25
-degrees has no habit: people bend it alone as well, and what was done in the recording says too little.
+to half a degree was not measured: trackers make it from the PIP (the Leap does so). An MCP that is off by more than 25
+degrees has no coupling: people bend it alone as well, and what was done in the recording constrains too little.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from common.hand_presets import preset_couplings
 MOVED_S = 20.0  # of movement, at least
 _MOVES_RAD_S = np.radians(10.0)
 _STEP_S = 0.1  # longer, two frames are no step
-_BENT_RAD = np.radians(15.0)  # the PIP, where it tells a ratio
+_BENT_RAD = np.radians(15.0)  # the PIP, where it determines a ratio
 _RANGE_RAD = np.radians(20.0)  # of the PIP from the 5th to the 95th hundredth, at least
 _MADE_RAD = np.radians(0.5)
 _NO_COUPLING_RAD = np.radians(25.0)
@@ -70,7 +70,7 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
 
     Args:
         angles_rad: (T, 5, 4) [rad] of `common.hand_posture.joint_angles`.
-        chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is told by bones that change.
+        chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is estimated from bones that change.
         t_ns: (T,) [ns] times.
     """
     angles = angles_rad[:, 1:, 1:]

@@ -5,7 +5,7 @@ Wrist, knuckles and the thumb's root are one rigid body, whose shape is the mean
 profile's, scaled: so it is the frame of all our hands, origin at the wrist, +z to the fingers, +y out of the back.
 
 Knuckles and wrist are nearly a plane, and a plane is its own mirror image: which side is the back, and so which hand it
-is, say the fingers. They bend into the palm, towards -y.
+is, follows from the fingers. They bend into the palm, towards -y.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     NaN: not seen. Of the given side, or of the side that the joints show.
 
     Raises:
-        FitError: The palm is never seen whole, or the fingers do not tell which side is the back.
+        FitError: The palm is never seen whole, or the fingers do not determine which side is the back.
     """
     mine = list(PALM_JOINTS)
     there = [joint for joint in mine if known(joints_m[:, joint]).mean() > 0.5]

@@ -27,7 +27,7 @@ class Priors:
         dip_ratio, thumb_ratio: Mean and sd of DIP per PIP, between Kalbfleisch's 2/3 and Kamper's 0.84, and of the
             thumb's IP per MCP.
         dip_bias_rad: Of the DIP of a finger whose PIP is straight.
-        dip_rad, thumb_dip_rad: By how much the DIP strays from that, slowly.
+        dip_rad, thumb_dip_rad: By how much the DIP drifts from that, slowly.
         straight_rad: Mean and sd of the PIP of a finger that is held straight.
         level_rad, moving_level_rad: Of an angle about what the routine asks for, while held and while it moves.
         held_rad_s: Wandering of a joint that is to be held [rad/sqrt(s)].

@@ -40,14 +40,14 @@ class HandRoutineProblem:
     Attributes:
         model: Template.
         cap_m: (5, 3) offsets of the caps in the frames of the tip joints.
-        prior: Shape that is believed.
+        prior: Prior shape.
         points_m: (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen.
         whiten: (T, 5 + B, 3, 3): whiten @ off has unit covariance.
         knots: Of the curves.
         targets: What the routine asks for at each of them.
         start: (4, 4) palm pose about which the curves are.
         palm_free: The palm may move, since it is measured.
-        beliefs: Widths.
+        priors: Widths.
     """
 
     model: HandModel

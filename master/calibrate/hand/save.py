@@ -15,7 +15,7 @@ from master.calibrate.hand.measure import CERTAIN, HandMeasurement, hand_length_
 from master.calibrate.tree_files import provenance
 
 TOOL = "calibrate hand"
-_QUICK = "rest_joints"  # says of a whole hand that it is only scaled
+_QUICK = "rest_joints"  # marks a whole hand that is only scaled
 
 
 def measured_profile(
@@ -26,7 +26,7 @@ def measured_profile(
     The parts of a measured sum keep the template's proportions.
 
     Args:
-        measurement: What the routine told.
+        measurement: What the routine measured.
         name: Of the new profile.
         data: Name of what it was measured from.
         dip_per_pip: The DIP's ratio that the lengths were measured with, if that was measured; None: the template's.

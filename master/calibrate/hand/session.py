@@ -65,7 +65,7 @@ def guide(
         tips: Rows of the five tips among the markers.
         names: Of the markers.
         clock: For the steps.
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
 
     Raises:
         FitError: No pose comes, or a step was not seen three times.

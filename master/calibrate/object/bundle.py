@@ -3,7 +3,7 @@
 One least-squares problem, from where the beads were.
 
 Minimised over beads q_b and poses R_t, p_t, with the covariances C of the points, which hold what the cameras' pixels
-told (a bundle adjustment, linear in the points: Triggs et al. 2000):
+measured (a bundle adjustment, linear in the points: Triggs et al. 2000):
 
     sum_tb  rho( e' C^-1 e ),   e = R_t q_b + p_t - x_tb
 
@@ -21,11 +21,11 @@ from common.errors import FitError
 from common.geometry import fit_rigid, rotation_vector_to_matrix, skew, transform
 from master.calibrate.object.seen import Seen
 
-_MOST = 1500  # instants: more of the same motion adds time, not knowledge
+_MOST = 1500  # epochs: more of the same motion adds time, not information
 _ROUNDS = 40
 _SETTLED_M = 1e-7
 _SOFT_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
-OUTLIER = 0.1  # weight below which a bead at an instant counts as a stray
+OUTLIER = 0.1  # weight below which a bead at an epoch counts as an outlier
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Bundle:
     """A rigid body that explains what was seen.
 
     Attributes:
-        seen: The instants that were used.
+        seen: The epochs that were used.
         beads_m: (B, 3) in a frame of its own.
         cov_m2: (3 B, 3 B) of the beads among each other, from the covariances of the points alone.
         T: (T, 4, 4) body -> rig.
@@ -69,7 +69,7 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
 
     Args:
         seen: The beads over time.
-        rows: Which instants; None: all that are usable, at most so many, spread.
+        rows: Which epochs; None: all that are usable, at most so many, spread.
 
     Raises:
         FitError: A bead is never seen together with two others whose places are known.
@@ -154,7 +154,7 @@ def _scale_2(chi: Float, known: Bool) -> float:
 
     1 at least, from chi-squares (T, B) by their median.
 
-    Of the 3 n numbers of an instant 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n numbers, whose
+    Of the 3 n numbers of an epoch 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n numbers, whose
     median follows by Wilson and Hilferty (1931).
     """
     own = chi[known]

@@ -10,10 +10,8 @@ from common.errors import FitError
 from common.geometry import fit_rigid, rigid, transform
 from common.object_profile import ObjectProfile
 
-LINE_M = (
-    5e-3  # from the line through the first two beads; nearer, they do not tell how it is turned about that
-)
-_LIKE_M = 0.015  # by which beads may lie elsewhere than the file says that the frame is taken from
+LINE_M = 5e-3  # from the line through the first two beads; nearer, they do not determine how it is turned about that
+_LIKE_M = 0.015  # by which beads may lie elsewhere than in the file that the frame is taken from
 OWN = (
     "origin in the middle of the beads, x from the first to the second, y to the side of the one farthest from that"
     " line"

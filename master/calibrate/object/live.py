@@ -22,7 +22,7 @@ def observe_live(
         rig: That it runs.
         names: Of the beads.
         longest_s: How long the motion may take [s].
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
 
     Raises:
         BusError: Nobody listens there.
@@ -35,7 +35,7 @@ def observe_live(
 
         def receive(timeout_s: float) -> HandPose | None:
             message = poses.get(timeout_s)
-            # A wrist device alone tells of hands without markers.
+            # A wrist device alone reports hands without markers.
             return message if isinstance(message, HandPose) and len(message.markers_raw_m) else None
 
         return guide(receive, rig, names, SystemClock(), notify, longest_s)

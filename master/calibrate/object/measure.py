@@ -20,7 +20,7 @@ MOTION = (
     "hold the object before the cameras for fifteen seconds, hands behind it, all beads in sight of two cameras: turn"
     " it slowly about all its axes, and carry it to all sides"
 )
-FEWEST, ENOUGH = 60, 240  # instants at which all beads are known
+FEWEST, ENOUGH = 60, 240  # epochs at which all beads are known
 FEWEST_LOOKS, ENOUGH_LOOKS = 4, 15
 _LOOK_RAD = np.radians(
     10.0
@@ -42,7 +42,7 @@ class Measurement:
 
     Attributes:
         bundle: What was fitted.
-        T_own_body: (4, 4) of the frame that is told (`master.calibrate.object.frame`).
+        T_own_body: (4, 4) of the frame that is reported (`master.calibrate.object.frame`).
         looks: How many ways of turning and places cameras saw it in.
         sigma_m: (B,) how sure each place is among the others, largest axis.
     """
@@ -76,14 +76,14 @@ def measure_object(seen: Seen) -> Measurement:
     """Measure.
 
     Raises:
-        FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not tell them.
+        FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not determine them.
     """
     refuse_insufficient(seen)
     refuse_loose(seen)
     bundle = fit_bundle(seen)
     own = own_frame(bundle.beads_m, seen.names)
     looks = looks_of(bundle.T)
-    # What misleads cameras about a bead is the same while it shows the same side: looks count, and not instants.
+    # What misleads cameras about a bead is the same while it shows the same side: looks count, and not epochs.
     size = bundle.cov_m2.reshape(len(seen.names), 3, len(seen.names), 3)
     variance = np.array([np.linalg.eigvalsh(size[b, :, b])[-1] for b in range(len(seen.names))])
     sigma = np.sqrt(variance * max(1.0, len(bundle.T) / min(looks, _LOOKS)))
@@ -130,7 +130,7 @@ def refuse_loose(seen: Seen) -> None:
     For the most part of the time, not for a moment.
 
     Raises:
-        FitError: Which bead moved, where the others say so.
+        FitError: Which bead moved, where the others determine it.
     """
     change = changes(seen)
     loose = {pair: by for pair, by in change.items() if by[0] > by[1]}

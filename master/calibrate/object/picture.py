@@ -22,7 +22,7 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
         RecordingError: The file cannot be written.
     """
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
-    # Where each sighting lies in the object: the bead less what is left, turned into its frame.
+    # Where each observation lies in the object: the bead less its residual, turned into its frame.
     rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
     left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
     figure = figure_of((16.0, 8.4))

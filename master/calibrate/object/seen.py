@@ -47,7 +47,7 @@ def rows_of(rig: RigCalibration, names: Sequence[str]) -> list[int]:
     """Rows of the beads among the rig's markers.
 
     Raises:
-        CalibrationError: The rig has no such marker, or it sits on the hand; the text says what to write.
+        CalibrationError: The rig has no such marker, or it sits on the hand; the message states what to write.
     """
     listed = ", ".join(f'"{name}"' for name in names)
     for name in names:
@@ -69,7 +69,7 @@ def seen_by(
 ) -> Seen:
     """Bring the cameras to common epochs and triangulate the beads there.
 
-    What has a second place in a camera is left out of that instant: there is no pose yet that tells which is right.
+    What has a second place in a camera is rejected at that epoch: there is no pose yet that determines which is right.
 
     Args:
         rig: Whose markers these are.

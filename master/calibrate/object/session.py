@@ -17,7 +17,7 @@ from master.calibrate.object.seen import Seen, seen_in
 
 PRINT_NS = 1_000_000_000
 _WAIT_S = 0.05
-_SHOWN = 200  # instants from which ways of turning are counted while it goes on
+_SHOWN = 200  # epochs from which ways of turning are counted while it goes on
 
 Receive = Callable[[float], HandPose | None]
 
@@ -37,7 +37,7 @@ def guide(
         rig: Of that master.
         names: Of the beads.
         clock: Of this machine.
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
         longest_s: How long the motion may take [s].
 
     Raises:

@@ -13,7 +13,7 @@ from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 LEAST_S, LEAST_ROTATION_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
 LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
-_ENDS = (0.03, 0.97)  # quantiles: a stray pose is no motion
+_ENDS = (0.03, 0.97)  # quantiles: an outlier pose is no motion
 _PACE_S = 0.2
 _BEGUN_S = 1.0  # before that there is no motion to speak of
 _ADVICE = {

@@ -3,13 +3,13 @@
 Over all shared epochs, outliers down-weighted.
 
 Thirteen unknowns, as small changes of what is there: a turn a and shift d of the tracking system about the middle c of
-what was seen, a turn b and shift e of the device in the object's frame, and the lag. With P, R the foretold pose:
+what was seen, a turn b and shift e of the device in the object's frame, and the lag. With P, R the predicted pose:
 
     P' = P + a x (P - c) + d + R e - v dt        turn' = a + R b - w dt
 
-Each instant counts by the covariance that the object's pose has, with what a tracker's jitter is; all of these are
-scaled by one factor, so that half of the instants lie within what is foretold. How sure the result is comes from the
-leaving out of blocks of time, since neighbours in time share their errors (jackknife), and where the motion tells
+Each epoch counts by the covariance that the object's pose has, with what a tracker's jitter is; all of these are
+scaled by one factor, so that half of the epochs lie within what is predicted. How sure the result is comes from the
+leaving out of blocks of time, since neighbours in time share their errors (jackknife), and where the motion determines
 nothing of an unknown, from the normal equations; the larger counts.
 """
 
@@ -22,7 +22,7 @@ from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_v
 from master.calibrate.tracker.start import Placed, predicted
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
-MOST = 900  # instants
+MOST = 900  # epochs
 BLOCKS = 12
 TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
 DEFAULT_SIGMA_M, DEFAULT_SIGMA_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
@@ -45,13 +45,13 @@ class Fit:
     Attributes:
         placed: The registration.
         middle_m: (3,) middle of the object's places, rig frame.
-        t_s: (N,) instants [s].
+        t_s: (N,) epochs [s].
         R, p_m: The object as the tracker foretells it, rig frame.
         off: (N, 6) what cameras saw against that: place [m], turn [rad], rig axes.
-        stray: (N,) which instants no registration explains.
-        scale: By how much more than foretold the good half is off.
+        outlier: (N,) which epochs no registration explains.
+        scale: By how much more than predicted the good half is off.
         cov: (13, 13) of the unknowns, by the normal equations.
-        rejected: (B, 13) how the unknowns change when a block of time is left out.
+        rejected: (B, 13) how the unknowns change when a block of time is omitted.
     """
 
     placed: Placed
@@ -127,7 +127,7 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     """
     coarse = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
     better, _ = _refined(coarse, first)
-    # Again, because the lag decides which instants are known.
+    # Again, because the lag decides which epochs are known.
     problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, MOST))
     placed, scale = _refined(problem, better)
     lines = problem.lines(placed)
@@ -223,7 +223,7 @@ def _blocks(t_s: Float) -> list[Bool]:
 
 
 def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:
-    """Return the change of the unknowns (13,) when a block is left out.
+    """Return the change of the unknowns (13,) when a block is omitted.
 
     One step from the whole.
     """

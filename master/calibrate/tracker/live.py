@@ -20,11 +20,11 @@ def observe_live(
         bus: Endpoint of the running master's bus.
         profile: The object; it has a tracker.
         longest_s: How long the motion may take [s].
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
 
     Raises:
         BusError: Nobody listens there.
-        FitError: Cameras or tracker said nothing.
+        FitError: Nothing was received from the cameras or the tracker.
     """
     link = join_bus(bus)
     try:

@@ -61,11 +61,11 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
     """Find the registration.
 
     Args:
-        objects: What the cameras made of the object, in any order; what was held or told by a tracker is left out.
-        tracked: What the device on it said, on the same clock.
+        objects: Object poses by the cameras, in any order; those held or reported by a tracker are rejected.
+        tracked: Poses reported by the device on it, on the same clock.
 
     Raises:
-        FitError: The motion was not done, was not seen, does not tell the registration, or none explains it.
+        FitError: The motion was not done, was not seen, does not constrain the registration, or none explains it.
     """
     if not (objects and tracked):
         raise FitError(f"{'the cameras' if not objects else 'the tracker'} told nothing: {MOTION}")

@@ -50,7 +50,7 @@ def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], l
     NaN: not seen, lost.
 
     Raises:
-        RecordingError: The file is missing or broken, or lacks a key; the text says which.
+        RecordingError: The file is missing or broken, or lacks a key; the text states which.
     """
     names = [f"{who}_{key}" for who in ("object", "tracker") for key in _KEYS]
     arrays = read_npz(path, names, _FIX, also=("object_cov", "object_source"))

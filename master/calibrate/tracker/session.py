@@ -83,11 +83,11 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
     Args:
         receive: The next pose of object or device, waiting at most so long [s].
         clock: The master's clock.
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
         longest_s: How long the motion may take [s].
 
     Raises:
-        FitError: Cameras or tracker said nothing all the time.
+        FitError: Nothing was received from the cameras or the tracker all the time.
     """
     session = Session()
     notify(MOTION)

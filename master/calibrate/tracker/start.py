@@ -5,7 +5,7 @@ The lag by how fast both rotate, the positions in closed form, outliers outvoted
 Cameras and tracker sit in frames that nobody knows yet, but by how much the object turned within a fifth of a second
 is the same number in all frames. So the lag is where the two courses of that number differ least.
 
-The closed form is that of robot-world/hand-eye calibration, A Y = X B for all instants (Shah, "Solving the
+The closed form is that of robot-world/hand-eye calibration, A Y = X B for all epochs (Shah, "Solving the
 robot-world/hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5, 2013): the turns of X
 and Y are the first singular vectors of the sum of R_B (x) R_A, their shifts then a linear least squares.
 """
@@ -32,7 +32,7 @@ class Placed:
     Attributes:
         T_rig_tracking: X (4, 4).
         T_object_tracker: Y (4, 4).
-        late_s: How much later the tracker's poses hold than they say [s].
+        late_s: How much later the tracker's poses hold than their time stamps [s].
     """
 
     T_rig_tracking: Float
@@ -89,7 +89,7 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
     Args:
         seen: The object, by the cameras.
         tracker: The device, by its system.
-        late_s: How much later its poses hold than they say [s].
+        late_s: How much later its poses hold than their time stamps [s].
         seed: Of the draws.
     """
     rows = shared_epochs(seen, tracker, late_s, _EPOCHS)

@@ -24,7 +24,7 @@ class PoseTrack:
         t_s: (N,) [s], rising.
         R: (N, 3, 3) thing -> frame.
         p_m: (N, 3) its origin [m], in the frame.
-        cov: (N, 6, 6) of place and of a small turn about the frame's axes; NaN: not told.
+        cov: (N, 6, 6) of place and of a small turn about the frame's axes; NaN: not reported.
     """
 
     t_s: Float
@@ -58,7 +58,7 @@ class PoseTrack:
 def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
     """Return the track of an object as measured by cameras, rig frame.
 
-    Poses that were held, or reported by the tracker itself, are left out.
+    Poses that were held, or reported by the tracker itself, are rejected.
     """
     own = [one for one in poses if one.tracked and one.source not in _NOT_ITS_OWN]
     return _track(
@@ -105,7 +105,7 @@ def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int)
     Args:
         seen: By the cameras.
         tracker: By the tracking system.
-        late_s: How much later its poses hold than they say [s].
+        late_s: How much later its poses hold than their time stamps [s].
         most: More of the same motion adds time, not knowledge.
     """
     if len(seen) == 0 or len(tracker) < 2:

@@ -20,7 +20,9 @@ from master.calibrate.wrist.lit_views import LitView
 _CORNER_SIGMA_PX = (
     0.05  # of the detector on rendered boards: what few corners that happen to agree do not get below
 )
-_MOVED_PX = 1.0  # between the frames of a triple; half of it is what a constant speed leaves unexplained
+_MOVED_PX = (
+    1.0  # between the frames of a strobe cycle; half of it is what a constant speed leaves unexplained
+)
 _MOST_RMS_PX = 1.0  # beyond it, it is another board or another lens
 
 

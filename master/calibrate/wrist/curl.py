@@ -13,7 +13,7 @@ from common.hand_model import FINGERS
 from common.wrist_calibration import FingerLine
 from master.estimator.finger_lines import principal_line
 
-MIN_POINTS = 20  # two thirds of a second of triples
+MIN_POINTS = 20  # two thirds of a second of strobe cycles
 MIN_MOTION_M = (
     0.015  # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
 )
@@ -30,7 +30,7 @@ class FingerCurl:
         finger: Its name.
         points_m: (N, 3) the points that count [m], camera frame.
         seen: Points seen in all.
-        line: Its line; None: not told.
+        line: Its line; None: not determined.
         reason: Why not.
     """
 
@@ -48,7 +48,7 @@ def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
         laser_m: (T, 5, 3) laser points [m], camera frame; NaN: not seen.
 
     Raises:
-        FitError: No finger tells a line; the text says for each finger why.
+        FitError: No finger determines a line; the text states for each finger why.
     """
     curls = tuple(_curl(name, laser_m[:, f]) for f, name in enumerate(FINGERS))
     if all(curl.line is None for curl in curls):
@@ -89,7 +89,7 @@ def _together(points: Float) -> Bool:
     a, b = points[rng.integers(0, len(points), (2, _PAIRS))]
     way = b - a
     length = np.linalg.norm(way, axis=1)
-    # Neighbours tell no direction.
+    # Neighbours constrain no direction.
     far = length > np.quantile(length, 0.5)
     if not far.any():  # all in one place
         return np.ones(len(points), dtype=np.bool_)

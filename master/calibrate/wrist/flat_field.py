@@ -2,13 +2,13 @@
 
 From the white squares of a board whose pose is known.
 
-White paper at X with normal n gets E = sum over LEDs of cos / r^2; what a pixel says beyond that is the flat field F:
+White paper at X with normal n gets E = sum over LEDs of cos / r^2; what a pixel has beyond that is the flat field F:
 
     led - ambient = k F(x, y) E
 
 with k the paper and the gain, which nobody needs. The logarithm of k F is fitted: a power of the cosine off the axis,
-as LEDs and lenses have it, times a smooth correction of third degree that is believed to be small; so F stays sane
-where there was no paper. Samples that stray (shine, shadow, dirt) count little. The file holds a polynomial of sixth
+as LEDs and lenses have it, times a smooth correction of third degree that is assumed to be small; so F stays sane
+where there was no paper. Outliers (shine, shadow, dirt) count little. The file holds a polynomial of sixth
 degree in the normalised image point, laid through this over the whole image. In the corners of a wide lens, where F
 is a fifth, a polynomial follows a power of the cosine to ten per cent only; in the middle half to two.
 """
@@ -35,7 +35,7 @@ _STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
 _WITHIN = np.array([-0.22, 0.0, 0.22])  # of a square from its middle: clear of blurred borders
 _DEGREE = 6
 _CORRECTION_SIGMA = 0.15  # of a coefficient of the correction, where the tangent is 1
-_SAMPLE_SIGMA = 0.02  # of paper; samples of one view do not stray independently, so more than of one alone
+_SAMPLE_SIGMA = 0.02  # of paper; errors of one view's samples are not independent, so more than of one alone
 _GRID = (24, 32)
 _FOLDS = 5
 _CELLS = (3, 3)
@@ -73,7 +73,7 @@ class FlatFit:
     Attributes:
         field: 1 on the axis.
         rms: Relative residual of the samples, robust.
-        cross_validated_rms: The same of views that were left out of the fit.
+        cross_validated_rms: The same of views that were held out of the fit.
         residual: (S,) relative residual of each sample.
     """
 

@@ -2,9 +2,9 @@
 
 Flat hand, knuckles flexed with straight fingers, flat hand, fist.
 
-How far the laser points lie tells how open the hand is, whatever else is still unknown: they are farthest on a flat
+How far the laser points lie shows how open the hand is, whatever else is still unknown: they are farthest on a flat
 hand and come nearer with every joint that bends. So a motion falls into its openings and what lies between them, and
-a few triples of each are all that a fit needs. Which of the bends are of the knuckles, and which are fists, is told
+a few strobe cycles of each are all that a fit needs. Which bends are of the knuckles, and which are fists, is decided
 later, by the tips.
 """
 
@@ -22,10 +22,10 @@ MOTION = (
 FLAT = -1
 _OPEN, _BENT = 0.85, 0.5  # shares of a finger's way: 4 degrees of a straight finger are a tenth of it
 _MOVED_M = 0.015  # of the laser point of a finger that bent
-_FEWEST = 5  # triples of a bend
+_FEWEST = 5  # strobe cycles of a bend
 _FINGERS = 3  # that must be seen
 _PER_BEND, _PER_FLAT = 16, 6
-_EDGE = 0.02  # share of strays beyond the ends of a way
+_EDGE = 0.02  # share of outliers beyond the ends of a way
 
 
 @dataclass(frozen=True, slots=True, eq=False)

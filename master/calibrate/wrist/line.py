@@ -5,7 +5,7 @@ Sought in the board's own plane, where it is straight.
 The difference (laser - ambient) is laid out flat by the pose of the board. Only what lies within the board's squares
 counts, so that a line on the table beside it cannot. The brightest straight line is found by consensus; then, in steps
 of a pixel, its profile across is centred with a Gaussian window that moves until it rests. Profiles near the borders of
-squares are left out: there the paper, not the light, makes the slope.
+squares are rejected: there the paper, not the light, makes the slope.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class BoardLine:
         points_m: (n, 3) on the board, camera frame [m].
         uv: (n, 2) [px] the same in the image.
         sigma_px: How sure the place of the whole line is, across it.
-        rms_px: How far single points stray from it.
+        rms_px: RMS distance of single points from it.
     """
 
     points_m: Float

@@ -20,7 +20,7 @@ MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
 _MOST_NAMED = 6  # views named with a reason
-_APART = 2  # rows: frames of one strobed triple
+_APART = 2  # rows: frames of one strobe cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +50,13 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
     Evenly over the source, at most 60.
 
     Args:
-        folder: A recording whose frames.csv says what lit each frame, or images named VIEW_ambient.png, VIEW_laser.png,
+        folder: A recording whose frames.csv names the light of each frame, or images VIEW_ambient.png, VIEW_laser.png,
             VIEW_led.png.
         camera: Camera of the recording.
         needed: Laser or LED.
 
     Raises:
-        RecordingError: No such folder, or no such frames; the text says what is expected.
+        RecordingError: No such folder, or no such frames; the text states what is expected.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is not a folder")

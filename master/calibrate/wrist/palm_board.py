@@ -2,7 +2,7 @@
 
 **How the board lies.** Flat on the palm and the straight fingers, print towards the camera; its rows across the hand,
 its columns along the middle finger. Which end is up does not matter: that whose corners lie farther from the camera is
-towards the fingers. Three lengths say where it is, all measured with a ruler:
+towards the fingers. Three lengths define where it is, all measured with a ruler:
 
 - `wrist_m`: along the hand from the crease of the wrist (the wrist joint, the palm frame's origin) to the row of
   inner corners nearest to it;

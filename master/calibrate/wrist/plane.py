@@ -4,9 +4,9 @@ Weighted least squares over views, wrong ones rejected.
 
 Every view gives one straight line in space; how far it lies off a plane is two numbers (two points of it with the
 spread of all its points). Their covariance is that of the board's pose, which all points of a view share, and of the
-line's place in the image; so a thousand points of one view do not count as a thousand. A plane is told by lines that
-are not all the same one (three points that are not collinear); how well, the covariance says, and what it does not
-tell to a tenth of a degree and of a millimetre is refused.
+line's place in the image; so a thousand points of one view do not count as a thousand. A plane is constrained by lines
+that are not all the same one (three points that are not collinear); the covariance states how well, and what is not
+known to a tenth of a degree and of a millimetre is refused.
 """
 
 from collections.abc import Sequence
@@ -112,7 +112,7 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
     """The plane through the lines of at least three views.
 
     Raises:
-        FitError: Too few views, too few that agree, or lines that tell no plane, or not well enough; the text says what
+        FitError: Too few views, too few agree, or their lines constrain no plane, or too weakly; the text states what
             to do.
     """
     if len(views) < MIN_VIEWS:
@@ -181,7 +181,7 @@ def _agreeing(views: Sequence[ViewLine], normal: Float, offset: float) -> Bool:
     """Which views (V,) agree with a plane."""
     chi2 = np.array([_chi2(view, normal, offset) for view in views])
     off = np.array([_off(view, normal, offset) for view in views])
-    # The covariances may be small by a common factor: a wrong view is one that strays more than most.
+    # The covariances may be small by a common factor: a wrong view is one whose residual is larger than most.
     times = max(1.0, float(np.median(chi2)) / 1.386)
     return (chi2 < _WRONG_CHI2 * times) | (off < _WRONG_M)
 

@@ -2,7 +2,7 @@
 
 Kim et al. 2012 read the knuckles off the laser at its smallest extent.
 
-The place of a knuckle is told by the laser where its finger is bent most: there the line lies beside it. One motion
+The place of a knuckle is measured by the laser where its finger bends most: there the line lies beside it. One motion
 shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is
 made of it is in `guided`, `subject_model` and `subject_fit`; here is what goes in, comes out and is refused.
 """
@@ -37,7 +37,7 @@ _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly mov
 _MOST_RMS = 1.5  # standard deviations: angles are free, so what is left is small
 _UNLIKELY = 3.0  # standard deviations
 _MOST_PRIOR_RMS = (
-    1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
+    1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion constrains
 )
 
 
@@ -49,7 +49,7 @@ class Subject:
         rig: The rig with its new `T_camera_palm`.
         hand: The hand file with new knuckles, lengths and `palmar_scale`, under its old name.
         report: Lines for a person.
-        chosen: Which triples were used.
+        chosen: Which strobe cycles were used.
         seen: What was seen in them.
         fit: What was fitted to it.
         model: The forward function about the old rig and hand.
@@ -97,7 +97,7 @@ def calibrate_subject(
         source: Name of the data, for the provenance.
 
     Raises:
-        FitError: The motion was not done, or not seen, or nothing likely explains it; the text says what to do.
+        FitError: The motion was not done, or not seen, or nothing likely explains it; the text states what to do.
         CalibrationError: The rig lacks its laser plane or palm pose.
     """
     setup = WristSetup.of(rig, camera, HandModel.of(hand))
@@ -123,7 +123,7 @@ def _pose_sigma(rig: RigCalibration) -> Float:
 
     Rotated about the wrist joint, and shifted.
 
-    A rig whose maker knows how differently it is worn says so in the residual of the pose's provenance.
+    A rig whose maker knows how differently it is worn states so in the residual of the pose's provenance.
     """
     how = rig.provenance.get("T_camera_palm")
     stated = {} if how is None or how.tool == TOOL else how.residual

@@ -2,16 +2,16 @@
 
 Given what was seen of a guided motion.
 
-Laser point and tip give four numbers of a finger in a triple, its angles are three unknowns; so what is known of the
-subject comes from habits as well, and each is believed as far as people keep it. A flat hand is flat and a finger that
+Laser point and tip give four numbers of a finger in a strobe cycle, its angles are three unknowns; what is known of a
+subject comes from joint couplings as well, each as firm as people keep to it. A flat hand is flat and a finger that
 bends at its knuckle is straight, to a few degrees; a fist closes in natural ratios, about. Knuckles, thickness and
-length are those of a hand of its size, about. What none of that determines keeps what is believed, and the
-covariance says so: above all, a knuckle that lies farther from the camera looks like a thicker finger, and all
+length are those of a hand of its size, about. What none of that determines keeps its prior, and the
+covariance shows it: above all, a knuckle that lies farther from the camera looks like a thicker finger, and all
 knuckles shifted alike look like a palm that is shifted.
 
-The angles of each finger in each triple are eliminated (Schur's complement), which leaves 26 unknowns. Steps are those
-of Levenberg and Marquardt; what strays is weighed down (Cauchy). Errors of skin, tips and habits last as long as a bend
-does: its triples count together as a few.
+The angles of each finger in each strobe cycle are eliminated (Schur complement), which leaves 26 unknowns. Steps are
+Levenberg-Marquardt; outliers are downweighted (Cauchy). Errors of skin, tips and couplings last as long as a bend
+does: its strobe cycles count together as a few.
 """
 
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ _STRAIGHT_RAD = np.radians(5.0)  # how straight they keep a finger that bends at
 _RATIO_SPREAD = 0.15  # MCP of a fist against the natural ratio
 _ASIDE_RAD = np.radians(
     17.0
-)  # 5 of a finger, who keeps to it all the time: its triples together count as one
+)  # 5 of a finger, who keeps to it all the time: its strobe cycles together count as one
 _ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
 _KNUCKLE_M = 3e-3  # against a hand of this size, per axis
-_INDEPENDENT = 4.0  # triples of a bend
-_STRAYS = 2.5  # standard deviations from which a sighting is believed less
+_INDEPENDENT = 4.0  # strobe cycles of a bend
+_STRAYS = 2.5  # standard deviations from which an observation is downweighted
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _GUESS_SIGMA = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
 _ROUGHEST = 3.0
@@ -55,7 +55,7 @@ class ImageObservations:
     Attributes:
         laser_m: (T, 4, 2) on the plane, across and along [m].
         tip_uv: (T, 4, 2) [px].
-        tip_sigma_px: (T, 4) as the slave says.
+        tip_sigma_px: (T, 4) as the slave reports.
         bend: (T,) as of `guided.Guided`.
     """
 
@@ -72,13 +72,13 @@ class Fit:
     Attributes:
         x: (26,) as of `subject_model.Unknown`.
         covariance: (26, 26).
-        prior_sigma: (26,) what was believed before.
+        prior_sigma: (26,) prior standard deviations.
         angles_rad: (T, 4, 3) abduction, MCP, PIP.
-        fist: (T,) whether the triple is of a fist.
+        fist: (T,) whether the strobe cycle is of a fist.
         off: (T, 4, 4) seen minus fitted, in standard deviations: laser across and along, tip; NaN: not seen, or past
             the end of the laser's branch.
-        rms: Of `off`, strays at their limit.
-        unlike: Rms of what fingers did against their habits, in standard deviations.
+        rms: Of `off`, outliers at their limit.
+        unlike: Rms of what fingers did against their joint couplings, in standard deviations.
         laser_m, tip_px: What is left at laser points and tips, median.
     """
 
@@ -121,7 +121,7 @@ def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> F
     """
     problem = _Problem(model, seen, sigma)
     x, guess, covariance = np.zeros(UNKNOWN), problem.guessed(np.zeros(UNKNOWN)), np.empty(0)
-    for rounds in _ROUNDS:  # what a rough pose takes for a stray may be none
+    for rounds in _ROUNDS:  # what a rough pose takes for an outlier may be none
         x, guess, covariance = problem.solved(x, problem.guessed(x), rounds)
     return problem.result(x, guess, covariance)
 
@@ -151,7 +151,7 @@ class _Problem:
         laser = np.full_like(tip_px, _LASER_SIGMA_M)
         self._sigma = np.stack([laser, laser, tip_px, tip_px], axis=-1)
         count = np.array([(seen.bend == bend).sum() for bend in seen.bend])
-        self._share = np.minimum(_INDEPENDENT / count, 1.0)  # (T,) what a triple counts
+        self._share = np.minimum(_INDEPENDENT / count, 1.0)  # (T,) what a strobe cycle counts
 
     def guessed(self, x: Float) -> "_Guess":
         """Guess the angles from joint couplings alone.

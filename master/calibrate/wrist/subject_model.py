@@ -3,7 +3,7 @@
 For a hand of which little is known.
 
 Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
-and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
+and how long. Unknown in each strobe cycle are three angles per finger; the DIP follows the PIP. What is seen are the
 laser point on its plane and the fingertip. Both are made as the master does (`master.calibrate.laser_intersection`,
 `common.fingertips`), so that what is fitted is what will be used.
 """
@@ -38,7 +38,7 @@ class Unknown:
 
     Attributes:
         pose: (6,) turn [rad] about the wrist joint and shift [m] of the palm, camera axes. A strap holds a device at
-            the wrist and lets it turn: knuckles that lie elsewhere tell of a turn first.
+            the wrist and lets it turn: knuckles that lie elsewhere indicate a turn first.
         knuckle_m: (4, 3) shift of each knuckle, palm frame.
         thick, long: (4,) natural logarithms of the factors of thickness and length.
     """
@@ -184,7 +184,7 @@ def fitted_profile(model: HandModel, unknown: Unknown) -> HandProfile:
         joints[JOINTS[index]] = replace(joints[JOINTS[index]], position_m=(x, y, z))
     plain = replace(model.profile, rest_joints=joints)
     names: tuple[Finger, ...] = get_args(Finger)[FINGERS]
-    # Without radii the breadth of the knuckles tells the thickness, and they have moved.
+    # Without radii the breadth of the knuckles constrains the thickness, and they have moved.
     without = {name: scale for name, scale in plain.palmar_scale.items() if name not in names}
     typical = PalmarSurface.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
     scale = (thick / typical).mean(axis=1)

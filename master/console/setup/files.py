@@ -2,7 +2,7 @@
 
 An old file is kept beside the tree's.
 
-What the page was told and no calibration file has a place for (which camera is simulated, which is a USB camera here)
+What was entered on the page and no calibration file has a place for (which camera is simulated, which is a USB one)
 stands in console/setup.json of the same tree, so that the set-up goes on where it was left.
 """
 

@@ -76,7 +76,7 @@ def _known(desk: Desk, camera: str) -> set[str]:
     try:
         return set(load(path, CameraCalibration).markers or {})
     except CalibrationError:
-        return set()  # the first step says what is wrong with it
+        return set()  # the first step reports what is wrong with it
 
 
 class _ColourChoice:

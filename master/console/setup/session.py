@@ -113,7 +113,7 @@ class Session:
         """Write rig, hand and key.
 
         Raises:
-            PhalanxError: As of `write_rig`; the rig is none that the console was told to show.
+            PhalanxError: As of `write_rig`; the rig is none that the console was set to show.
         """
         shown = self.state.settings.rigs
         if shown and plan.rig not in shown:

@@ -29,7 +29,7 @@ class Step:
         key: Its name in code and in the page.
         title: For a person.
         state: Whether it is done.
-        why: What the state is told from, or what is to be done.
+        why: What the state is derived from, or what is to be done.
     """
 
     key: str

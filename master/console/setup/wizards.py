@@ -45,7 +45,7 @@ class Wizard:
         keyboard: Whether it waits for Enter between its steps.
         first: Fields shown at once, in this order; the others are under "More options".
         defaults: What fields begin with, where that is not the command's own default.
-        prepared: What a recording is made of first: marker cameras, the wrist device's triples ..., "" for none.
+        prepared: What a recording is made of first: marker cameras, the wrist device's strobe cycles ..., "" for none.
         scene: What simulated cameras show meanwhile.
         seconds: How long a recording is made.
         writes: What it writes that a person may print or download, beside calibration files.
