@@ -34,7 +34,7 @@ SECTIONS = {
     "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",
     "mocap": "Poses against motion capture in another frame and clock; hands made from joints; exact truth, leapjs",
     "real_hands": "Real hands before ideal markers: grasping (PHALANX_MOTION), a glove with tips hidden; goals beside",
-    "joint_certainty": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
+    "joint_covariance": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
     "hidden_fingers": "Flexion and PIP of a finger without a marker, with its neighbours; baseline: alone",
     "pose_cost": "What a pose costs the master, stage by stage: two cameras, sixteen, fused; processor time",
     "fusion": "Markers and wrist device as one hand, against each alone; either cut off and back; exact truth",

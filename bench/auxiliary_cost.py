@@ -16,17 +16,17 @@ from bench.object_views import Where, detections, wander
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.geometry import axis_rotation, rigid
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.transforms import axis_rotation, rigid
 from common.messages import MarkerDetections
-from common.object_profile import ObjectProfile
 from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
 from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 # How they are turned, so that what is painted or printed on them faces the cameras.

@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.row import Row
 from common.arrays import Float
-from common.geometry import invert
+from common.geometry.transforms import invert
 from master.calibrate.cameras.audit import audit_pair, pairs_with_views
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras

@@ -17,10 +17,10 @@ from typing import Any
 
 from bench.local_rig import free_port, join_bus, until
 from bench.udp_relay import UdpRelay
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError, PhalanxError
 from common.messages import Checklist, Command, Health
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from common.messages.streams import MASTER
 
 ROOT = Path(__file__).resolve().parents[1]
 MARKER_HZ, WRIST_HZ = 12.0, 30.0  # slow enough for two busy cores to draw all pictures in time

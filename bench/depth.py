@@ -21,16 +21,16 @@ from bench.played import message_of
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from master.calibrate.depth.fit import fit_affine_disparity, fit_power_law, ideal_of, relative_error
 from master.fabrik.depth import AffineDisparity
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,12 +13,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from common.bus.keys import rig_key
 from common.calibration import HandProfile, load
 from common.clock import SystemClock
-from common.keys import rig_key
 from common.messages import MarkerDetections
 from common.sim.scene import Scene
-from master.rig import load_setup
+from master.rig.files import load_setup
 from slave.uplink import Uplink
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"

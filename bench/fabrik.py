@@ -18,14 +18,14 @@ from bench.fusion_shown import shown
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import FilterCalibration, RigCalibration
-from common.hand_model import FINGER_JOINTS
+from common.hand.model import FINGER_JOINTS
 from common.messages import HandPose, MarkerDetections
 from master.estimator.cameras import CameraArrays
 from master.fabrik.intersection import triangulate
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline, line_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline, line_of
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS, SEED = 10.0, 7

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from bench.faults_poses import ReceivedPose
 from bench.faults_rig import RATE_HZ, FaultRig
 from bench.processes import cpu_s, footprint
-from common.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
+from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
+from common.link.session import RigKeys
 from common.messages import WIRE_VERSION
-from common.session import RigKeys
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 POOL = 4096  # different ones; the network does not care
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from bench.faults_rig import FaultRig
 from bench.udp_relay import Impairment
 from common.messages import WIRE_VERSION
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 CUT_S, STOPPED_S, CRASHES, RESTART_S, STEP_S = 5.0, 3.0, 4, 1.0, 10.0
 

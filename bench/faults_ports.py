@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from contextlib import ExitStack, suppress
 
-from common.datagram import Address
+from common.link.datagram import Address
 
 _HELLO = bytes.fromhex("16030100c8010000c40303")  # how a TLS client begins
 _UPGRADE = (

@@ -10,9 +10,9 @@ import numpy as np
 from bench.detections_sender import CALIBRATION
 from bench.faults_sender import WAY_S, scene_s, standard_scene
 from common.arrays import Float
+from common.bus.zenoh_bus import ZenohBus
 from common.messages import HandPose
-from common.zenoh_bus import ZenohBus
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 GRID_HZ = 200.0
 STEADY_S, STEADY_SHARE, GAP_S = 0.5, 0.8, 0.2

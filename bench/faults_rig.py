@@ -22,7 +22,7 @@ from bench.processes import footprint
 from bench.udp_relay import UdpRelay
 from common.errors import BusError, PhalanxError
 from common.messages import Checklist, Command, Health
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERAS = ("left", "right")

@@ -16,15 +16,15 @@ import time
 import msgspec
 import numpy as np
 
-import common.datagram
+import common.link.datagram
 from bench.detections_sender import CALIBRATION, NOISE_PX
+from common.bus.keys import rig_key
 from common.calibration import HandProfile, load
 from common.clock import SkewedClock, SystemClock
-from common.keys import rig_key
 from common.messages import WIRE_VERSION, MarkerDetections
 from common.sim.scene import Scene
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 from slave.uplink import Uplink
 
 WAY_S = 10.0  # of the scene, forth and back: nothing ever leaps
@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("--wire", type=int, default=WIRE_VERSION, help="the wire version that it speaks")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stdout)
-    setattr(common.datagram, "WIRE_VERSION", options.wire)  # noqa: B010  as a program of that version has it
+    setattr(common.link.datagram, "WIRE_VERSION", options.wire)  # noqa: B010  as a program of that version has it
     clock, late_ns = SkewedClock(round(options.clock_s * 1e9), 0.0), round(options.late_ms * 1e6)
     frames = frames_of(options.camera, options.rate_hz, late_ns)
     uplink = Uplink(options.camera, rig_key(os.environ, None), clock, options.port, "127.0.0.1")

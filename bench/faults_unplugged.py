@@ -15,7 +15,7 @@ from pathlib import Path
 
 from bench.checklist_rig import Rig
 from bench.local_rig import until
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 AWAY_S, PATIENCE_S = 3.0, 30.0
 ABSENT = ("camera_absent", "left")

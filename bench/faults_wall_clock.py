@@ -20,7 +20,7 @@ from pathlib import Path
 
 from bench.checklist_rig import Rig
 from common.errors import PhalanxError
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 CAMERA, OTHER = "left", "right"
 STEPS_S = (10.0, -10.0)

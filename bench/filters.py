@@ -20,9 +20,9 @@ from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import FilterCalibration
-from common.geometry import rigid
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import rigid
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuro, OneEuroParameters, PointFilter

@@ -21,21 +21,26 @@ from bench.row import Row
 from bench.solved_hand import NO_RAY, TOWARDS
 from common.arrays import Float
 from common.calibration import ImuCalibration
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rigid, rotation_vector_to_matrix
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import (
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rigid,
+    rotation_vector_to_matrix,
+)
+from common.hand.wrist_joint import STRAIGHT, forearm_palm
+from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
-from common.wrist_joint import STRAIGHT, forearm_palm
 from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
 from master.estimator.fused import WristSide
 from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel, loosened
-from master.rig import load_setup
-from master.rig_setup import RigSetup
-from master.wrist_setup import WristSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
+from master.rig.wrist import WristSetup
 
 # Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
 _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)

@@ -19,7 +19,7 @@ from bench.fusion_outcome import KINDS, Outcome, cut_off, solved
 from bench.fusion_scene import SCENES
 from bench.fusion_score import Figures, Ratios
 from bench.row import Row
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 
 SECONDS, CUT_SECONDS, SEED = 24.0, 60.0, 41
 CUT = ("both-travel", "both-poses")

@@ -12,9 +12,9 @@ from bench.fusion_scene import Observed
 from bench.fusion_shown import shown
 from bench.row import Row
 from common.messages import ImuSample, WristDetections
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 SCENE, SECONDS, SEED = "grasp", 6.0, 7
 

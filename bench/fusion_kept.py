@@ -15,7 +15,7 @@ from bench.fusion_scene import MARKER_RIG, WRIST_RIG, Both, Observed, Shown, Sig
 from bench.fusion_shown import shown_of
 from bench.fusion_watched import watched
 from common.messages import decode, encode
-from common.npz import read_npz, write_npz
+from common.recording.npz import read_npz, write_npz
 
 Mode = Literal["rendered", "quick"]
 _ROOT = Path(__file__).parent.parent
@@ -23,7 +23,7 @@ _KEPT = _ROOT / "out" / "fusion"
 _HANGS_ON = (
     "common/sim/**/*.py",
     "common/hand*.py",
-    "common/camera_model.py",
+    "common/geometry/camera_model.py",
     "common/imu*.py",
     "common/wrist*.py",
     "slave/markers/*.py",

@@ -8,7 +8,7 @@ from bench.fusion_kept import Mode, observed
 from bench.fusion_scene import Shown
 from bench.fusion_score import Figures, Ratios, Sighted, ratios
 from bench.fusion_solved import RejectedPeer, Solved, solve
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 
 Kind = Literal["fused", "markers", "wrist"]
 KINDS: tuple[Kind, ...] = ("fused", "markers", "wrist")

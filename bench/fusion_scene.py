@@ -8,14 +8,14 @@ import numpy as np
 
 from bench.played import START_NS
 from common.arrays import Bool, Float, Int
-from common.imu_fusion import OrientationFilter
+from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections, WristDetections
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene, SceneTruth
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 SCENES = ("both-poses", "both-curl", "both-travel", "grasp")

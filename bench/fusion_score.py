@@ -8,7 +8,7 @@ import numpy as np
 from bench.fusion_scene import Shown
 from bench.fusion_solved import RejectedPeer, Solved
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 
 REGION = 7.815  # chi square, three degrees, 95 %
 OFF_M = 0.020  # a joint that is tracked may not be farther off

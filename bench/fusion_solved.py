@@ -13,13 +13,13 @@ import numpy as np
 from bench.fusion_scene import Both, Observed
 from bench.played import START_NS
 from common.arrays import Bool, Float
-from common.geometry import quaternion_to_matrix
-from common.hand_model import CHAINS, WRIST
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import CHAINS, WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections
 from master.outputs.poses import Poses
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 _FOLLOWS_S = 0.1  # poses farther apart are a new beginning, not a step
 _SETTLED_S = 1.0  # of every scene's beginning: filters and IMU find their feet

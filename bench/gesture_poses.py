@@ -26,9 +26,9 @@ from bench.recognised_poses import RecognisedPoses, pose_of, recognised_in
 from bench.row import Row, median_us
 from bench.solved_hand import PointHand
 from common.calibration import CameraCalibration, FilterCalibration, HandProfile, RigCalibration, load
-from common.geometry import matrix_to_quaternion
-from common.gesture_settings import default_gestures
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import default_gestures
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
 from common.messages import HandPose
 from common.sim.poses import StudyPoses
 from master.estimator.smooth import HandOneEuro

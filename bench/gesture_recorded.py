@@ -13,11 +13,11 @@ from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import FilterCalibration
-from common.geometry import matrix_to_quaternion, rigid
-from common.hand_fitting import profile_from_rest
-from common.hand_model import CHAINS, HandModel
+from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.hand.fitting import profile_from_rest
+from common.hand.model import CHAINS, HandModel
 from common.messages import HandPose
-from common.npz import read_npz
+from common.recording.npz import read_npz
 from common.sim.motion import POSES
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters

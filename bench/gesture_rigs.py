@@ -23,17 +23,17 @@ from bench.played import START_NS, message_of, times_of
 from bench.recognised_poses import RecognisedPoses, recognised_in
 from bench.row import Row
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose, ImuSample
 from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from common.sim.together import FlexedWrist
 from common.sim.wrist.scene import WristScene
-from master.rig import load_setup
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from master.study.participant import Participant, participant, rotated
 from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline

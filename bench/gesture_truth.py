@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.capsule_gaps import TaperedCapsules, gaps_between
-from common.gesture_settings import GestureSettings
-from common.hand_model import CHAINS, FINGERS, TIPS, HandModel
+from common.calibration.gesture_settings import GestureSettings
+from common.hand.capsule_gaps import TaperedCapsules, gaps_between
+from common.hand.model import CHAINS, FINGERS, TIPS, HandModel
 from common.sim.gestures import Annotation, Gestures
 
 RATE_HZ = 240.0

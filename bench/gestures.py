@@ -32,16 +32,16 @@ from bench.gesture_truth import GestureTruth
 from bench.played import START_NS, solve, times_of, watch
 from bench.row import Row
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion
-from common.gesture_settings import GestureSettings, default_gestures
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import GestureSettings, default_gestures
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gestures import Gestures
 from common.sim.motion import HandMotion
 from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 RATE_HZ = 60.0
 FUSED = "desk-back3+wrist-back3"

@@ -19,8 +19,8 @@ from bench.peers_paper import Fingers, PaperFingers, closed_form, finger_solvers
 from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT

@@ -22,7 +22,7 @@ from bench.peers_paper import Fingers, PaperFingers, closed_form, finger_solvers
 from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 
 POSES = 2000
 BATCHES = 10

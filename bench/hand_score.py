@@ -6,7 +6,7 @@ import numpy as np
 
 from bench.hand_draws import Draw
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 
 MISSED_MM = 1.0
 _TIPS = ("thumb", "index", "middle", "ring", "little")

@@ -18,8 +18,8 @@ from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.geometry import rigid
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid
+from common.hand.model import HandModel
 from common.sim.leap import load_leap
 from common.sim.motion import HandMotion
 from master.estimator.settings import DEFAULT

@@ -10,6 +10,7 @@ from msgspec import Struct
 from bench.hostile_messages import Attack, Fields, wire
 from bench.scale_rig import detections_of
 from common.arrays import Float
+from common.link.session import EchoAnswer, Hello, Started
 from common.messages import (
     Backlog,
     CheckItem,
@@ -29,9 +30,8 @@ from common.messages import (
     TrackerPose,
     WristDetections,
 )
-from common.session import EchoAnswer, Hello, Started
 from common.sim.wrist.scene import WristScene
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 
 _JPEG = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()
 _LOOP, _RATE_HZ = 300, 30.0  # frames, then the same again

@@ -15,8 +15,8 @@ import msgspec
 from msgspec import Struct, inspect
 
 from bench.hostile_values import dtype_of, hostile, nested
+from common.link.session import EchoAnswer, Hello, Started
 from common.messages import AnyMessage, Message
-from common.session import EchoAnswer, Hello, Started
 
 Fields: TypeAlias = dict[str, object]
 SAID: tuple[type[Struct], ...] = (*get_args(AnyMessage), Hello, Started, EchoAnswer)  # what a slave may say

@@ -23,12 +23,12 @@ from bench.detections_sender import send
 from bench.local_rig import free_port, join_bus, until
 from bench.processes import footprint
 from bench.scale_rig import ROOM, detections_of, room
-from common.bus import Subscription
+from common.bus.bus import Subscription
 from common.clock import SystemClock
 from common.errors import BusError, PhalanxError
 from common.messages import Command, HandPose, Health
-from common.streams import MASTER
-from master.rig import load_setup
+from common.messages.streams import MASTER
+from master.rig.files import load_setup
 from slave.uplink import Uplink
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -22,15 +22,15 @@ from msgspec import Struct
 
 from bench.hostile_examples import Speaker, own_kinds
 from bench.hostile_messages import SAID, Attack, flood, wire
-from common.bus_settings import settings
+from common.bus.keys import rig_key
+from common.bus.settings import settings
 from common.clock import SystemClock
-from common.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
-from common.keys import rig_key
+from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
+from common.link.session import EchoAnswer, Hello, RigKeys, Started
 from common.messages import Health, Preview, Still
-from common.session import EchoAnswer, Hello, RigKeys, Started
-from common.streams import key_of
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from common.messages.streams import key_of
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 from slave.uplink import Uplink
 
 _START_S = 60.0

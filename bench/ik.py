@@ -15,9 +15,9 @@ from bench.hand_draws import MARKERS, Draw, bench_model, draw, posed
 from bench.hand_score import Score, score
 from bench.peers_paper import Angles, Fingers, PaperFingers, closed_form, finger_solvers, tips_in_palm
 from bench.row import Row, median_us
-from common.camera_model import CameraModel
-from common.geometry import axis_rotation, rigid
-from common.hand_model import HandModel
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, rigid
+from common.hand.model import HandModel
 from master.estimator.cameras import CameraArrays
 from master.fabrik.fabrik import Fabrik
 from master.fabrik.finger import Finger, FingerSolver

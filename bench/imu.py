@@ -23,8 +23,8 @@ import numpy as np
 from bench.row import Row
 from common.arrays import Bool, Float
 from common.calibration import ImuCalibration
-from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
+from common.imu.fusion import OrientationFilter
 from common.imu_score import TiltErrors
 from common.messages import ImuSample
 from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu

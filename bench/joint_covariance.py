@@ -19,13 +19,13 @@ from bench.row import Row
 from bench.solved_hand import TOWARDS, PointHand
 from common.arrays import Bool, Float
 from common.calibration import Couplings, HandProfile, load
-from common.hand_model import CHAINS, TIPS, HandModel
+from common.hand.model import CHAINS, TIPS, HandModel
 from common.sim.leap import load_leap
 from common.sim.motion import HandMotion, HandState, ScriptedMotion, base_pose, smooth_step
 from common.sim.poses import StudyPoses
 from common.sim.scenes import scene_by_name
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 HAND = _CALIBRATION / "hands/default-right.json"

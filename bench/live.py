@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bench.row import Row
 from deploy.demo import DemoSettings, demo_keys, play, run_demo
-from master.summary import read_summary
+from master.commands.summary import read_summary
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _SECONDS, _RELAY_SECONDS = 30.0, 15.0

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from common.certificates import OPERATOR
+from common.bus.certificates import OPERATOR
+from common.bus.keys import access_of
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from common.keys import access_of
-from common.zenoh_bus import ZenohBus
 
 _PORTS = range(15_000, 32_000)  # below those that Linux gives to whoever names none (32768 to 60999)
 _TRIES = 100

@@ -13,7 +13,7 @@ from bench.marker_photos import DATASETS, Photo, as_by_another_camera, halves, p
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HsvRange, load
 from common.errors import FitError
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from slave.markers.classify import ColourTable
 from slave.markers.colours import calibrate, grow
 from slave.markers.detector import Detections, MarkerDetector

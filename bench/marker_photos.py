@@ -17,8 +17,8 @@ from bench.marker_frames import expose
 from bench.marker_kinds import KINDS, Kind
 from bench.marker_scene import make_scene
 from common.arrays import Float, Image
+from common.geometry.srgb import gain_tables
 from common.sim.light import to_linear
-from common.srgb import gain_tables
 
 WIDTH: Final = 640  # px, to which a photograph is scaled
 DATASETS: Final = Path(os.environ.get("PHALANX_DATASETS", "../shared/datasets"))

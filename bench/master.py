@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from bench.row import Row, median_us
+from common.bus.keys import new_key
 from common.calibration import HandProfile, load
 from common.clock import SystemClock
-from common.keys import new_key
 from common.messages import MarkerDetections, decode, encode
 from common.sim.scene import Scene
-from master.ingest import Ingest
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.ingest import Ingest
+from master.run.stages import StageTimes
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _CAMERAS, _RATE_HZ, _SECONDS = 16, 90, 5

@@ -26,16 +26,16 @@ from bench.fusion_shown import shown
 from bench.real_motion import recordings
 from bench.row import Row
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
-from common.hand_model import CHAINS, JOINTS, WRIST, HandModel
-from common.hand_profiles import generated_profile
-from common.npz import read_npz
+from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.hand.model import CHAINS, JOINTS, WRIST, HandModel
+from common.hand.profiles import generated_profile
+from common.recording.npz import read_npz
 from master.calibrate.hand.motion import MotionHand, hand_from_motion
 from master.calibrate.hand.palm import PALM_JOINTS, find_palm, palm_axes
-from master.export.truth import Wanted, compare_source
 from master.mocap.joint_motion import JointMotion
 from master.mocap.read import Reading
 from master.outputs.files import PosesFile
+from master.recording.export.truth import Wanted, compare_source
 
 _ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 10.0

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
-from common.geometry import rigid, rotation_vector_to_matrix
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.messages import MarkerDetections, TagDetections
-from common.object_profile import ObjectProfile
 from master.objects.features import Features
 
 Where = Callable[[float], Float]

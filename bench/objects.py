@@ -15,10 +15,10 @@ from bench.played import START_NS, message_of, times_of
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import MarkerDetections, ObjectPose, TagDetections
-from common.object_profile import ObjectProfile
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name

@@ -16,11 +16,11 @@ from bench.played import shown_by, solve, times_of, times_of_poses, watch
 from bench.row import Row
 from common.arrays import Bool, Float, Int
 from common.calibration import HandProfile, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 PAIR, FOUR = ("left", "right"), ("left", "right", "left2", "right2")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench.oracle_truth import FROZEN, Truth
 from common.messages import ImuSample, MarkerDetections, WristDetections
-from common.recording import MessageWriter
+from common.recording.messages import MessageWriter
 
 
 @dataclass(frozen=True, slots=True, eq=False)

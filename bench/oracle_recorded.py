@@ -27,15 +27,15 @@ from bench.played import START_NS
 from bench.real_motion import FACING, Recorded, recordings
 from bench.scale_rig import CALIBRATION, DESK
 from common.arrays import Float, Int
-from common.frame_recording import open_recording
-from common.geometry import rigid
-from common.hand_model import CHAINS, HandModel
-from common.message_sensed import MarkerDetections
-from common.npz import read_npz
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, HandModel
+from common.messages.sensed import MarkerDetections
+from common.recording.frame_recording import open_recording
+from common.recording.npz import read_npz
 from common.sim.motion import HandState
 from common.sim.scene import Scene, view_centre
-from master.recorded import recorded_detections
-from master.rig import load_setup
+from master.replay.recorded import recorded_detections
+from master.rig.files import load_setup
 
 _ROOT = Path(__file__).resolve().parents[1]
 RENDERED = {

@@ -14,12 +14,12 @@ from bench.played import START_NS, times_of
 from bench.real_motion import FACING, held_poses
 from bench.scale_rig import CALIBRATION, DESK, ROOM, middle_m, room
 from common.arrays import Float, Int
-from common.geometry import rigid
+from common.geometry.transforms import rigid
 from common.messages import MarkerDetections
 from common.sim.motion import HandState, ScriptedMotion, smooth_step
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 SCENES = ("standard", "grasp", "both-travel")
 SEEDS = (11, 12, 13)

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from common.messages import HandPose, ImuSample
-from common.recording import open_messages
-from master.rig import load_setup
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from common.recording.messages import open_messages
+from master.rig.files import load_setup
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 FROZEN = "frozen"
 KEPT = ("position_m", "angles_rad", "cov_m2", "valid", "tracked", "source")

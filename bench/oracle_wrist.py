@@ -23,12 +23,12 @@ from bench.oracle_scenes import truth_of
 from bench.oracle_truth import Truth
 from bench.wrist_mesh.sets import set_named, write_set
 from common.errors import RecordingError
-from common.frame_recording import open_recording
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import WristDetections
-from common.npz import read_npz
-from master.recorded import recorded_cycles
-from master.wrist_score import load_wrist_truth
+from common.recording.frame_recording import open_recording
+from common.recording.npz import read_npz
+from master.evaluation.wrist_score import load_wrist_truth
+from master.replay.recorded import recorded_cycles
 
 RECORDED = ("curl", "mcp", "spread", "left_small")
 MESHES = {"random": 24, "left_random": 16, "six": 6, "motion": 30}  # triples

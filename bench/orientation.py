@@ -17,17 +17,17 @@ from bench.played import START_NS, message_of, times_of
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import HandProfile, ImuCalibration, MarkerMount
-from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
-from common.hand_model import PALM_FRAME, WRIST, HandModel
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.hand.model import PALM_FRAME, WRIST, HandModel
+from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections
 from common.sim.imu import SimulatedImu
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"

@@ -14,8 +14,8 @@ import numpy as np
 
 from bench.hand_draws import MARKERS
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion, rigid
-from common.hand_model import CHAINS, FINGERS, HandModel
+from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.hand.model import CHAINS, FINGERS, HandModel
 
 INSTALL = "not installed (pip install mink)"
 _ANGLES = ("abduction", "flexion", "pip", "dip")
@@ -51,7 +51,7 @@ _MASS = '<inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>'  # bod
 
 
 def _finger(model: HandModel, f: int) -> str:
-    """Nested bodies: abduction, flexion (at one place), PIP, DIP. Rest turns as in `common.hand_model`."""
+    """Nested bodies: abduction, flexion (at one place), PIP, DIP. Rest turns as in `common.hand.model`."""
     name, root = FINGERS[f], CHAINS[f, 0]
     rest, still = model.rest_rotation[root], np.eye(3)
     before, after = (rest, still) if f == 0 else (still, rest)  # the thumb abducts about its own axis

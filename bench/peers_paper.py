@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 from bench.hand_draws import BACK, FACING_ROTATION, MARKERS
 from common.arrays import Float
-from common.geometry import rigid
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid
+from common.hand.model import HandModel
 from master.fabrik.chain import Pose
 from master.fabrik.fabrik import Fabrik
 from master.fabrik.finger import FingerSolver

@@ -7,8 +7,8 @@ from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariabl
 
 from bench.hand_draws import MARKERS, Noise
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT

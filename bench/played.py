@@ -12,9 +12,9 @@ from common.arrays import Float, Int
 from common.messages import HandPose, MarkerDetections
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from slave.markers.detector import Detections
 from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline

@@ -31,13 +31,13 @@ from bench.fusion_shown import shown
 from bench.row import Row
 from bench.scale_rig import ROOM, detections_of, in_order, room
 from common.messages import ImuSample, encode
-from master.app import result_at
-from master.dispatcher import Dispatcher
-from master.link import MasterLink
-from master.rig import load_setups
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.tuning import LivePipeline
+from master.rig.files import load_setups
+from master.rig.setup import RigSetup
+from master.run.app import result_at
+from master.run.dispatcher import Dispatcher
+from master.run.link import MasterLink
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline
 from slave.link import SlaveLink
 
 RIGS = {
@@ -70,8 +70,8 @@ began_s = process_time()
 import numba
 spent_s = process_time() - began_s
 from pathlib import Path
-from master.rig import load_setup
-from master.dispatcher import new_dispatcher
+from master.rig.files import load_setup
+from master.run.dispatcher import new_dispatcher
 setup, began_s = load_setup(Path("calib_json"), "desk"), process_time()
 new_dispatcher([setup])
 print(spent_s + process_time() - began_s)

@@ -28,11 +28,11 @@ from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Bool, Float, Int
 from common.calibration import HandProfile, MarkerMount
-from common.geometry import fit_rigid
-from common.hand_fitting import profile_from_joints
-from common.hand_model import CHAINS, TIPS, HandModel
-from common.hand_profiles import generated_profile
-from common.npz import read_npz
+from common.geometry.transforms import fit_rigid
+from common.hand.fitting import profile_from_joints
+from common.hand.model import CHAINS, TIPS, HandModel
+from common.hand.profiles import generated_profile
+from common.recording.npz import read_npz
 from master.calibrate.hand.palm import find_palm
 from master.mocap.compare import joint_track
 from master.mocap.read import Reading, read_motion

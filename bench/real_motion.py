@@ -1,7 +1,7 @@
 """Hands that others recorded, as the truth: Leap motions, a held hand after the filter, static poses of WebXR joints.
 
 **Motion**: the joints that the Leap recorded (`leapjs/*.npz`, model-based: bones are constant, the DIP bends as the
-PIP) are the truth themselves. A profile is made from the same joints (`common.hand_fitting`); its DIP is coupled 1 : 1,
+PIP) are the truth themselves. A profile is made from the same joints (`common.hand.fitting`); its DIP is coupled 1 : 1,
 its limits are D, widened for fingers bent back up to 30 degrees, thumbs 20, and for 30 degrees of abduction (the little
 finger 45). Caps on the five tips and one on the back, 1 mm of noise, go through estimator and filter at the recorded
 times. The cameras are where they see the back of the hand in the mean, and the cap there is hidden beyond 75 degrees.
@@ -27,11 +27,11 @@ from bench.row import Row
 from bench.solved_hand import TOWARDS, PointHand
 from common.arrays import Float, Int
 from common.calibration import Couplings, FilterCalibration, FingerLimits, Limits
-from common.geometry import matrix_to_rotation_vector, rigid
-from common.hand_fitting import profile_from_joints, profile_from_rest
-from common.hand_model import CHAINS, FINGERS, HandModel
-from common.hand_profiles import generated_profile
-from common.npz import read_npz
+from common.geometry.transforms import matrix_to_rotation_vector, rigid
+from common.hand.fitting import profile_from_joints, profile_from_rest
+from common.hand.model import CHAINS, FINGERS, HandModel
+from common.hand.profiles import generated_profile
+from common.recording.npz import read_npz
 from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
 from master.estimator.epoch import FittedHand
 from master.estimator.smooth import HandOneEuro
@@ -96,7 +96,7 @@ def rows() -> Iterator[Row]:
 
 
 def wide_limits() -> Limits:
-    """Limits D (`common.hand_presets`), wide enough for the hands that the Leap reports."""
+    """Limits D (`common.calibration.hand_presets`), wide enough for the hands that the Leap reports."""
 
     def finger(abduction: float) -> FingerLimits:
         return _limits((-abduction, abduction), (-30.0, 100.0), (-5.0, 120.0), (-5.0, 120.0))

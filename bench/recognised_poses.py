@@ -8,8 +8,8 @@ import numpy as np
 
 from bench.row import Row
 from common.arrays import Float
-from common.gesture_settings import default_gestures
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import default_gestures
+from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, HandPose, Source
 from common.sim.motion import POSES
 from master.gestures.features import FeatureExtractor

@@ -12,8 +12,8 @@ import msgspec
 from bench.row import Row
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination, Manifest
-from common.frame_writing import RecordingWriter, encode_png
+from common.recording.frame_recording import Illumination, Manifest
+from common.recording.frame_writing import RecordingWriter, encode_png
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.progress import Length

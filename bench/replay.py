@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from bench.row import Row
-from master.summary import read_summary
+from master.commands.summary import read_summary
 
 _ROOT = Path(__file__).parent.parent
 _RECORDINGS = (

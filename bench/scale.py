@@ -24,10 +24,10 @@ from bench.scale_page import into_page
 from bench.scale_rig import CALIBRATION, DESK, ROOM, detections_of
 from bench.scale_run import ScaleRun, measure
 from bench.scale_solve import solve_us
-from common.datagram import OVERHEAD
+from common.link.datagram import OVERHEAD
+from common.link.session import MAX_CAMERAS
 from common.messages import encode
-from common.session import MAX_CAMERAS
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 BUILDING = "building"
 PER_HAND = (

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from bench.local_rig import free_port
-from common.bus import Subscription
-from common.certificates import MASTER, OPERATOR
+from common.bus.bus import Subscription
+from common.bus.certificates import MASTER, OPERATOR
+from common.bus.keys import FOLDER, access_of
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from common.keys import FOLDER, access_of
 from common.messages import Gesture
-from common.zenoh_bus import ZenohBus
 
 SITE, HOPS = "room-a", 3  # relay, router, router
 _READY_S, _MESSAGES, _PERIOD_S = 60.0, 300, 0.01

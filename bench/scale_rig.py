@@ -15,8 +15,8 @@ from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.messages import MarkerDetections
 from common.sim.scene import HAND_DEPTH_M, Scene
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 ROOM, DESK = "room", "desk"

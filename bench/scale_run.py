@@ -20,9 +20,9 @@ import numpy as np
 
 from bench.local_rig import free_port, join_bus
 from bench.scale_rig import DESK, ROOM, desk, room
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.messages import Command, HandPose, encode
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 READY_S, SETTLE_S = 90.0, 3.0
 _TICKS = os.sysconf("SC_CLK_TCK")

@@ -19,10 +19,10 @@ import msgspec
 import numpy as np
 
 from bench.scale_rig import LOOP_S, detections_of
+from common.bus.keys import rig_key
 from common.clock import SystemClock
-from common.keys import rig_key
 from common.messages import MarkerDetections
-from master.rig import load_setup
+from master.rig.files import load_setup
 from slave.uplink import Uplink
 
 _START_S = 60.0

@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 from bench.scale_rig import ROOM, detections_of, in_order, room
-from master.dispatcher import Dispatcher
-from master.rig import load_setups
-from master.stages import StageTimes
-from master.tuning import LivePipeline
+from master.rig.files import load_setups
+from master.run.dispatcher import Dispatcher
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline
 
 _POSES, _WARM = 200, 20
 

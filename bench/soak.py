@@ -19,8 +19,8 @@ from bench.soak_monitor import Minute, SoakHistory, Watch
 from bench.soak_plot import draw
 from bench.soak_rig import SoakSettings, running
 from bench.soak_verdict import Finding, judge
-from common.replacing import replacing
-from master.stopping import stop_on_signals
+from common.calibration.replacing import replacing
+from master.run.stopping import stop_on_signals
 
 _READY_S = 90.0
 _LISTEN_S = 0.5

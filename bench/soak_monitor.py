@@ -9,7 +9,7 @@ import numpy as np
 from bench.processes import Footprint, cpu_s, footprint
 from bench.soak_rig import SoakRig
 from bench.soak_steps import grown, mapped
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.messages import HandPose, Health
 
 _DEPTH = 4096

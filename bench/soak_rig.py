@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.local_rig import free_port
-from common.keys import FOLDER
+from common.bus.keys import FOLDER
 from deploy.process import Process
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"

@@ -5,8 +5,8 @@ from math import inf
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.hand_model import HandModel
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandModel
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings

@@ -10,7 +10,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError, PhalanxError
 from common.option_types import whole
 from common.terminal import echo
-from master.options import add_calibration
+from master.commands.options import add_calibration
 from master.study.one import CAUSES, Condition, Task
 from master.study.paper import BLOCKS, PARTICIPANTS
 from master.study.run import Study, finish, recorded, simulate
@@ -163,7 +163,7 @@ def study(options: Namespace) -> None:
         result = recorded(
             options.recordings,
             lambda name: _hand(options.hand, options.calibration, name),
-            options.level,
+            options.solver_mode,
             options.out,
             _progress(),
         )
@@ -178,7 +178,7 @@ def study(options: Namespace) -> None:
             options.seed,
             options.blocks,
             conditions,
-            options.level,
+            options.solver_mode,
             options.step,
             options.guided,
             options.out,

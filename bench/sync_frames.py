@@ -11,11 +11,11 @@ from bench.played import START_NS, Watched, solve, watch
 from bench.sync_rig import SPEED_M_S, Treatment
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.scene import Scene, view_centre
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 AMPLITUDE_M = 0.15

@@ -14,7 +14,7 @@ from scipy.signal import savgol_filter  # pyright: ignore[reportUnknownVariableT
 
 from bench.row import Row
 from common.arrays import Float
-from common.npz import read_npz
+from common.recording.npz import read_npz
 
 _ROOT = Path(__file__).resolve().parents[1]
 _GRID_S = 0.01

@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from master.estimator.cameras import CameraArrays
 from master.fabrik.intersection import triangulate
 from master.fabrik.sync import FrameSet, FrameSync
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 DEPTH_M, SPEED_M_S = 0.5, 1.0

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
-from common.camera_model import CameraModel
-from common.object_profile import TagFamily, tag_corners
-from common.srgb import to_srgb
-from common.tag_family import tag_bits
+from common.calibration.object_profile import TagFamily, tag_corners
+from common.geometry.camera_model import CameraModel
+from common.geometry.srgb import to_srgb
+from common.geometry.tag_family import tag_bits
 
 SUB = 5  # sub-pixels along a side of a pixel
 BLACK, PAPER = 0.03, 0.75  # linear light of print and paper

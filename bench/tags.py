@@ -12,9 +12,9 @@ from bench.row import Row
 from bench.tag_images import Look, tag_picture
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, load
-from common.camera_model import CameraModel
-from common.object_profile import ObjectProfile, Tag, TagFamily, Tags
-from common.tag_family import dictionary
+from common.calibration.object_profile import ObjectProfile, Tag, TagFamily, Tags
+from common.geometry.camera_model import CameraModel
+from common.geometry.tag_family import dictionary
 from slave.tags.finder import TagFinder
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,11 +15,16 @@ from bench.object_views import Where, detections
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError
-from common.geometry import matrix_to_quaternion, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import (
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    rigid,
+    rotation_vector_to_matrix,
+)
 from common.messages import ObjectPose, TrackerPose
-from common.object_profile import ObjectProfile
 from common.sim.scene import view_centre
 from common.sim.tracked import facing
 from common.sim.tracker import WANDER_M, WANDER_RAD, WHITE_M, WHITE_RAD

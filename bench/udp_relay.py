@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from common.datagram import Address
+from common.link.datagram import Address
 
 _BROADCAST = "127.255.255.255"
 _LONGEST = 8192

@@ -14,15 +14,15 @@ from bench.played import message_of
 from bench.row import Row
 from common.arrays import Bool, Float
 from common.calibration import HandProfile, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose, MarkerDetections
 from common.sim.motion import POSES, REST, HandMotion, HandState, angles_of, base_pose, smooth_step
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"

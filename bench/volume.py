@@ -12,12 +12,12 @@ from bench.played import solve, times_of, times_of_poses, watch
 from bench.row import Row
 from common.arrays import Bool, Float
 from common.calibration import HandProfile, load
-from common.geometry import rigid
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid
+from common.hand.model import HandModel
 from common.sim.motion import POSES, HandState, angles_of, base_pose, smooth_step
 from common.sim.scene import Scene
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 TIP = 1  # the marker that is taken about: the index finger's

@@ -23,11 +23,11 @@ import zenoh
 
 from bench.local_rig import free_port, join_bus
 from bench.row import Row
+from common.bus.keys import new_key
 from common.errors import BusError
-from common.keys import new_key
 from common.messages import Command, Health
-from common.streams import MASTER
-from master.send.sender import NAME as SENDER
+from common.messages.streams import MASTER
+from master.outputs.network.sender import NAME as SENDER
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 TURNS, SECONDS, SETTLE_S, READY_S, RATE_HZ = 6, 12.0, 6.0, 60.0, 30.0

@@ -21,13 +21,13 @@ from bench.markers import Step, interleaved
 from bench.row import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import open_recording
 from common.messages import WristDetections, encode
+from common.recording.frame_recording import open_recording
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.estimator.wrist_pipeline import WristPipeline
-from master.stages import StageTimes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
+from master.run.stages import StageTimes
 from slave.cameras.replay import read_png
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame

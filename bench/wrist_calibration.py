@@ -14,18 +14,18 @@ from bench.row import Row
 from bench.wrist_subjects import Person
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.flat_field import field_at
+from common.calibration.wrist import LaserPlane
 from common.errors import FitError
-from common.flat_field import field_at
-from common.frame_recording import Illumination
-from common.geometry import (
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import (
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
     transform,
 )
-from common.hand_model import HandModel
+from common.hand.model import HandModel
+from common.recording.frame_recording import Illumination
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer, WristBoardScene, board_poses
-from common.wrist_calibration import LaserPlane
 from master.calibrate.cameras.boards import Checkerboard, board_corners
 from master.calibrate.wrist.board_pose import place_corners
 from master.calibrate.wrist.flat_command import white_of
@@ -36,7 +36,7 @@ from master.calibrate.wrist.palm_board import BoardOffset, palm_from_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 CALIB = Path("calib_json")
 SEEDS = range(100, 120)

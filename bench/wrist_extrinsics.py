@@ -25,9 +25,13 @@ from bench.row import Row
 from common.arrays import Float
 from common.calibration import RigCalibration
 from common.errors import FitError
-from common.frame_recording import open_recording
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
+from common.geometry.transforms import (
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
 from common.messages import HandPose, ImuSample, MarkerDetections, WristDetections
+from common.recording.frame_recording import open_recording
 from common.sim.motion import HandMotion, HandState
 from common.sim.record_both import record_both
 from common.sim.scenes import scene_by_name
@@ -35,11 +39,11 @@ from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.extrinsics.command import imu_samples, marker_poses
 from master.calibrate.extrinsics.extrinsics import Extrinsics, calibrate_extrinsics
-from master.recorded import recorded_cycles
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.replay.recorded import recorded_cycles
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 M = TypeVar("M", WristDetections, ImuSample)
 SCENE, SECONDS = "both-moves", 10.0

@@ -22,14 +22,14 @@ from bench.wrist_mesh.sets import set_named, write_set
 from bench.wrist_shown import RECORDINGS, ROOT, datasets
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import open_recording
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.messages import WristDetections
-from common.npz import read_npz
+from common.recording.frame_recording import open_recording
+from common.recording.npz import read_npz
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from master.estimator.wrist_pipeline import WristPipeline
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from slave.cameras.replay import read_png
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame

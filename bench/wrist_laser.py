@@ -19,7 +19,7 @@ from bench.row import Row
 from bench.wrist_shown import RECORDINGS, ROOT, datasets, other_palm, recorded
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from slave.cameras.synthetic import STROBE

@@ -11,12 +11,12 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.estimator.wrist_pipeline import WristPipeline
-from master.stages import StageTimes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
+from master.run.stages import StageTimes
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
 from slave.wrist.background import lit

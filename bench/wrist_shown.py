@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from common.arrays import Float, Image
 from common.calibration import HandProfile, RigCalibration, load
-from common.frame_recording import open_recording
-from common.npz import read_npz
+from common.recording.frame_recording import open_recording
+from common.recording.npz import read_npz
 from slave.cameras.replay import read_png
 from slave.sources import Frame
 from slave.wrist.background import lit

@@ -13,7 +13,7 @@ import numpy as np
 from bench.row import Row, median_us
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination, open_recording
+from common.recording.frame_recording import Illumination, open_recording
 from common.sim.wrist.record import ORDER, with_faults
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene

@@ -13,8 +13,8 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.geometry import matrix_to_rotation_vector, transform
-from common.hand_model import CHAINS, JOINTS, HandModel
+from common.geometry.transforms import matrix_to_rotation_vector, transform
+from common.hand.model import CHAINS, JOINTS, HandModel
 from common.messages import WristDetections
 from common.sim.wrist.scene import WristScene
 from master.study.participant import participant

@@ -16,7 +16,7 @@ from bench.row import Row, median_us
 from bench.wrist_shown import RECORDINGS, ROOT, datasets, other_palm, recorded
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.hand_profiles import generated_profile
+from common.hand.profiles import generated_profile
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from slave.cameras.synthetic import STROBE

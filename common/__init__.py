@@ -1,1 +1,1 @@
-"""The language both sides of the wire speak."""
+"""What both sides share: messages, files, geometry, the hand; imports neither."""

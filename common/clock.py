@@ -1,7 +1,7 @@
 """Time: monotonic clock, simulated foreign clock, and a drift-free loop tick.
 
 Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never
-asked, and setting it moves nothing. How the clock of another machine runs is `common.clock_offset`.
+asked, and setting it moves nothing. How the clock of another machine runs is `common.link.clock_offset`.
 """
 
 import time

@@ -14,7 +14,7 @@
     ├── BusError           the bus cannot be opened, or nobody answers
     └── FitError           observations do not determine the value asked for
 
-A bad datagram raises nothing: `common.datagram` counts it by reason. `ValueError` stays
+A bad datagram raises nothing: `common.link.datagram` counts it by reason. `ValueError` stays
 what it is everywhere: the caller passed something of the wrong shape or range.
 """
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import quaternion_to_matrix
+from common.geometry.transforms import quaternion_to_matrix
 
 _REGION = 5.991  # chi square, two degrees of freedom, 95 %
 

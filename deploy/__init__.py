@@ -1,4 +1,1 @@
-"""Starts and orchestrates processes by their command lines.
-
-It imports none of the packages it starts.
-"""
+"""Processes and machines: command lines and hosts enter, running services leave."""

@@ -322,7 +322,7 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
     command = [
         sys.executable,
         "-m",
-        "master.report_command",
+        "master.commands.report",
         *place,
         *files,
         "--scene-epoch-ns",

@@ -1,1 +1,1 @@
-"""On the PC: messages in, hands out."""
+"""On the PC: messages enter, hands leave."""

@@ -1,1 +1,1 @@
-"""Beside the sensor: light in, small messages out."""
+"""Beside the sensor: light enters, small messages leave."""

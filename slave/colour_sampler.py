@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.camera_settings import ColourPick
+from common.calibration.camera_settings import ColourPick
 from common.errors import CameraError
 from slave.markers.colour_sampling import SampledColours
 from slave.markers.reloadable import ReloadableDetector

@@ -11,7 +11,7 @@ from math import isfinite
 import numpy as np
 
 from common.arrays import Float
-from common.imu_fusion import OrientationFilter
+from common.imu.fusion import OrientationFilter
 from slave.failures import Failures
 from slave.sources import Reporting
 

@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 
 from common.calibration import CameraCalibration, ImuCalibration, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.strobe import StrobeCalibration
 from common.clock import Clock
 from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError, TrackerError
-from common.imu_fusion import OrientationFilter
-from common.object_profile import ObjectProfile
-from common.strobe_calibration import StrobeCalibration
+from common.imu.fusion import OrientationFilter
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options

@@ -12,7 +12,7 @@ TRACKERS = f"{REAL_TRACKERS} | synthetic"
 SWITCHED_LIGHTS = "gpio:CHIP:LASER,LED | i2c:BUS[:ADDRESS]"
 LIGHTS = f"{SWITCHED_LIGHTS} | camera | external"
 SCANS = ("auto", "full", "windows")
-# The units of a table of an IMU, by what is measured; a test compares them with `common.imu_csv_columns`.
+# The units of a table of an IMU, by what is measured; a test compares them with `common.imu.csv_columns`.
 IMU_UNITS = {
     "time": ("s", "ms", "us", "ns"),
     "gyro": ("rad/s", "deg/s", "mdeg/s"),

@@ -17,7 +17,9 @@ import msgspec
 
 from common.calibration import RigCalibration
 from common.errors import PictureError, RecordingError
-from common.frame_recording import (
+from common.imu.recording import IMU, read_imu, write_imu
+from common.messages import ImuSample
+from common.recording.frame_recording import (
     MAX_TIME_NS,
     FrameRecording,
     FrameRow,
@@ -25,10 +27,8 @@ from common.frame_recording import (
     RecordedClock,
     open_recording,
 )
-from common.frame_writing import RecordingWriter, refuse_occupied
-from common.imu_recording import IMU, read_imu, write_imu
-from common.messages import ImuSample
-from common.pictures import read_picture
+from common.recording.frame_writing import RecordingWriter, refuse_occupied
+from common.recording.pictures import read_picture
 from slave.progress import megabytes
 
 TRUTH = "truth.npz"

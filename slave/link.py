@@ -19,13 +19,12 @@ from collections import Counter
 from dataclasses import dataclass
 from hmac import compare_digest
 
+from common.bus.endpoints import reached_at
 from common.clock import Clock
-from common.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
-from common.endpoints import reached_at
+from common.link.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
 from common.link.handshake import RULES, WELL_NS, Event, Role, Rule, State
-from common.link_key import LinkKey
-from common.messages import WIRE_VERSION, Message, encode
-from common.session import (
+from common.link.link_key import LinkKey
+from common.link.session import (
     NONCE_BYTES,
     Beacon,
     EchoAnswer,
@@ -42,6 +41,7 @@ from common.session import (
     read,
     seal,
 )
+from common.messages import WIRE_VERSION, Message, encode
 
 VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
 UNLISTED_NS = 1_000_000_000

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from common.calibration import CameraCalibration, RigCalibration
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from slave.colour_sampler import ColourSampler
 from slave.counters import DetectionCounters
 from slave.light_report import LightReport

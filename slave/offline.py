@@ -14,9 +14,9 @@ import numpy as np
 from common.arrays import Float, Int
 from common.calibration import CameraCalibration, HandProfile, load, save
 from common.errors import CalibrationError, RecordingError
-from common.frame_pictures import FramePictures
-from common.frame_recording import FrameRecording, open_recording
-from common.npz import write_npz
+from common.recording.frame_pictures import FramePictures
+from common.recording.frame_recording import FrameRecording, open_recording
+from common.recording.npz import write_npz
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread

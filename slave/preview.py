@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Image
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import Clock
 from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
-from common.preview_wish import PreviewWish
+from common.messages.preview_wish import PreviewWish
 from slave.failures import Failures
 from slave.overlay import MarkerOverlay, WristOverlay
 from slave.sources import Frame

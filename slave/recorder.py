@@ -25,8 +25,8 @@ import numpy as np
 
 from common.clock import Clock
 from common.errors import RecordingError
-from common.frame_recording import Illumination, Manifest, RecordedClock
-from common.frame_writing import RecordingWriter, encode_png
+from common.recording.frame_recording import Illumination, Manifest, RecordedClock
+from common.recording.frame_writing import RecordingWriter, encode_png
 from slave.cameras.replay import is_grey
 from slave.progress import Length, Progress, megabytes
 from slave.sources import Frame, FrameSource

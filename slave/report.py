@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
 from common.machine import Machine, program

@@ -20,11 +20,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Image
+from common.bus.keys import Access
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock
-from common.imu_fusion import OrientationFilter
-from common.keys import Access
+from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections, Message, TagDetections, TrackerPose
-from common.zenoh_bus import ZenohBus
 from slave.counters import Counters, DetectionCounters, imu_counters, pose_counters
 from slave.report import Reporter
 from slave.service import Service

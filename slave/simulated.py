@@ -14,13 +14,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
 from common.clock import SkewedClock
 from common.errors import CalibrationError, CameraError, TrackerError
-from common.frame_recording import open_recording
-from common.geometry import matrix_to_quaternion
-from common.imu_recording import write_imu
+from common.geometry.transforms import matrix_to_quaternion
+from common.imu.recording import write_imu
 from common.messages import ImuSample, TrackerPose
-from common.object_profile import ObjectProfile
+from common.recording.frame_recording import open_recording
 from common.sim.board import BoardScene
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene

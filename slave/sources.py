@@ -12,8 +12,8 @@ from msgspec import Struct
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.frame_recording import Illumination
 from common.messages import ImuSample, TrackerPose
+from common.recording.frame_recording import Illumination
 
 ItemT_co = TypeVar("ItemT_co", covariant=True)
 
@@ -76,7 +76,7 @@ class Reporting(Protocol):
     def metrics(self) -> Mapping[str, float]:
         """Quantity with its unit -> value now.
 
-        Settings of a camera have the names of `common.camera_settings`.
+        Settings of a camera have the names of `common.calibration.camera_settings`.
         """
         ...
 

@@ -3,8 +3,8 @@
 On command, or because its files were changed.
 
     settings    report what the camera has, and which colours are in use
-    set         other exposure, gains, rate, margin, colours (body: `common.camera_settings.CameraSettings`)
-    pick        the colour of a marker, from a pixel on it (body: `common.camera_settings.ColourPick`)
+    set         other exposure, gains, rate, margin, colours (body: `common.calibration.camera_settings.CameraSettings`)
+    pick        the colour of a marker, from a pixel on it (body: `common.calibration.camera_settings.ColourPick`)
     load        another content of the camera file (body: the file): exposure, gains, rate, colours of the markers
     save        write the content in use to the slave's own camera file
 
@@ -23,8 +23,7 @@ from typing import TypeAlias
 from msgspec import structs
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse, save
-from common.calibration_parts import Provenance, date_now
-from common.camera_settings import (
+from common.calibration.camera_settings import (
     WANTED,
     CameraSettings,
     ColourPick,
@@ -33,9 +32,10 @@ from common.camera_settings import (
     refuse_strange,
     same_exposed,
 )
+from common.calibration.file_monitor import MonitoredFiles
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.parts import Provenance, date_now
 from common.errors import CalibrationError, PhalanxError
-from common.file_monitor import MonitoredFiles
-from common.object_profile import ObjectProfile
 from slave.colours_in_use import in_use
 from slave.sources import Tunable
 

@@ -15,12 +15,12 @@ from collections.abc import Callable
 from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock
-from common.datagram import Address
 from common.errors import BusError
-from common.link_key import LinkKey
+from common.link.datagram import Address
+from common.link.link_key import LinkKey
+from common.link.session import Random
+from common.link.udp import READ_TIMEOUT_S, UdpSocket
 from common.messages import Message
-from common.session import Random
-from common.udp import READ_TIMEOUT_S, UdpSocket
 from slave.link import SlaveLink
 
 ANYWHERE = "0.0.0.0"

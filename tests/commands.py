@@ -12,7 +12,13 @@ from pathlib import Path
 
 _FORKED = multiprocessing.get_context("forkserver")
 _FORKED.set_forkserver_preload(
-    ["master.__main__", "master.replay", "slave.__main__", "slave.offline", "master.export.run"]
+    [
+        "master.__main__",
+        "master.replay.detect",
+        "slave.__main__",
+        "slave.offline",
+        "master.recording.export.run",
+    ]
 )
 _WAIT_S = 120.0
 

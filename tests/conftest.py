@@ -30,8 +30,8 @@ LIVE = (
     "tests/master/console/",
     "tests/master/test_installed_master.py",
     "tests/master/test_live",
-    "tests/master/web/test_page.py",
-    "tests/master/export/test_export_gltf.py",
+    "tests/master/outputs/web/test_page.py",
+    "tests/master/recording/export/test_export_gltf.py",
 )
 
 # These solve hands of more free angles, whose kernels no other test needs: two workers would compile them twice.
@@ -39,8 +39,8 @@ OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py
 
 _KERNELS = (
     "common/kernels.py",
-    "common/records.py",
-    "common/capsule_gaps.py",
+    "common/messages/records.py",
+    "common/hand/capsule_gaps.py",
     "master/fabrik/*.py",
     "master/estimator/*.py",
     "master/gestures/*.py",

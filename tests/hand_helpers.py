@@ -17,11 +17,11 @@ from common.calibration import (
     RigCalibration,
     load,
 )
-from common.camera_model import CameraModel
-from common.geometry import rigid
-from common.hand_model import CHAINS, HandJoints, HandModel
-from common.hand_presets import preset_limits, without_tolerance
-from common.hand_profiles import generated_profile
+from common.calibration.hand_presets import preset_limits, without_tolerance
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, HandJoints, HandModel
+from common.hand.profiles import generated_profile
 from common.messages import MarkerDetections
 from master.fabrik.cap_views import seen_shift
 from master.fabrik.caps import CapTables

@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.local_rig import free_port
 from common.messages import FINGER_COUNT, Health, MarkerDetections, WristDetections
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 
 PATIENCE_S = (
     60.0  # what a test waits for comes at once; a machine with other things to do may take as long as this

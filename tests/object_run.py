@@ -9,14 +9,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import invert, matrix_to_quaternion, rigid, transform
+from common.calibration.object_profile import ObjectProfile, tag_corners
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert, matrix_to_quaternion, rigid, transform
 from common.messages import MarkerDetections, TagDetections, TrackerPose
-from common.object_profile import ObjectProfile, tag_corners
 from common.sim.scene import Scene
-from master.report import Played
-from master.rig import load_setups
-from master.rig_setup import RigSetup
+from master.evaluation.report import Played
+from master.rig.files import load_setups
+from master.rig.setup import RigSetup
 
 PERIOD_NS = 16_666_667
 START_NS = 1_000_000_000

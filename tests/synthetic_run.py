@@ -6,9 +6,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import RigCalibration
-from common.hand_model import HandJoints
+from common.hand.model import HandJoints
 from common.messages import MarkerDetections
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, detections, palm, rig_file
 
 PERIOD_NS = 16_666_667

@@ -26,7 +26,10 @@ FORBIDDEN: dict[str, frozenset[str]] = {
 }
 # The only files that know a library.
 ONLY_IN: dict[str, tuple[str, ...]] = {
-    "zenoh": ("common/zenoh_bus.py", "master/send/ros2_link.py"),  # the second: ROS 2's own network
+    "zenoh": (
+        "common/bus/zenoh_bus.py",
+        "master/outputs/network/ros2_link.py",
+    ),  # the second: ROS 2's own network
     "nicegui": ("master/console/*.py",),
     "rerun": ("master/outputs/rerun*.py",),
     "rerun_cli": ("master/outputs/rerun*.py",),
@@ -38,8 +41,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "libcamera": ("slave/cameras/picamera2*.py",),
     "numba": ("common/kernels.py", "slave/markers/fast*.py"),
     "openvr": ("slave/objects/openvr*.py",),
-    "pylsl": ("master/send/lsl*.py",),
-    "pythonosc": ("master/send/osc*.py",),
+    "pylsl": ("master/outputs/network/lsl*.py",),
+    "pythonosc": ("master/outputs/network/osc*.py",),
 }
 NEVER = frozenset({"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"})
 # Import name -> name in pyproject.toml, where they differ. picamera2 and libcamera come with the Pi's system.
@@ -55,10 +58,10 @@ SYSTEM = frozenset({"picamera2", "libcamera"})
 # Files of common that the slave never loads may use what only the PC has.
 PC_ONLY = {
     "common/kernels.py": frozenset({"numba"}),
-    "common/recording.py": frozenset({"mcap"}),
-    "common/recording_parts.py": frozenset({"mcap"}),
-    "common/mcap_file.py": frozenset({"mcap"}),
-    "common/mcap_chunk.py": frozenset({"mcap", "zstandard"}),
+    "common/recording/messages.py": frozenset({"mcap"}),
+    "common/recording/parts.py": frozenset({"mcap"}),
+    "common/recording/mcap_file.py": frozenset({"mcap"}),
+    "common/recording/mcap_chunk.py": frozenset({"mcap", "zstandard"}),
 }
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(
@@ -135,7 +138,7 @@ def undeclared(path: str, text: str) -> set[str]:
         promised += project["optional-dependencies"]["fast"]
     if fnmatch(path, "slave/objects/openvr*.py"):
         promised += project["optional-dependencies"]["vive"]
-    if fnmatch(path, "master/send/lsl*.py"):
+    if fnmatch(path, "master/outputs/network/lsl*.py"):
         promised += project["optional-dependencies"]["lsl"]
     have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())
     names = set(imported(text)) - OURS - sys.stdlib_module_names
@@ -210,23 +213,23 @@ Guard = Callable[[str, str], set[str]]
 PLANTED: list[tuple[Guard, str, str, str]] = [
     (wrong_side, "common/x.py", "def late():\n    from master.fabrik import depth\n", "import common.clock"),
     (wrong_side, "common/x.py", "import rerun as rr", "import re"),
-    (wrong_side, "common/bus.py", "import zenoh", "import common.zenoh_bus"),
+    (wrong_side, "common/bus/bus.py", "import zenoh", "import common.bus.zenoh_bus"),
     (wrong_side, "slave/app.py", "from master import ingest", "from common import bus"),
     (wrong_side, "slave/app.py", "import serial", "import common"),
     (wrong_side, "slave/app.py", "from smbus2 import SMBus", "import slave.imu"),
     (wrong_side, "slave/cameras/v4l2.py", "from picamera2 import Picamera2", "import cv2"),
-    (wrong_side, "master/app.py", "import slave.app", "import master.ingest"),
+    (wrong_side, "master/run/app.py", "import slave.app", "import master.run.ingest"),
     (
         wrong_side,
-        "master/app.py",
+        "master/run/app.py",
         "importlib.import_module('slave.app')",
-        "importlib.import_module('master.app')",
+        "importlib.import_module('master.run.app')",
     ),
-    (wrong_side, "master/app.py", "import rerun", "import master.outputs.rerun"),
-    (wrong_side, "master/app.py", "if True:\n    import pickle", "import json"),
+    (wrong_side, "master/run/app.py", "import rerun", "import master.outputs.rerun"),
+    (wrong_side, "master/run/app.py", "if True:\n    import pickle", "import json"),
     (wrong_side, "deploy/demo.py", "import common.clock", "import subprocess"),
     (undeclared, "slave/app.py", "import starlette", "import cv2, numpy, msgspec"),
-    (undeclared, "master/app.py", "import pandas", "import starlette, rerun, scipy.optimize"),
+    (undeclared, "master/run/app.py", "import pandas", "import starlette, rerun, scipy.optimize"),
     (undeclared, "slave/markers/centroid.py", "import numba", "import cv2"),
     (undeclared, "slave/markers/fast_scan.py", "import scipy", "import numba"),
     (relative_imports, "slave/app.py", "from . import cameras", "from slave import cameras"),
@@ -271,7 +274,7 @@ def test_the_guard_bites_a_planted_violation_only(
 @pytest.mark.parametrize(
     ("name", "path"),
     [
-        ("zenoh", "common/zenoh_bus.py"),
+        ("zenoh", "common/bus/zenoh_bus.py"),
         ("rerun", "master/outputs/rerun_viewer.py"),
         ("smbus2", "slave/imu/icm20948.py"),
         ("picamera2", "slave/cameras/picamera2.py"),

@@ -12,8 +12,8 @@ import pytest
 
 from bench.__main__ import SECTIONS
 from common.calibration import HandProfile, RigCalibration, parse
-from common.hand_model import FINGERS, JOINTS, HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import FINGERS, JOINTS, HandModel
+from common.hand.profiles import generated_profile
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "calib_json").rglob("*.md")})

@@ -8,13 +8,13 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, schema
-from common.frame_recording import Manifest
-from common.gesture_settings import GestureSettings
+from common.calibration.gesture_settings import GestureSettings
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.output_settings import OutputSettings
 from common.link.handshake import state_pages
-from common.message_schema import bounds_table, bus_schema
 from common.messages import AnyMessage, HandPose
-from common.object_profile import ObjectProfile
-from common.output_settings import OutputSettings
+from common.messages.schema import bounds_table, bus_schema
+from common.recording.frame_recording import Manifest
 
 MESSAGES = "messages.json"
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "schema"

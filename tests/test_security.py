@@ -4,10 +4,10 @@ from ipaddress import ip_address
 
 import pytest
 
-from common.endpoints import default_bus
-from common.output_settings import OutputSettings
+from common.bus.endpoints import default_bus
+from common.calibration.output_settings import OutputSettings
+from master.commands.options import CALIB_JSON, HERE_BEACON, HERE_BIND
 from master.console.state import ConsoleSettings
-from master.options import CALIB_JSON, HERE_BEACON, HERE_BIND
 from master.outputs.rerun_process import viewer_arguments
 from slave.uplink import ANYWHERE
 from tests.sockets import PAGE, Listener, rows, undocumented

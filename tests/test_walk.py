@@ -7,8 +7,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from master.dispatcher import Dispatcher
-from master.rig_pipeline import pipeline_of
+from master.rig.pipeline import pipeline_of
+from master.run.dispatcher import Dispatcher
 from tests.synthetic_run import synthetic_run
 
 ROOMS = "master", "common"

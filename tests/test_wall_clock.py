@@ -14,15 +14,17 @@ PACKAGES = ("common", "slave", "master")
 WALL = {"time": {"time", "time_ns", "localtime", "gmtime", "ctime", "CLOCK_REALTIME", "CLOCK_TAI"}}
 WALL |= {"datetime": {"now", "utcnow", "today"}, "date": {"today"}}
 # Beside the line: what people set up, look at and keep, and what is sent on in the time of other programs.
-NOT_LIVE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/send/", "master/export/",
-          "master/study/", "master/keys_command.py", "master/keys_folder.py", "master/listening.py",
-          "common/certificates.py")  # fmt: skip
+NOT_LIVE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/outputs/network/",
+          "master/recording/export/",
+          "master/study/", "master/commands/keys.py", "master/commands/keys_folder.py",
+          "master/outputs/web/listening.py",
+          "common/bus/certificates.py")  # fmt: skip
 REASONS = {
-    "common/bus_refusal.py": "what the validity of certificates is judged by, in words about a refused connection",
-    "common/calibration_parts.py": "the date of a measurement, in its file",
-    "common/recording.py": "the date of a recording, in its file",
+    "common/bus/refusal.py": "what the validity of certificates is judged by, in words about a refused connection",
+    "common/calibration/parts.py": "the date of a measurement, in its file",
+    "common/recording/messages.py": "the date of a recording, in its file",
     "slave/recorder.py": "what the wall clock said when a recording began, in its file",
-    "slave/cameras/stamps.py": "drivers that stamp frames so: moved to the monotonic clock frame by frame",
+    "slave/clocks.py": "drivers that stamp frames so: moved to the monotonic clock frame by frame",
 }
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import rotation_vector_to_matrix
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rotation_vector_to_matrix
 from common.messages import MarkerDetections
 from tests.hand_helpers import MARKERS, RIGHT, camera_models, palm, rig_file
 

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion
-from common.hand_model import HandModel
-from common.hand_profiles import mirrored_profile
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
+from common.hand.profiles import mirrored_profile
 from common.messages import HandPose, Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
-from master.rig import load_setup
-from master.rig_setup import RigSetup
-from master.wrist_setup import WristSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
+from master.rig.wrist import WristSetup
 
 CYCLE_NS = 33_333_333
 START_NS = 1_000_000_000

@@ -23,7 +23,7 @@ from bench import seed_markers
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, read, read_strobed, without
 from bench.aarch64.parts import counted_parts
 from common.messages import Message, WristDetections, encode
-from master.link import MasterLink
+from master.run.link import MasterLink
 from slave.counters import DetectionCounters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector

@@ -12,7 +12,7 @@ import numpy as np
 from bench.wrist_mesh.hinges import Hinges
 from bench.wrist_mesh.subdivision import Subdivision
 from common.arrays import Float, Int
-from common.hand_model import WEBXR_JOINTS, HandModel
+from common.hand.model import WEBXR_JOINTS, HandModel
 
 SEGMENT = np.array(
     [0, 10, 11, 13, 13, *(f + s for f in (20, 30, 40, 50) for s in (0, 1, 2, 3, 3))]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 
 ROLL_RAD = {  # thumb, index ... little
     "right": (0.041463, 0.002728, 0.001839, -0.000725, 0.000906),

@@ -8,7 +8,7 @@ from bench.wrist_mesh.hand_mesh import HandMesh, Posed
 from bench.wrist_mesh.raster import Samples
 from common.arrays import Bool, Float, Int
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.kernels import kernel
 
 RAYS = 12288  # 0.15 mrad apart

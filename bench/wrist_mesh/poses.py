@@ -4,7 +4,7 @@ import numpy as np
 
 from bench.wrist_mesh.hinges import CHAINS, Hinges
 from common.arrays import Bool, Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 
 DIP_PER_PIP = 0.84
 MCP_PER_PIP = 0.54

@@ -15,10 +15,10 @@ from bench.wrist_mesh.room import Room, grained, picture
 from bench.wrist_mesh.truth import laser_truth, tip_truth
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.camera_model import CameraModel
-from common.frame_recording import Illumination, Manifest
-from common.hand_model import HandModel
-from common.wrist_joint import forearm_palm
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandModel
+from common.hand.wrist_joint import forearm_palm
+from common.recording.frame_recording import Illumination, Manifest
 
 ORDER = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 Arrays = dict[str, npt.NDArray[np.generic]]

@@ -13,7 +13,7 @@ import numpy as np
 from bench.wrist_mesh.hand_mesh import Posed
 from bench.wrist_mesh.shadows import from_afar, sky
 from common.arrays import Float, Image, Int
-from common.frame_recording import Illumination, open_recording
+from common.recording.frame_recording import Illumination, open_recording
 
 BLACK = 2.0
 RECORDINGS = ("curl", "mcp", "spread", "left_small")

@@ -14,8 +14,8 @@ from bench.wrist_mesh.room import LEVELS, Room, behind
 from bench.wrist_mesh.truth import FINGERS, GROUPS
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.frame_recording import Manifest, load_manifest
-from common.hand_model import WEBXR_JOINTS, HandModel
+from common.hand.model import WEBXR_JOINTS, HandModel
+from common.recording.frame_recording import Manifest, load_manifest
 from common.sim.record import ANGLE_NAMES, FIRST_NS, RenderedFrame, write_frames, write_truth
 
 PERIOD_S = 1.0 / 90.0

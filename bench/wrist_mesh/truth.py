@@ -8,7 +8,7 @@ from bench.wrist_mesh.hinges import CHAINS
 from bench.wrist_mesh.line import Curve, Fan
 from bench.wrist_mesh.raster import Samples
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 
 LEAST_M = 2e-4  # of visible line, for a centroid
 GROUPS = ("palm", "thumb", "index", "middle", "ring", "pinky", "thenar")

@@ -1,1 +1,1 @@
-"""What both ends of the datagram link share; datagrams enter, events leave."""
+"""The datagram link, both ends: sealed datagrams enter, messages leave."""

@@ -15,7 +15,7 @@ nor a replayed datagram ends it.
 from enum import StrEnum
 from typing import NamedTuple
 
-from common.datagram import Kind, Refusal
+from common.link.datagram import Kind, Refusal
 
 WELL_NS = 500_000_000  # a peer that was received this recently keeps its session
 

@@ -1,4 +1,1 @@
-"""Simulated rig: motions with exact truth, and the camera images of them.
-
-No hardware is needed.
-"""
+"""Simulated rig: a scene and a seed enter, exact truth and pictures leave."""

@@ -16,9 +16,9 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import invert
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert
 from common.sim.desk import LENS_SIGMA_PX, NoiseTiles
 from common.sim.light import Float32, SrgbTables
 

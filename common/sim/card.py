@@ -11,10 +11,10 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.geometry import axis_rotation
+from common.geometry.srgb import to_linear
+from common.geometry.transforms import axis_rotation
 from common.sim.board import TEXELS_PER_M, BoardScene, Print
 from common.sim.light import DESK_LINEAR_RGB, TO_LIGHT_RIG, face_shade, marker_colour
-from common.srgb import to_linear
 
 MARKER = "index"
 WIDTH_M, HEIGHT_M = 0.075, 0.050

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.camera_model import CameraModel
-from common.geometry import transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import transform
 from common.sim.light import DESK_LINEAR_RGB, to_srgb
 
 TEXEL_M = 0.001

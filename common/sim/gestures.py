@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
-from common.hand_model import FINGERS, HandModel
+from common.geometry.transforms import axis_rotation, rigid, rotation_vector_to_matrix
+from common.hand.model import FINGERS, HandModel
 from common.messages import GestureKind
 from common.sim.gesture_postures import (
     KNOB_M,

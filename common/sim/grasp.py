@@ -15,7 +15,7 @@ sides while the bar is turned; by 3 either way else.
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.grip import MCP_PER_PIP, bar_in_palm, closed_round
 from common.sim.held import Cylinder
 from common.sim.motion import (

@@ -9,8 +9,8 @@ radii of the profile.
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rigid
-from common.hand_model import CHAINS, MIDDLE_PROXIMAL, HandModel
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, MIDDLE_PROXIMAL, HandModel
 from common.sim.motion import angles_of
 
 MCP_PER_PIP = 0.54  # Kamper's ratio, in Kim et al. 2012

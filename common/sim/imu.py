@@ -18,7 +18,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
 from common.sim.scene import Scene

@@ -16,9 +16,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rigid
-from common.hand_model import CHAINS, HandModel
-from common.npz import read_npz
+from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, rigid
+from common.hand.model import CHAINS, HandModel
+from common.recording.npz import read_npz
 from common.sim.motion import HandState, smooth_step
 
 KEYS = ("t", "hand0_joints", "hand0_palm", "hand0_normal", "hand0_direction", "hand0_type")

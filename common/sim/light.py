@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.errors import CalibrationError
-from common.srgb import to_linear, to_srgb
+from common.geometry.srgb import to_linear, to_srgb
 
 Float32 = npt.NDArray[np.float32]
 

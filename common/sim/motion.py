@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import axis_rotation, rigid
-from common.hand_model import HandModel
+from common.geometry.transforms import axis_rotation, rigid
+from common.hand.model import HandModel
+from common.hand.wrist_joint import STRAIGHT
 from common.sim.held import Cylinder
-from common.wrist_joint import STRAIGHT
 
 PERIOD_S = 60.0
 PEAK_SPEED_M_S = 1.0
@@ -54,7 +54,7 @@ class HandState:
     Attributes:
         T_rig_palm: Palm pose (4, 4) [m].
         angles_rad: (5, 4) [rad].
-        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_joint`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.hand.wrist_joint`).
         things: What stands about, or is held.
         objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's order.
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import cross
+from common.geometry.transforms import cross
 from common.sim import light, raster
 from common.sim.object_surface import BLOCK_FACES, Ball, Block, ObjectSurface, Rod, Sheet
 from common.sim.objects_seen import NOTHING, Colour, SeenBead, SeenObjects, SeenPart, SeenSheet

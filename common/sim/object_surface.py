@@ -12,10 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
-from common.geometry import invert, transform
-from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape, TagFamily, tag_corners
+from common.calibration.object_profile import (
+    BoxShape,
+    CylinderShape,
+    ObjectProfile,
+    Shape,
+    TagFamily,
+    tag_corners,
+)
+from common.geometry.tag_family import GRIDS
+from common.geometry.transforms import invert, transform
 from common.sim.tracked import TrackedObjects
-from common.tag_family import GRIDS
 
 PAPER_CELLS = 1.0  # of white about the black square of a tag
 ON_M = 0.003  # a tag as near as this to a block's surface is stuck on it

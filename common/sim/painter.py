@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image
-from common.geometry import cross
+from common.geometry.transforms import cross
 from common.sim import light, raster
 from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.desk import LENS_SIGMA_PX

@@ -10,7 +10,7 @@ all the time. From one to the next the hand goes smoothly (C2), and from the las
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.motion import PERIOD_S, POSES, Drift, HandState, angles_of, base_pose, smooth_step
 
 ROUNDS = 4

@@ -17,11 +17,11 @@ import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.errors import RecordingError
-from common.frame_recording import Illumination, Manifest
-from common.frame_writing import RecordingWriter, encode_png
-from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
-from common.imu_recording import write_imu
-from common.npz import write_npz
+from common.hand.model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
+from common.imu.recording import write_imu
+from common.recording.frame_recording import Illumination, Manifest
+from common.recording.frame_writing import RecordingWriter, encode_png
+from common.recording.npz import write_npz
 from common.sim.imu import SimulatedImu
 from common.sim.light import marker_colour
 from common.sim.painter import MarkerView

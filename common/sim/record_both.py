@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration
-from common.imu_recording import write_imu
+from common.imu.recording import write_imu
 from common.sim.imu import SimulatedImu
 from common.sim.record import FIRST_NS, SceneTake, write_frames, write_truth
 from common.sim.scene import Scene

@@ -8,9 +8,9 @@ The palm rests on something and faces the cameras, so that the finger tips are s
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
-from common.hand_routine import MOVES, ROUTINE_S, STEPS, posture_at
+from common.geometry.transforms import axis_rotation, rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
+from common.hand.routine import MOVES, ROUTINE_S, STEPS, posture_at
 from common.sim.motion import Drift, HandState, angles_of
 
 REACTION_S, TAIL_S = 1.0, 0.8

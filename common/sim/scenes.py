@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import overload
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import PhalanxError
-from common.hand_model import HandModel
-from common.object_profile import ObjectProfile
+from common.hand.model import HandModel
 from common.sim.board import BoardRenderer, BoardScene
 from common.sim.card import CardScene
 from common.sim.illuminant import ROOM

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.hand_model import CHAINS, METACARPALS, Chains, HandModel
+from common.hand.model import CHAINS, METACARPALS, Chains, HandModel
 
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.object_profile import TagFamily
+from common.calibration.object_profile import TagFamily
+from common.geometry.tag_family import tag_image
 from common.sim.light import AMBIENT
 from common.sim.object_surface import PAPER_CELLS
 from common.sim.objects_seen import SeenSheet
-from common.tag_family import tag_image
 
 Float32 = npt.NDArray[np.float32]
 INK, PAPER = 0.035, 0.72  # reflectance of toner and of office paper

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import transform
+from common.geometry.transforms import transform
 from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES

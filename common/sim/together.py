@@ -3,7 +3,7 @@
 Fusion is measured on them, and extrinsics are calibrated from them.
 
 All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
-device sits on the forearm (`common.wrist_joint`; limits of the bend as flexion / deviation):
+device sits on the forearm (`common.hand.wrist_joint`; limits of the bend as flexion / deviation):
 
     grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 3 degrees flexed, +-7 / +-8 about that
     both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.gestures import Gestures
 from common.sim.grasp import Grasp
 from common.sim.motion import (

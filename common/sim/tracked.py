@@ -13,9 +13,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, rigid
-from common.object_profile import ObjectProfile
+from common.geometry.transforms import axis_rotation, rigid
 from common.sim.motion import HandState
 
 RESTING_M = np.array([0.19, 0.13, 0.12])  # of an object that nothing moves, against the middle of the view

@@ -14,9 +14,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, invert, rigid, rotation_vector_to_matrix
-from common.object_profile import ObjectProfile
+from common.geometry.transforms import axis_rotation, invert, rigid, rotation_vector_to_matrix
 from common.sim.scene import Scene
 
 WANDER_M, WANDER_RAD = 3e-4, np.radians(0.05)

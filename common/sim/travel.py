@@ -18,8 +18,8 @@ All is smooth (C2) and closed over the period.
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
 from common.sim.motion import (
     FIST,
     PERIOD_S,

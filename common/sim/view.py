@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import invert, transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert, transform
 from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG

@@ -16,12 +16,12 @@ import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
-from common.camera_model import CameraModel
+from common.calibration.wrist import Laser, LaserPlane
 from common.errors import CalibrationError
-from common.frame_recording import Illumination, Manifest
-from common.frame_writing import RecordingWriter, encode_png
-from common.geometry import rotation_vector_to_matrix
-from common.wrist_calibration import Laser, LaserPlane
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.recording.frame_recording import Illumination, Manifest
+from common.recording.frame_writing import RecordingWriter, encode_png
 
 Float32 = npt.NDArray[np.float32]
 

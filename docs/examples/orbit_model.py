@@ -21,12 +21,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from common.arrays import Float
-from common.bus import Bus
+from common.bus.bus import Bus
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import PhalanxError
-from common.geometry import axis_rotation
+from common.geometry.transforms import axis_rotation
 from common.messages import Gesture
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from common.messages.streams import MASTER
 from master.outputs.rerun_process import ViewerProcess
 
 TAKE_NS, UNDO_NS, SILENT_NS = 200_000_000, 200_000_000, 1_000_000_000

@@ -19,11 +19,11 @@ import sys
 import threading
 from array import array
 
-from common.bus import Bus
+from common.bus.bus import Bus
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import PhalanxError
 from common.messages import Gesture
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from common.messages.streams import MASTER
 
 SINK, OLD, RATE_HZ = "@DEFAULT_AUDIO_SINK@", "@DEFAULT_SINK@", 48000
 APLAY = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", f"{RATE_HZ}"]

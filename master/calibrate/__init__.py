@@ -1,4 +1,1 @@
-"""Calibrations: pure fits and the thin commands around them.
-
-A fit maps observations -> (value, residual).
-"""
+"""Calibrations: recordings or live messages enter, files of calib_json leave."""

@@ -2,7 +2,7 @@
 
 This is the forward function of a pose.
 
-The skin (`common.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first, the
+The skin (`common.hand.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first, the
 nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the image is
 put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are ignored.
 
@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import transform
-from common.palmar_surface import ROOT, PalmarSurface
-from common.tapered_capsules import Capsules, first_hits, terms
+from common.geometry.tapered_capsules import Capsules, first_hits, terms
+from common.geometry.transforms import transform
+from common.hand.palmar_surface import ROOT, PalmarSurface
 from master.estimator.laser_plane import PlaneAxes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 RAYS = 64
 _SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
@@ -136,7 +136,7 @@ class LaserIntersection:
         Rays in the plane; 0 where none does.
 
         The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its quadric
-        (`common.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
+        (`common.geometry.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
         """
         flat = self._axes.flat(spheres)
         height = spheres @ self._setup.normal - self._setup.offset_m
@@ -239,7 +239,7 @@ def _depths(known: Float, rays: Float) -> tuple[Float, Float]:
 
     Rays (3, M), cones of terms (12, M), depths (3, M); below 0: beside them.
 
-    Also the feet (M,) of their hits of the side, as in `common.tapered_capsules`.
+    Also the feet (M,) of their hits of the side, as in `common.geometry.tapered_capsules`.
     """
     d2, k0, lean, shift, c1, c2 = known[6:]
     m2, m3 = (rays * known[:3]).sum(axis=0), (rays * known[3:6]).sum(axis=0)

@@ -1,4 +1,1 @@
-"""Checklist of current problems, from what all processes report.
-
-One list for people and programs (docs/checklist.md).
-"""
+"""Checklist of a rig: what all processes report enters, problems and fixes leave."""

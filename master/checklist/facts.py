@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
-from master.rejected_peers import MarkerCounts, RejectedPeer
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
+from master.run.rejected_peers import MarkerCounts, RejectedPeer
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,9 @@ from typing import TypeVar
 from msgspec import Struct
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.calibration_parts import Provenance
+from common.calibration.file_monitor import MonitoredFiles
+from common.calibration.parts import Provenance
 from common.errors import CalibrationError
-from common.file_monitor import MonitoredFiles
 from common.messages import CheckItem
 from master.checklist.facts import CameraPlan, Plan
 

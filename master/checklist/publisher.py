@@ -9,20 +9,20 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import Clock
-from common.clock_offset import ClockEstimate
 from common.errors import BusError
+from common.link.clock_offset import ClockEstimate
 from common.machine import Machine
 from common.messages import CheckItem, Checklist, Health
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from master.checklist.facts import MasterNow, SenderNow, plan_of
 from master.checklist.files import FileMonitor
 from master.checklist.monitor import ChecklistMonitor
-from master.quarantine import Quarantine
-from master.rejected_peers import MarkerCounts, RejectedPeer
-from master.rig_setup import RigSetup
-from master.sequence import CameraCounts
+from master.rig.setup import RigSetup
+from master.run.quarantine import Quarantine
+from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.run.sequence import CameraCounts
 
 POLL_S = 0.2
 EVERY_NS = 1_000_000_000  # and at once where it changes

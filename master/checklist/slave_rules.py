@@ -6,7 +6,7 @@ Camera settings, light, colours, markers, temperature, disk, strobe.
 from collections.abc import Iterator
 from math import log
 
-from common.camera_settings import WANTED
+from common.calibration.camera_settings import WANTED
 from master.checklist.facts import CameraPlan, Verdict, beyond
 from master.checklist.link_rules import disk_verdict
 from master.checklist.slave_reports import SlaveReports

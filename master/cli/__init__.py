@@ -1,1 +1,1 @@
-"""The commands of `phalanx`: their table, and their options as text; what does the work is loaded when called."""
+"""The table of commands and their options: words enter, parsed options leave."""

@@ -4,7 +4,7 @@ from argparse import ArgumentParser
 from pathlib import Path
 
 from common.option_types import number, whole
-from master.options import (
+from master.commands.options import (
     add_bus,
     add_calibration,
     add_joints,

@@ -4,7 +4,14 @@ from argparse import ArgumentParser
 from pathlib import Path
 
 from common.option_types import number, whole
-from master.options import add_bus, add_calibration, add_json, add_out, add_picture, add_recording_rig
+from master.commands.options import (
+    add_bus,
+    add_calibration,
+    add_json,
+    add_out,
+    add_picture,
+    add_recording_rig,
+)
 
 
 def tracker(command: ArgumentParser) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from common.option_types import number
 from master.cli.calibrate import add_board, add_markers_of_board
-from master.options import add_calibration, add_json, add_out, add_picture, add_recording_rig
+from master.commands.options import add_calibration, add_json, add_out, add_picture, add_recording_rig
 
 
 def add_lit_views(command: ArgumentParser) -> None:

@@ -4,7 +4,7 @@ from argparse import ArgumentParser
 from pathlib import Path
 
 from common.option_types import number
-from master.options import add_bus, add_calibration, add_link, add_rig, site_name
+from master.commands.options import add_bus, add_calibration, add_link, add_rig, site_name
 
 
 def status(command: ArgumentParser) -> None:

@@ -4,7 +4,7 @@ from argparse import SUPPRESS, ArgumentParser
 from pathlib import Path
 
 from common.option_types import number
-from master.options import (
+from master.commands.options import (
     add_bus,
     add_calibration,
     add_hand,

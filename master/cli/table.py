@@ -23,7 +23,7 @@ TABLE: tuple[Command | Family, ...] = (
         _TRY,
         "recorded frames or your own videos to hands, offline",
         "master.cli.run:replay",
-        "master.replay_command:replay",
+        "master.commands.replay:replay",
     ),
     Family("calibrate", _SET_UP, "measure cameras, hand, wrist device, object or tracker"),
     Command(
@@ -31,7 +31,7 @@ TABLE: tuple[Command | Family, ...] = (
         _SET_UP,
         "see how a running camera is set, and set it otherwise",
         "master.cli.set_up:camera",
-        "master.camera_command:camera",
+        "master.commands.camera:camera",
     ),
     Command(
         "gestures",
@@ -45,21 +45,21 @@ TABLE: tuple[Command | Family, ...] = (
         _RUN,
         "track live, or install that as a service",
         "master.cli.run:run",
-        "master.run_command:run",
+        "master.commands.run:run",
     ),
     Command(
         "view",
         _LOOK,
         "a running master in the Rerun viewer",
         "master.cli.look:view",
-        "master.view_command:view",
+        "master.commands.view:view",
     ),
     Command(
         "console",
         _LOOK,
         "watch, tune, record and set up in a browser",
         "master.cli.look:console",
-        "master.console_command:console",
+        "master.commands.console:console",
     ),
     Command(
         "check",
@@ -94,14 +94,14 @@ TABLE: tuple[Command | Family, ...] = (
         _RECORD,
         "recorded hands for other tools: CSV, Parquet, BVH, glTF, Rerun",
         "master.cli.record:export",
-        "master.export.command:export",
+        "master.recording.export.command:export",
     ),
     Command(
         "send",
         _SEND,
         "live hands to other programs: OSC, VMC, ROS 2, LSL, WebSocket",
         "master.cli.record:send",
-        "master.send.command:send",
+        "master.outputs.network.command:send",
     ),
     Family("fleet", _FLEET, "slaves on their machines, their keys, and masters of several sites"),
     Command(
@@ -237,7 +237,7 @@ TABLE: tuple[Command | Family, ...] = (
         "machines",
         "how each process of the rig is, or whether it is heard",
         "master.cli.fleet:status",
-        "master.fleet:status",
+        "master.commands.fleet:status",
     ),
     Command(
         "fleet rollback",
@@ -265,14 +265,14 @@ TABLE: tuple[Command | Family, ...] = (
         "keys and sites",
         "rig key, secrets and certificates: show, make, renew, revoke",
         "master.cli.fleet:keys",
-        "master.keys_command:keys",
+        "master.commands.keys:keys",
     ),
     Command(
         "fleet relay",
         "keys and sites",
         "several masters, seen from one place",
         "master.cli.fleet:relay",
-        "master.relay_command:relay",
+        "master.commands.relay:relay",
     ),
 )
 # The calibrations by their last word, which is theirs alone.

@@ -1,4 +1,1 @@
-"""Web console on the master's PC that shows, tunes, records and sets up.
-
-It runs as a process of its own.
-"""
+"""Web console: messages of the bus enter, pages and commands leave."""

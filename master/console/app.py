@@ -23,7 +23,7 @@ from master.console.setup import page as setup_page
 from master.console.shell import Entry, shell
 from master.console.sockets import serve_sockets
 from master.console.state import ConsoleSettings, ConsoleState
-from master.listening import is_loopback, page_certificate, places_of, private_folder
+from master.outputs.web.listening import is_loopback, page_certificate, places_of, private_folder
 
 TITLE = "Phalanx"
 _AWAY_S = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was

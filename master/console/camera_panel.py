@@ -9,7 +9,7 @@ from collections.abc import Callable
 from nicegui import background_tasks, ui
 from nicegui.client import Client
 
-from common.camera_settings import ROI_LEAST, ROI_MOST
+from common.calibration.camera_settings import ROI_LEAST, ROI_MOST
 from common.errors import CalibrationError, PhalanxError
 from master.console.colour_panel import ColourPanel
 from master.console.command_queue import CommandQueue

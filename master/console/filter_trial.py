@@ -11,7 +11,7 @@ import msgspec
 
 from common.calibration import FilterCalibration, RigCalibration, load, save
 from common.messages import Command, Health
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from master.calibrate.tree_files import provenance
 
 NAMES = ("min_cutoff_hz", "beta", "d_cutoff_hz", "jitter_m")

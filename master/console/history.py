@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from common.messages import Health
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 SPAN_S = 60.0
 STEP_S = 0.5

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, Source
 
 SOURCES = {

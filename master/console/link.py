@@ -7,7 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.errors import BusError
 from common.messages import Command, Health, Message
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from common.calibration import CameraCalibration, load, save
-from common.camera_settings import CameraSettings
+from common.calibration.camera_settings import CameraSettings
 from common.errors import CalibrationError
 from master.calibrate.tree_files import provenance
 from master.console.tuner import InUse, markers_over

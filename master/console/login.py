@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import PhalanxError
-from master.listening import read_private, write_private
+from master.outputs.web.listening import read_private, write_private
 
 HASH_FILE = "console.password"
 LEAST_CHARACTERS = 12

@@ -10,10 +10,10 @@ from pathlib import Path
 import msgspec
 
 from common.calibration import parse, save
-from common.output_settings import OutputPart, OutputSettings
+from common.calibration.output_settings import OutputPart, OutputSettings
 from master.console.state import ConsoleState
-from master.send.outputs import OUTPUTS, switched_on
-from master.send.sender import NAME, settings_of
+from master.outputs.network.outputs import OUTPUTS, switched_on
+from master.outputs.network.sender import NAME, settings_of
 
 PROCESS = "send"
 _GONE_S = 3.0  # so long one that has ended is still seen on the bus

@@ -10,13 +10,13 @@ from typing import Literal, get_args, get_origin
 import msgspec
 from nicegui import background_tasks, ui
 
+from common.calibration.output_settings import OutputSettings
 from common.errors import PhalanxError
 from common.messages import Health
-from common.output_settings import OutputSettings
 from master.console.output_files import PROCESS, change_output, follow, read_outputs
 from master.console.state import ConsoleState
-from master.send.outputs import OUTPUTS
-from master.send.sender import NAME
+from master.outputs.network.outputs import OUTPUTS
+from master.outputs.network.sender import NAME
 
 _TITLES = {
     "osc": ("OSC", "Open Sound Control: hands, objects, contact and gestures over UDP"),

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from common.calibration import CameraCalibration
 from common.errors import CalibrationError
 from common.messages import Preview
-from common.picture_size import Size, jpeg_size
+from common.recording.picture_size import Size, jpeg_size
 
 _POLL_S = 2.0  # a camera file is not read more often
 _MOST = 64  # cameras: a bus on which names are invented costs no memory

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from common.errors import BusError
 from common.messages import Command, Health
-from common.preview_wish import PreviewWish
+from common.messages.preview_wish import PreviewWish
 
 LEASE_S = 3.0  # so long a lease holds: whoever still looks renews it before
 ASK_EVERY_S = 1.0  # a camera shows itself for 3 s after each request

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from master.listening import machine_names
+from master.outputs.web.listening import machine_names
 
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "[::1]"})
 ANYWHERE = frozenset({"0.0.0.0", "::"})

@@ -18,7 +18,7 @@ from nicegui import app as nicegui_app
 
 from common.messages import MAX_MARKERS, HandPose, Name, ObjectPose
 from master.console.state import ConsoleState
-from master.web import object_json, static_dir, three_js_path, webxr_json
+from master.outputs.web import object_json, static_dir, three_js_path, webxr_json
 
 _POLL_S = 0.03
 _RENEW_S = 1.0

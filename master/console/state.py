@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import (
@@ -24,7 +24,8 @@ from common.messages import (
     ObjectPose,
     Preview,
 )
-from common.streams import MASTER
+from common.messages.streams import MASTER
+from master.commands.options import HERE_BEACON, HERE_BIND, HERE_BUS
 from master.console.history import STEP_S, History
 from master.console.link import Link
 from master.console.local import LocalProcesses
@@ -32,8 +33,7 @@ from master.console.picture_sizes import PictureSizes
 from master.console.preview_leases import PreviewLeases
 from master.console.received_gestures import ReceivedGestures
 from master.console.tuner import Tuner
-from master.master_bus import join_bus
-from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
+from master.run.master_bus import join_bus
 
 STALE_S = 3.0  # what was not reported again for so long is no longer shown as present
 MAX_NAMES = 64  # kept of each kind: a bus on which names are invented costs no memory

@@ -12,7 +12,7 @@ from math import nan
 
 import msgspec
 
-from common.camera_settings import WANTED, ColourPick
+from common.calibration.camera_settings import WANTED, ColourPick
 from common.errors import BusError
 from common.messages import Command, Health
 

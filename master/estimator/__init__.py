@@ -1,1 +1,1 @@
-"""One state of a hand, fitted to the pixels of all sensors; compiled."""
+"""The estimator: pixels of all sensors enter, one hand with covariance leaves."""

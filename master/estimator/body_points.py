@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import skew
-from common.hand_model import CHAINS, Chains, HandJoints, HandModel
+from common.geometry.transforms import skew
+from common.hand.model import CHAINS, Chains, HandJoints, HandModel
 from master.estimator.parameters import HandParameters
 
 _AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abduction, flexion, PIP, DIP turn

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.kernels import inlined
 
 _NEWTON_STEPS = 12

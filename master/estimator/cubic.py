@@ -14,17 +14,17 @@ between 71 and 152 mm: it is here to compare with (`forward` of the rig: "cubic"
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import FINGERS
+from common.calibration.wrist import FingerLine
+from common.hand.model import FINGERS
 from common.kernels import kernel
-from common.records import boxed
-from common.wrist_calibration import FingerLine
+from common.messages.records import boxed
 from master.estimator.finger_lines import on_line, principal_line
 from master.estimator.finger_surface import OWN_MOVES, Surface, laser_centroid, look
 from master.estimator.flexion_synergy import FlexionSynergy
 from master.estimator.hand_tables import HandTables
 from master.estimator.parameters import HandParameters
 from master.estimator.wrist_device import Device, flexed_palm
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 ROOT_MM = 102.06
 _POLYNOMIAL = (-0.0003, 0.059, -4.07, 119.75)

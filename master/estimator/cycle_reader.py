@@ -13,11 +13,11 @@ from math import nan
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import WristDetections
 from master.estimator.cubic import CubicLaw
 from master.estimator.epoch import WristRows
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 _NO_LAW = np.full(5, nan)
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
-from common.hand_model import HandJoints, HandModel
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandJoints, HandModel
 from common.kernels import bound
-from common.records import boxed, fields
+from common.messages.records import boxed, fields
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch
 from master.estimator.extras import stationary_of

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float, Int
-from common.camera_model import CameraModel
-from common.hand_model import HandJoints, HandModel
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandJoints, HandModel
 from master.estimator.epoch import Epoch, Fitted, FittedHand
 from master.estimator.epoch_steps import EpochSteps
 from master.estimator.observation_sources import ON_OTHERS

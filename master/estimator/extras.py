@@ -24,7 +24,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.matrices import cholesky, inverse
 from master.estimator.problem import EpochPrior
 from master.estimator.settings import Settings

@@ -13,8 +13,8 @@ into one good to 13 where curls ended anywhere, and to 5 where all were full.
 import numpy as np
 
 from common.arrays import Float
+from common.calibration.wrist import FingerLine
 from common.errors import FitError
-from common.wrist_calibration import FingerLine
 
 _MIN_POINTS = 5
 _MIN_RANGE_M = 5e-3  # below this the direction is that of the noise

@@ -21,7 +21,7 @@ from typing import Any
 
 from common.arrays import Float, Int
 from common.kernels import inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_hit, laser_centroid, look
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import twist_hand

@@ -2,7 +2,8 @@
 
 They model its skin, where the laser meets it, and its tip.
 
-The skin of a finger is a chain of capsules (`common.palmar_surface`), cut by the plane of the laser. What the camera
+The skin of a finger is a chain of capsules (`common.hand.palmar_surface`), cut by the plane of the laser.
+What the camera
 makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
 lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
@@ -20,7 +21,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import constant, inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import abduction_axis, finger_chain
 
@@ -216,7 +217,7 @@ def _away(S: Float, k: int) -> float:
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
     """Return the distance along a unit ray to the cone of terms (12,).
 
-    inf: the cone is missed (`common.tapered_capsules`).
+    inf: the cone is missed (`common.geometry.tapered_capsules`).
     """
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
     best, d2 = inf, t[6]

@@ -10,9 +10,9 @@ from math import radians
 import numpy as np
 
 from common.arrays import Float
-from common.hand_limits import ABDUCTION, FLEXION
-from common.hand_model import HandModel
-from common.hand_presets import preset_couplings
+from common.calibration.hand_presets import preset_couplings
+from common.hand.limits import ABDUCTION, FLEXION
+from common.hand.model import HandModel
 
 PIP, DIP = 2, 3
 FULL_CURL_RAD = radians(120.0)

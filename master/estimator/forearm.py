@@ -18,8 +18,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import ImuCalibration
-from common.geometry import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
-from common.wrist_joint import wrist_quaternion
+from common.geometry.transforms import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
+from common.hand.wrist_joint import wrist_quaternion
 from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import Between, OrientationSamples
 from master.estimator.palm_imu import SURE_RAD, rotation_of

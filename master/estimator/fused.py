@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import Detections, HandPose, WristDetections
 from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Fitted, OrientationMeasurement, WristRows
@@ -21,7 +21,7 @@ from master.estimator.forearm import LOST_RAD, Forearm
 from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
 from master.estimator.wrist_device import HEADING, WRIST_ANGLES
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's strobe cycles lead
 _MAX_AGE_NS = 70_000_000  # an older strobe cycle constrains no finger now

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, FINGER_JOINTS, HandModel
-from common.records import filled
+from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
+from common.messages.records import filled
 from master.estimator.parameters import REACH, HandParameters
 
 _STIFF_RAD = 1e-9  # an angle whose highest flexion is 0 narrows nothing

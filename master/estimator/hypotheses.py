@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inlined
-from common.records import boxed, record
+from common.messages.records import boxed, record
 from master.estimator.priors import PosturePrior
 from master.estimator.problem import EpochPrior, Search
 from master.estimator.residuals import Observations
@@ -58,7 +58,7 @@ class Posterior:
 class Blank(NamedTuple):
     """Empty prior, used by `_onto` for a fit to points alone.
 
-    `epoch_prior`: the array that a `EpochPrior` lies in (`common.records.boxed`).
+    `epoch_prior`: the array that a `EpochPrior` lies in (`common.messages.records.boxed`).
     """
 
     posture_prior: PosturePrior

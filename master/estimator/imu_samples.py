@@ -9,7 +9,7 @@ from math import acos, isnan, nan, sin, sqrt
 
 from common.arrays import Float
 from common.calibration import UNIT_WITHIN
-from common.geometry import Wxyz
+from common.geometry.transforms import Wxyz
 
 REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
 _KEPT = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind

@@ -10,9 +10,9 @@ the past diagonal, the smaller of each pair. Where every finger is seen this epo
 from math import acos, cos, sqrt
 
 from common.arrays import Float, Int
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.kernels import constant, inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_jacobian, palm_jacobian
 from master.estimator.matrices import cholesky, eigen

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import constant, inlined, inner, kernel
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.matrices import copy
 
@@ -394,7 +394,7 @@ def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
 def quaternions(rotation: Float, out: Float) -> None:
     """Write unit quaternions (N, 4) wxyz with w >= 0 of rotation matrices (N, 3, 3).
 
-    By the largest of the four classic forms (Shepperd, 1978), as `common.geometry.matrix_to_quaternion`.
+    By the largest of the four classic forms (Shepperd, 1978), as `common.geometry.transforms.matrix_to_quaternion`.
     """
     for n in range(rotation.shape[0]):
         R, q = rotation[n], out[n]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import intersect_plane
-from master.wrist_setup import WristSetup
+from common.geometry.transforms import intersect_plane
+from master.rig.wrist import WristSetup
 
 _STEP_PX = 0.5  # of the differences that carry a pixel's noise onto the plane
 _AROUND_PX = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])

@@ -4,7 +4,7 @@ from typing import Any
 
 from common.arrays import Bool, Float, Int
 from common.kernels import kernel
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import Mounts
 from master.estimator.residuals import Observations
 

@@ -19,7 +19,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration, Quaternion
 from common.errors import CalibrationError
-from common.geometry import (
+from common.geometry.transforms import (
     matrix_of,
     matrix_to_quaternion,
     quaternion_to_matrix,

@@ -4,7 +4,7 @@ They are the angles that no coupling fixes, and the bounds of each.
 
 A parameter vector is the palm's rotation (3, rotation vector about the wrist, rig frame) and translation (3),
 then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it does not follow exactly) of each
-finger. Where flexion narrows the abduction (`common.hand_limits`), the parameter is the abduction before that:
+finger. Where flexion narrows the abduction (`common.hand.limits`), the parameter is the abduction before that:
 
     abduction = share(flexion) parameter
 
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_limits import ABDUCTION, FLEXION, spread_left
-from common.hand_model import HandModel
+from common.hand.limits import ABDUCTION, FLEXION, spread_left
+from common.hand.model import HandModel
 
 _LEAST_SHARE = 1e-6  # an abduction that is narrowed to nothing may come from any
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it

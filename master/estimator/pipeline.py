@@ -3,7 +3,7 @@
 It takes centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
 
 `MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
-and get the same poses. It is built from calibration by `master.rig`.
+and get the same poses. It is built from calibration by `master.rig.files`.
 """
 
 from collections import Counter
@@ -17,8 +17,8 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.calibration import ImuCalibration, Volume
-from common.camera_model import CameraModel
-from common.hand_model import HandModel
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandModel
 from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
@@ -121,7 +121,7 @@ class MarkerPipeline:
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether to drop it for newer ones (`master.load_shedding`); None: none is.
+            shed: Asked for each epoch whether to drop it for newer ones (`master.run.load_shedding`); None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts

@@ -4,12 +4,12 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Volume
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose
 from master.estimator.epoch import Fitted
 from master.estimator.kinematics import quaternions
 from master.fabrik.estimate import HandEstimate, MarkerPositions
-from master.volume import inside
+from master.monitor.volume import inside
 
 
 def pose_of(

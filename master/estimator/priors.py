@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 

@@ -6,7 +6,7 @@ They are the rig, the prior of the hand, and scratch arrays.
 from typing import NamedTuple
 
 from common.arrays import Bool, Float, Int
-from common.records import record
+from common.messages.records import record
 from master.estimator.cameras import CameraArrays
 from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables, Mounts

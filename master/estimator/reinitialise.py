@@ -9,9 +9,9 @@ on the markers as a rigid body, of which the best goes on.
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import fit_rigid
-from common.hand_model import HandModel
-from common.wrist_joint import forearm_palm
+from common.geometry.transforms import fit_rigid
+from common.hand.model import HandModel
+from common.hand.wrist_joint import forearm_palm
 from master.estimator.epoch import Epoch
 from master.estimator.epoch_steps import EpochSteps
 from master.estimator.parameters import HandParameters

@@ -33,9 +33,9 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import HandJoints, HandModel
+from common.hand.model import HandJoints, HandModel
 from common.kernels import bound
-from common.records import boxed, fields
+from common.messages.records import boxed, fields
 from master.estimator.blend import Blend
 from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.hand_tables import HandTables, Mounts

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
+from common.hand.model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
 from common.kernels import constant, inner, kernel
-from common.records import record
+from common.messages.records import record
 from master.estimator.blend import PARTS
 from master.estimator.hand_tables import HandTables
 from master.estimator.joint_covariance import is_small

@@ -20,7 +20,7 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
 from common.kernels import constant, inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.matrices import cholesky, copy, substitute

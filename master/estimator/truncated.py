@@ -13,7 +13,7 @@ from math import erfc, exp, inf, pi, sqrt
 
 from common.arrays import Float
 from common.kernels import inlined, inner
-from common.records import record
+from common.messages.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.matrices import cholesky, inverse
 

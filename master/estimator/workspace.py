@@ -6,7 +6,7 @@ It has what is the same at every epoch, the task, and scratch room.
 from typing import Any, NamedTuple
 
 from common.arrays import Bool, Code, Float, Int
-from common.records import record
+from common.messages.records import record
 from master.estimator.cameras import CameraArrays
 from master.estimator.extras import ExtrasScratch
 from master.estimator.finger_scan import Prior, Scan
@@ -116,7 +116,7 @@ class Workspace:
 class Model(NamedTuple):
     """Everything that is the same at every epoch.
 
-    Hand, settings and device are in their arrays (`common.records.boxed`).
+    Hand, settings and device are in their arrays (`common.messages.records.boxed`).
     """
 
     hand: Any

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.fingertips import Fingertips
+from common.hand.fingertips import Fingertips
+from common.hand.palmar_surface import PLACES, SPREAD, PalmarSurface
 from common.kernels import inlined, inner, kernel
-from common.palmar_surface import PLACES, SPREAD, PalmarSurface
-from common.records import filled, record
+from common.messages.records import filled, record
 from master.estimator.laser_plane import PlaneAxes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
@@ -316,7 +316,7 @@ def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Floa
 
     Also writes the axes (2, 3) of flexion and deviation.
 
-    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_joint`).
+    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.hand.wrist_joint`).
     """
     c, s, cd, sd = cos(flexion), sin(flexion), cos(deviation), sin(deviation)
     for i in range(3):

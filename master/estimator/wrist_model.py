@@ -7,12 +7,12 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.hand_limits import ABDUCTION, FLEXION
-from common.hand_model import HandModel
+from common.hand.limits import ABDUCTION, FLEXION
+from common.hand.model import HandModel
 from master.estimator.cubic import CubicLaw, lit
 from master.estimator.flexion_synergy import DIP, PIP, FlexionSynergy
 from master.estimator.wrist_device import Device
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 _DIP_PER_PIP = 0.5 * (2.0 / 3.0 + 0.84)  # between the ratios of both papers
 _IP_PER_MCP = 1.1  # of thumbs: between those of grasps and the ratio of the limits

@@ -12,7 +12,7 @@ from math import nan
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.hand_model import CHAINS, FINGERS
+from common.hand.model import CHAINS, FINGERS
 from common.kernels import bound
 from common.messages import HandPose, Source, WristDetections
 from master.estimator.cycle_reader import CycleReader
@@ -23,8 +23,8 @@ from master.estimator.kinematics import quaternions
 from master.estimator.pipeline import SolvedPose, Stage
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.wrist_model import WristModel, loosened
-from master.volume import inside
-from master.wrist_setup import WristSetup
+from master.monitor.volume import inside
+from master.rig.wrist import WristSetup
 
 _ORIENTATION_INFO = np.eye(3) * 1e6  # of a palm that stands: a thousandth of a radian
 _PALM = np.setdiff1d(np.arange(26), CHAINS)

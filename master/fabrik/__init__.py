@@ -1,1 +1,1 @@
-"""The card's line: disparity, depth, 1 € filter, palm, FABRIK per finger."""
+"""The card's line: centroids enter; depth, 1 € filter, FABRIK; a hand leaves."""

@@ -3,8 +3,8 @@
 import time
 from pathlib import Path
 
-from master.dispatcher import new_dispatcher
-from master.rig import load_setup
+from master.rig.files import load_setup
+from master.run.dispatcher import new_dispatcher
 
 
 def main() -> None:

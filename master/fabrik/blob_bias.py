@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 
 _CORNERS: Final = 64  # of the polygon; that for a circle is 0.2 % small, which is scaled away
 _ROUNDS: Final = 3  # each leaves a few per cent of the shift: the outline starts around the centroid

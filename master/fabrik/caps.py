@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float, Int
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from master.fabrik.estimate import SolvedHand
 
 _RINGS, _SPOKES = 16, 48  # samples of the surface

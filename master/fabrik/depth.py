@@ -22,8 +22,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration, Volume
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
 
 PARALLEL_RAD = np.radians(3.0)
 """Most by which two cameras may be turned against each other where depth is a law of raw disparity."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.hand_model import HandJoints
+from common.hand.model import HandJoints
 from common.messages import Source
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import CHAINS, HandModel
+from common.hand.model import CHAINS, HandModel
 from common.kernels import bound, constant, kernel
 from master.fabrik.chain import Chain, Coupling, Link
 from master.fabrik.chain_arrays import ChainArrays, end_of

@@ -13,7 +13,7 @@ angles; a direction that is legal comes back unchanged.
 
 The rotor has four half-angles. `box`: every flexion with every abduction. `ellipse`: the four quadrants of a cone,
 (a / A)^2 + (f / F)^2 <= 1 with the A and F of the quadrant (FABRIK's elliptic cone; Aristidou & Lasenby 2011).
-Both may lose abduction with flexion by the parabola of `common.hand_limits`. A rotor has no third angle: the twist
+Both may lose abduction with flexion by the parabola of `common.hand.limits`. A rotor has no third angle: the twist
 of its bone is what these two rotations make of it, and no solver can turn it further.
 
 What they do is compiled (`master.fabrik.limits`).

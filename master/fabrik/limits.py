@@ -6,7 +6,7 @@ The definitions are in `master.fabrik.joints`. A joint's angles are a pair, of w
 from math import acos, atan2, cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
-from common.hand_limits import spread_left
+from common.hand.limits import spread_left
 from common.kernels import inner, kernel
 from master.fabrik.rotations import (
     Matrix,

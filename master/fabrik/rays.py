@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.kernels import bound, inner, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.cap_views import (

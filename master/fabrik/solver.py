@@ -11,9 +11,9 @@ from math import isfinite
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
-from common.geometry import rigid
-from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator

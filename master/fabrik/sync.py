@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
 

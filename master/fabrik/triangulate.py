@@ -24,7 +24,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.kernels import constant, inner, kernel
 from master.fabrik.cap_views import hidden_part, seen_shift
 from master.fabrik.caps import CAPS, CapTables

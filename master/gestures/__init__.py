@@ -1,1 +1,1 @@
-"""Hand gestures: held poses, pinches, dials, taps and pointing."""
+"""Hand gestures: hand poses enter, held poses, pinches, dials and taps leave."""

@@ -12,7 +12,7 @@ finger has come to meet the thumb; and a finger that is stretched while a dial t
 """
 
 from common.arrays import Float
-from common.gesture_settings import GestureSettings
+from common.calibration.gesture_settings import GestureSettings
 from common.messages import Gesture
 from master.gestures.dial import DialMonitor
 from master.gestures.features import HandFeatures

@@ -6,19 +6,19 @@ from pathlib import Path
 import msgspec
 
 from common.calibration import HandProfile, load, save
+from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.clock import SystemClock
 from common.command_line import UsageError
 from common.errors import CalibrationError, FitError, PhalanxError
-from common.gesture_settings import GestureSettings, default_gestures
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose
 from common.terminal import echo
 from master.calibrate.tree_files import provenance
 from master.gestures.reading import lines_of, read_gestures, spans_of
 from master.gestures.template_session import held, template_session, what_lacks
 from master.gestures.templates import Example, PoseTemplate, learn
-from master.master_bus import join_bus
 from master.outputs.files import load_poses
+from master.run.master_bus import join_bus
 
 _DEPTH = 256  # poses that may wait while a line is printed
 _FIRST_S = 10.0  # until the first pose of a running master must have come

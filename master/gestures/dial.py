@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from math import atan2, cos, pi, radians, sin, sqrt
 
 from common.arrays import Float
-from common.gesture_actions import DialSettings
+from common.calibration.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, FINGERS, TIPS, WRIST, HandModel
+from common.hand.model import CHAINS, FINGERS, TIPS, WRIST, HandModel
 from common.kernels import inner, kernel
 from common.messages import HandPose
 from master.estimator.matrices import spread

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import quaternion_to_matrix
-from common.gesture_actions import DialSettings
+from common.calibration.gesture_actions import DialSettings
+from common.geometry.transforms import quaternion_to_matrix
 from common.kernels import inner, kernel
 from master.estimator.matrices import diagonalise
 from master.fabrik.rotations import dot

@@ -12,8 +12,8 @@ to meet a finger beside it. A gap that is not known neither begins nor ends a pi
 gap that was known last, its confidence falling, until `lost_s` are over.
 """
 
-from common.gesture_actions import PinchSettings
-from common.hand_model import FINGERS
+from common.calibration.gesture_actions import PinchSettings
+from common.hand.model import FINGERS
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.held_gesture import HeldGesture, below

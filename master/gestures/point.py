@@ -21,8 +21,8 @@ from math import sqrt
 import numpy as np
 
 from common.arrays import Float
-from common.gesture_actions import PointSettings
-from common.hand_model import CHAINS
+from common.calibration.gesture_actions import PointSettings
+from common.hand.model import CHAINS
 from common.kernels import kernel
 from common.messages import Gesture, Phase
 from master.estimator.matrices import spread

@@ -2,7 +2,7 @@
 
 The poses are the six of the Digits study, and those of templates.
 
-Every pose defines which quantities are to lie in which range (`common.gesture_settings`). It fits by
+Every pose defines which quantities are to lie in which range (`common.calibration.gesture_settings`). It fits by
 
     s = exp(-1/2 sum z^2),   z = distance to the range / sqrt(border^2 + sigma^2)
 
@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.gesture_settings import GestureSettings, HoldSettings
-from common.hand_model import FINGERS
+from common.calibration.gesture_settings import GestureSettings, HoldSettings
+from common.hand.model import FINGERS
 from common.kernels import kernel
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures

@@ -1,6 +1,6 @@
 """Quantities of one hand that distinguish the poses, with uncertainties.
 
-The quantities are `common.gesture_settings.Quantity`.
+The quantities are `common.calibration.gesture_settings.Quantity`.
 
 A tip that is off by s turns the finger's last two bones about the PIP, so that a bend is off by s over their length;
 that is the lever of all bends here. What is measured of the thumb's tip is off as the tip is, gaps as both tips are.
@@ -15,8 +15,8 @@ from typing import get_args
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.gesture_settings import Quantity
-from common.hand_model import CHAINS, MIDDLE_PROXIMAL, WRIST
+from common.calibration.gesture_settings import Quantity
+from common.hand.model import CHAINS, MIDDLE_PROXIMAL, WRIST
 from common.kernels import constant, inner, kernel
 from master.gestures.features import HandFeatures
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from common.gesture_settings import GestureSettings
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import GestureSettings
+from common.hand.model import HandModel
 from common.messages import Gesture
 from master.gestures.recogniser import GestureRecogniser
 from master.outputs.poses import Poses

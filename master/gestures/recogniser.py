@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from common.geometry import matrix_to_quaternion
-from common.gesture_settings import GestureSettings
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import GestureSettings
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, Gesture, HandPose, Source
 from master.fabrik.compile import log_if_slow
 from master.gestures.action import ActionMonitor

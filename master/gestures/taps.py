@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.gesture_actions import TapSettings
-from common.hand_model import CHAINS, TIPS
+from common.calibration.gesture_actions import TapSettings
+from common.hand.model import CHAINS, TIPS
 from common.messages import Gesture
 from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from common.clock import Clock
 from common.errors import FitError
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import FingerSpeed

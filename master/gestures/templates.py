@@ -20,9 +20,9 @@ import numpy as np
 from scipy.special import stdtrit
 
 from common.arrays import Bool, Float
+from common.calibration.gesture_settings import GestureSettings, PoseShape, Quantity, Span
 from common.errors import FitError
-from common.gesture_settings import GestureSettings, PoseShape, Quantity, Span
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from master.gestures.features import HandFeatures
 from master.gestures.poses import PoseTable
 from master.gestures.quantities import QUANTITIES, Quantities, known_of

@@ -10,8 +10,8 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from common.arrays import Float
-from common.capsule_gaps import ROUNDS, foot_of, nearest
-from common.hand_model import CHAINS
+from common.hand.capsule_gaps import ROUNDS, foot_of, nearest
+from common.hand.model import CHAINS
 from common.kernels import constant, inner, kernel
 from master.estimator.matrices import spread
 from master.fabrik.rotations import Vector, cross, dot, length, minus
@@ -110,7 +110,7 @@ def _on(joints: Float, a: int, b: int, share: float) -> Vector:
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
     """Return where along two segments their skins are nearest.
 
-    As `common.capsule_gaps`.
+    As `common.hand.capsule_gaps`.
     """
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))

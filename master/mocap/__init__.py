@@ -1,1 +1,1 @@
-"""Motion capture of others: read it, hold poses against it, make a hand of it."""
+"""Motion capture of others: BVH, C3D and CSV enter, hand motions leave."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
-from common.geometry import fit_rigid, rigid, rotation_vector_to_matrix
+from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix
 from master.mocap.speed_match import HALF_NS, clock_offset
 from master.mocap.track import Track, known
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import FINGER_JOINTS, FINGERS, JOINTS, WRIST
+from common.hand.model import FINGER_JOINTS, FINGERS, JOINTS, WRIST
 from master.mocap.align import Alignment
 from master.mocap.joint_motion import JointMotion
 from master.mocap.track import Track, known

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import RecordingError
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 
 Unit = Literal["m", "dm", "cm", "mm", "in"]
 Side = Literal["left", "right"]

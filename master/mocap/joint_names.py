@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from common.errors import RecordingError
-from common.hand_model import FINGER_JOINTS, JOINTS
+from common.hand.model import FINGER_JOINTS, JOINTS
 from master.mocap.joint_motion import POINTS, Side
 
 _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
+from common.calibration.json_file import read_json
 from common.errors import RecordingError
-from common.json_file import read_json
 from master.mocap.bvh_file import read_bvh
 from master.mocap.c3d_file import read_c3d
 from master.mocap.csv_file import read_csv

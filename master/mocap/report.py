@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from common.geometry import matrix_to_rotation_vector
+from common.geometry.transforms import matrix_to_rotation_vector
 from master.mocap.align import Alignment
 
 _COLUMNS = (

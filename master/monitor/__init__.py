@@ -1,1 +1,1 @@
-"""Watch what the rig measures for what is wrong with it: clocks that lag."""
+"""Monitors of a running rig: counts and times enter, warnings and health leave."""

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from master.monitor.timing_evidence import CameraPair, Track
 from master.monitor.timing_fit import TENTHS, TimeOffset, fit_offset, unit_sums

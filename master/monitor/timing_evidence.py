@@ -26,8 +26,8 @@ from functools import cache
 import numpy as np
 
 from common.arrays import Float, Int
-from common.camera_model import CameraModel
-from common.geometry import cross, invert
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import cross, invert
 
 _NEIGHBOURS = 3  # distances of each marker to so many next ones: of six markers these are all 15 pairs
 _STEP_S = 1e-3  # of the numerical derivative of a distance

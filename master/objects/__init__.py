@@ -1,4 +1,1 @@
-"""Rigid objects that the cameras see.
-
-Their poses, and how near the hand is to them.
-"""
+"""Rigid objects: markers, tags and tracker poses enter, poses and contact leave."""

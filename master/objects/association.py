@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.objects.features import Features
 from master.objects.fit import Fitted
 from master.objects.start import Sighted, reach

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 
 _BEFORE_M = 1e-3  # a point nearer to the plane of a camera than this is not before it
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import invert, transform
+from common.geometry.transforms import invert, transform
 
 SPAN_S = 0.35  # over which motions are compared
 WAY_M = 0.015  # of the palm, at least: by that much it would move with the object

@@ -1,6 +1,7 @@
 """How near the fingers of a hand are to objects, and which of them touch.
 
-The skin of a finger is capsules from joint to joint with the radii of the profile (`common.tapered_capsules`). The
+The skin of a finger is capsules from joint to joint with the radii of the profile
+(`common.geometry.tapered_capsules`). The
 distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
 bar often holds it with the middle ones. The object's poses around the hand's epoch are brought to it: between two of
 them by interpolation, behind the last by its motion, a tenth of a second at most.
@@ -21,7 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import (
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.tapered_capsules import Capsules
+from common.geometry.transforms import (
     cross,
     invert,
     matrix_to_rotation_vector,
@@ -30,10 +33,8 @@ from common.geometry import (
     rotation_vector_to_matrix,
     transform,
 )
-from common.hand_model import CHAINS, METACARPALS, HandModel
+from common.hand.model import CHAINS, METACARPALS, HandModel
 from common.messages import Contact, HandPose, ObjectPose
-from common.object_profile import ObjectProfile
-from common.tapered_capsules import Capsules
 from master.objects.carried import Carried
 from master.objects.surface import Nearest, Surface
 

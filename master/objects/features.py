@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile, tag_corners
 from common.errors import CalibrationError
-from common.geometry import cross, transform
-from common.object_profile import ObjectProfile, tag_corners
-from common.tag_family import GRIDS
+from common.geometry.camera_model import CameraModel
+from common.geometry.tag_family import GRIDS
+from common.geometry.transforms import cross, transform
 from master.objects.surface import Surface
 
 _MARGIN_PX = 6.0  # from the image's border

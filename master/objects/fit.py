@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.camera_model import CameraModel
-from common.geometry import rotation_vector_to_matrix, skew
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rotation_vector_to_matrix, skew
 from master.objects.cameras import Cameras, Views
 from master.objects.motion import ORDERS, Motion, Past, basis_at
 from master.objects.sums import Observations, Sums

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.objects.features import Features
 from master.objects.window import ImageObservation, Window
 

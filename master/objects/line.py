@@ -21,10 +21,10 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_quaternion
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_quaternion
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
-from common.object_profile import ObjectProfile
 from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import OneEuroParameters

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 
 ORDERS = 5
 _FACTORIAL: Float = np.array([1.0, 1.0, 2.0, 6.0, 24.0])

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from common.arrays import Float, Int
-from common.object_profile import BoxShape, CylinderShape, Shape, SphereShape
+from common.calibration.object_profile import BoxShape, CylinderShape, Shape, SphereShape
 
 _GRAZES_M = 1e-3  # a sight that goes no deeper is not hidden: a tag lies on the surface itself
 _TINY = 1e-12

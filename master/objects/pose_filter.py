@@ -11,7 +11,7 @@ far it moves what is a decimetre away.
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.fabrik.noise import NoiseEstimator
 from master.fabrik.one_euro import OneEuro, OneEuroParameters
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_rotation_vector
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector
 from master.objects.association import Association, sighted_now
 from master.objects.features import Features
 from master.objects.fit import Fitted, PoseFit

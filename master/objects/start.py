@@ -15,9 +15,9 @@ from itertools import combinations, product
 import numpy as np
 
 from common.arrays import Float, Int
-from common.camera_model import CameraModel
-from common.geometry import fit_rigid, invert, rigid
-from common.object_profile import tag_corners
+from common.calibration.object_profile import tag_corners
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import fit_rigid, invert, rigid
 from master.estimator.cameras import CameraArrays
 from master.fabrik.intersection import triangulate
 from master.objects.features import Features

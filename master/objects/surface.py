@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import invert
-from common.object_profile import Shape
-from common.tapered_capsules import Capsules
+from common.calibration.object_profile import Shape
+from common.geometry.tapered_capsules import Capsules
+from common.geometry.transforms import invert
 from master.objects.parts import Parts, by_kind
 
 _STEPS = 17

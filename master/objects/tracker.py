@@ -21,10 +21,10 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
+from common.geometry.transforms import invert, matrix_to_quaternion, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from common.object_profile import ObjectProfile
 from master.objects.line import SolvedObject
 from master.objects.trajectory import HELD_S
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
 from master.fabrik.blob_bias import LensShift
 from master.fabrik.propagate import HISTORY, OBSERVATIONS

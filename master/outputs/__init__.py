@@ -1,1 +1,1 @@
-"""Where solved hands go: one seam, one file per sink."""
+"""Sinks: hands, objects and gestures enter; files, pictures, Rerun and bus leave."""

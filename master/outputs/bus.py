@@ -3,7 +3,7 @@
 For the viewer and for any program of the user.
 """
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.messages import Contact, Gesture, HandPose, ResultMessage
 
 _STREAM = {HandPose: "hand", Contact: "contact", Gesture: "gesture"}

@@ -4,7 +4,7 @@ The device is on the forearm, which the solved palm and the wrist's flexion plac
 
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
-with `T_camera_palm` of a straight wrist (`common.wrist_joint`). A bend that is not measured counts as none.
+with `T_camera_palm` of a straight wrist (`common.hand.wrist_joint`). A bend that is not measured counts as none.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import invert, quaternion_to_matrix
-from common.hand_model import WRIST, HandModel
-from common.wrist_joint import forearm_palm
+from common.geometry.transforms import invert, quaternion_to_matrix
+from common.hand.model import WRIST, HandModel
+from common.hand.wrist_joint import forearm_palm
 from master.outputs.poses import Poses
 
 _CORNERS = 24

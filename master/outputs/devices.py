@@ -8,7 +8,7 @@ the registration can see them beside the objects' poses without being a master i
 
 from typing import Generic, Protocol, TypeVar
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.messages import TrackerPose
 
 ReceivedT = TypeVar("ReceivedT")

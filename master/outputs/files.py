@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from common.errors import RecordingError
 from common.messages import Gesture, HandPose, ObjectPose, ResultMessage
-from common.npz import read_npz
+from common.recording.npz import read_npz
 from master.outputs.poses import Poses, record
 from master.outputs.result_files import GesturesFile, contact_file, object_file
 from master.outputs.table_file import TableFile

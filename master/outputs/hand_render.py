@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float
-from common.hand_model import FINGER_JOINTS, WRIST
+from common.hand.model import FINGER_JOINTS, WRIST
 
 Pixels = npt.NDArray[np.float32]
 

@@ -8,7 +8,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import RigCalibration
 from master.outputs.palette import Rgb
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 LASER_RGB: Rgb = (235, 64, 52)
 _FAN_RAD = np.radians(105.0)  # of the laser line of Digits, where the rig does not specify it

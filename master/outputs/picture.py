@@ -20,11 +20,11 @@ from matplotlib.lines import Line2D
 
 from common.arrays import Float
 from common.calibration import RigCalibration
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.geometry import axis_rotation
-from common.hand_model import TIPS, WRIST, HandModel
+from common.geometry.transforms import axis_rotation
+from common.hand.model import TIPS, WRIST, HandModel
 from common.messages import Source
-from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, unit

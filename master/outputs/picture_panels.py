@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from common.arrays import Float
-from common.hand_model import FINGERS, HandModel
+from common.hand.model import FINGERS, HandModel
 from master.outputs.palette import Rgb, series_rgb
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth, distance_m, mean_known

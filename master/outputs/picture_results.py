@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from common.arrays import Float, Int
-from common.geometry import quaternion_to_matrix, rigid, transform
+from common.calibration.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape, tag_corners
+from common.geometry.transforms import quaternion_to_matrix, rigid, transform
 from common.messages import Gesture
-from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape, tag_corners
 from master.outputs.hand_render import View
 from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import GESTURE_RGB

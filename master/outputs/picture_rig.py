@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 
 from common.arrays import Float
 from common.calibration import RigCalibration
-from common.geometry import axis_rotation
-from common.hand_model import FINGER_JOINTS, WRIST
+from common.geometry.transforms import axis_rotation
+from common.hand.model import FINGER_JOINTS, WRIST
 from common.messages import Source
+from master.monitor.volume import edges
 from master.outputs.palette import RAY_RGB, SOURCE_RGB
 from master.outputs.picture_panels import INK, Colour, style, unit
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
-from master.volume import edges
 
 STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
 _RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from common.arrays import Float, Image
-from common.camera_model import CameraModel
-from common.geometry import transform
-from common.hand_model import FINGER_JOINTS, FINGERS
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import transform
+from common.hand.model import FINGER_JOINTS, FINGERS
 from common.messages import FINGER_COUNT, Source
 from master.outputs.device_place import DevicePlace
 from master.outputs.hand_render import View
@@ -25,8 +25,8 @@ from master.outputs.palette import SOURCE_RGB, TRUTH_RGB, series_rgb
 from master.outputs.picture_panels import PAPER, style, unit
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
-from master.rig_setup import RigSetup
-from master.wrist_setup import WristSetup
+from master.rig.setup import RigSetup
+from master.rig.wrist import WristSetup
 
 _BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
 _FOREARM_M = 0.055  # of it

@@ -4,7 +4,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import now_ns
 from common.errors import BusError
 from common.messages import Command

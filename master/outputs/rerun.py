@@ -22,18 +22,18 @@ from typing import Literal, TypeVar
 import rerun as rr
 
 from common.arrays import Image
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
 from common.messages import Detections, HandPose, Health, Message, Preview, ResultMessage
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from master.outputs.poses import Poses
 from master.outputs.previews import PictureAsker
 from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 
 Mode = Literal["spawn", "web", "save"]
 

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from common.messages import Source
 from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 
 TIMELINE = "capture"
 WORLD = "world"

@@ -18,7 +18,7 @@ import numpy as np
 import rerun as rr
 
 from common.arrays import Float
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import Gesture
 from master.outputs.palette import GESTURE_RGB, Rgb
 from master.outputs.rerun_blueprint import EVENTS, WORLD

@@ -10,9 +10,9 @@ import numpy as np
 import rerun as rr
 
 from common.arrays import Image
-from common.camera_model import CameraModel
 from common.errors import PictureError
-from common.picture_size import Size, jpeg_size
+from common.geometry.camera_model import CameraModel
+from common.recording.picture_size import Size, jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, camera_path
 
 IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else

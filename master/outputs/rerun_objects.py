@@ -19,11 +19,11 @@ import numpy.typing as npt
 import rerun as rr
 
 from common.arrays import Bool, Float, Int
-from common.geometry import matrix_to_quaternion
-from common.hand_model import FINGERS
+from common.calibration.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape
+from common.geometry.tag_family import tag_image
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import FINGERS
 from common.messages import Contact, ObjectPose
-from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape
-from common.tag_family import tag_image
 from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import TOUCH_RGB, Rgb, pack, series_rgb
 from master.outputs.rerun_blueprint import WORLD

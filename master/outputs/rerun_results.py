@@ -9,9 +9,9 @@ import numpy as np
 import rerun as rr
 
 from common.arrays import Float
-from common.hand_model import PALM, TIPS
+from common.calibration.object_profile import ObjectProfile
+from common.hand.model import PALM, TIPS
 from common.messages import Contact, Gesture, ObjectPose, ResultMessage
-from common.object_profile import ObjectProfile
 from master.outputs.poses import Poses
 from master.outputs.rerun_gestures import GesturesLayer
 from master.outputs.rerun_objects import ObjectsLayer

@@ -33,10 +33,10 @@ import rerun as rr
 
 from common.arrays import Bool, Float, Image, Int
 from common.calibration import Volume
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_quaternion
-from common.hand_limits import FLEXION
-from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.limits import FLEXION
+from common.hand.model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
 from common.messages import Detections, Health, MarkerDetections, ResultMessage, Source, WristDetections
 from master.outputs.laser_fan import fan_rays
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, pack, series_rgb
@@ -47,7 +47,7 @@ from master.outputs.rerun_images import CameraImages
 from master.outputs.rerun_results import ResultLayer
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)

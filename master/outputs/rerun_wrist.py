@@ -24,8 +24,8 @@ import numpy as np
 import rerun as rr
 
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion, quaternion_to_matrix
-from common.hand_model import TIPS
+from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
+from common.hand.model import TIPS
 from common.messages import FINGER_COUNT, Source, WristDetections
 from master.outputs.device_place import DevicePlace
 from master.outputs.laser_fan import LASER_RGB, fan
@@ -33,7 +33,7 @@ from master.outputs.palette import RAY_RGB, SOURCE_RGB, TRUTH_RGB, pack, series_
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path
 from master.outputs.rerun_columns import Columns, seen
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 _FAN_LINE_M, _BONE_M = 0.0003, 0.0025
 _FOREARM_M = 0.16  # of it, as long as a hand

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
 from common.messages import FINGER_COUNT, Gesture, Message, ObjectPose
-from common.npz import read_npz
-from common.replacing import replacing
+from common.recording.npz import read_npz
 from master.outputs.table_file import Row, TableFile, cannot_write
 
 GESTURES = "gestures.jsonl"

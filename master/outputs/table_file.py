@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from common.errors import RecordingError
 from common.messages import Message
-from common.npz import write_npz
+from common.recording.npz import write_npz
 
 Row = np.dtype[np.void]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import MIDDLE_METACARPAL, MIDDLE_PROXIMAL
+from common.hand.model import MIDDLE_METACARPAL, MIDDLE_PROXIMAL
 from master.outputs.poses import Poses
 
 

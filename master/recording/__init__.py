@@ -1,4 +1,1 @@
-"""Recordings of messages.
-
-What a master received and published, kept in one file, and played again.
-"""
+"""Recordings of the bus: messages enter, MCAP files leave, and are played again."""

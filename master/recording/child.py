@@ -15,9 +15,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.errors import RecordingError
-from master.rig import RigFiles
+from master.rig.files import RigFiles
 
 READY_S = 60.0  # Python, numpy and the bus on a busy machine
 _END_S = 20.0

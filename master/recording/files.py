@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from common.errors import RecordingError
-from common.recording import MessageRecording
-from common.recording_parts import plain_names
-from master.rig import RigFiles, load_setups
-from master.rig_setup import RigSetup
+from common.recording.messages import MessageRecording
+from common.recording.parts import plain_names
+from master.rig.files import RigFiles, load_setups
+from master.rig.setup import RigSetup
 
 
 def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, bytes]:

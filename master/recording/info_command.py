@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from common.recording import open_messages
+from common.recording.messages import open_messages
 from common.terminal import echo
 from master.recording.lines import events_of, table
 

@@ -7,9 +7,9 @@ from typing import TextIO
 
 import msgspec
 
+from common.calibration.plain_names import is_plain
 from common.messages import WIRE_VERSION, Health
-from common.plain_names import is_plain
-from common.recording import MessageRecording
+from common.recording.messages import MessageRecording
 from master.recording.recorder import Progress
 
 RAW_FOLDERS = msgspec.json.Decoder(dict[str, str])

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import msgspec
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import SystemClock, now_ns
 from common.errors import PhalanxError, RecordingError
 from common.machine import program
 from common.messages import WIRE_VERSION, Command, Health, Message
-from common.recording import MessageRecording, open_messages
-from common.streams import MASTER
+from common.messages.streams import MASTER
+from common.recording.messages import MessageRecording, open_messages
 from master.outputs.bus import BusSink
 from master.outputs.files import RunFiles
 from master.outputs.sink import Sink

@@ -5,10 +5,10 @@ from argparse import Namespace
 
 from common.errors import PhalanxError
 from common.terminal import echo
-from master.master_bus import host_bus
 from master.recording.lines import ProgressLine, bar
 from master.recording.play import PlaySettings, run_play
-from master.stopping import stop_on_signals
+from master.run.master_bus import host_bus
+from master.run.stopping import stop_on_signals
 
 
 def play(options: Namespace) -> None:

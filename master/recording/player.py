@@ -16,18 +16,18 @@ from typing import cast
 from common.clock import now_ns
 from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, ResultMessage
-from common.recording import MessageRecording, Recorded
-from master.app import Solved
-from master.dispatcher import Dispatcher
-from master.link_senders import SensorMessage
-from master.load_shedding import LoadShedding, Shedding
+from common.recording.messages import MessageRecording, Recorded
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ResultDigest
 from master.recording.lines import EventMonitor
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.tuning import LivePipeline
+from master.rig.setup import RigSetup
+from master.run.app import Solved
+from master.run.dispatcher import Dispatcher
+from master.run.link_senders import SensorMessage
+from master.run.load_shedding import LoadShedding, Shedding
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline
 
 SETTLE_NS = 2_000_000_000
 GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message

@@ -13,13 +13,13 @@ import time
 from collections import deque
 from typing import Generic, TypeVar
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
 from common.messages import Backlog, Message
-from common.streams import MASTER, sender_of
-from master.load_shedding import LoadShedding
+from common.messages.streams import MASTER, sender_of
 from master.outputs.devices import Taking
+from master.run.load_shedding import LoadShedding
 
 LEASE_NS = 3_000_000_000
 CAPACITY = 20_000  # messages, some seconds

@@ -13,18 +13,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.clock import now_ns
 from common.errors import BusError
 from common.machine import program
 from common.messages import Command, Health
-from common.recording import MessageWriter
+from common.recording.messages import MessageWriter
 from master.outputs.previews import PictureAsker
 from master.recording.files import carried_files, rigs_text
 from master.recording.raw import RawAsker, raw_text
 from master.recording.recorder import MessageRecorder, Progress
 from master.recording.subscriber import MasterClock, ProbeLease, StreamSubscriber
-from master.rig import RigFiles
+from master.rig.files import RigFiles
 
 NAME = "recorder"
 KEPT = ("taken", "hand", "object", "contact", "gesture", "health", "checklist")

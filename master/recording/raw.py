@@ -12,10 +12,10 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.errors import BusError, CalibrationError, RecordingError
 from common.messages import Command, Health
-from common.raw_wish import RawWish, raw_name, refuse_strange
+from common.messages.raw_wish import RawWish, raw_name, refuse_strange
 
 LEASE_S = 10.0
 _PERIOD_S = 2.0

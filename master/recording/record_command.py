@@ -4,15 +4,15 @@ import sys
 import threading
 from argparse import Namespace
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.terminal import echo
-from master.master_bus import bus_of_master
-from master.options import rigs_of
+from master.commands.options import rigs_of
 from master.recording.lines import ProgressLine, progress_text
 from master.recording.process import RecordSettings, run_recorder
 from master.recording.recorder import Progress
-from master.rig import RigFiles
-from master.stopping import stop_on_signals
+from master.rig.files import RigFiles
+from master.run.master_bus import bus_of_master
+from master.run.stopping import stop_on_signals
 
 
 def record(options: Namespace) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from common.errors import RecordingError
 from common.messages import Message, Preview, Still
-from common.recording import MessageWriter
+from common.recording.messages import MessageWriter
 
 DEPTH = 20_000  # messages that may wait for the disk: some seconds
 PICTURES = 100  # and no picture is taken where so many wait: they would fill the memory

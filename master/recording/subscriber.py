@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.clock import now_ns
 from common.messages import Command, Health, Message
 from master.recording.probe import came_ns

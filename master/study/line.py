@@ -18,14 +18,14 @@ from msgspec.structs import replace
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, save
 from common.errors import PhalanxError, RecordingError
-from common.frame_recording import MANIFEST, open_recording
-from common.hand_model import HandModel
-from common.npz import write_npz
-from common.recorded_files import TRUTH, read_truth
+from common.hand.model import HandModel
+from common.recording.frame_recording import MANIFEST, open_recording
+from common.recording.npz import write_npz
+from common.recording.recorded_files import TRUTH, read_truth
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
-from master.rig_setup import RigSetup
-from master.solve import solve
+from master.replay.solve import solve
+from master.rig.setup import RigSetup
 
 SolverMode = Literal["fk", "ik", "auto"]
 Inputs = Literal["detected", "exact"]

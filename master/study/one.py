@@ -15,15 +15,15 @@ from msgspec import Struct
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
 from common.errors import FitError, RecordingError
-from common.frame_recording import open_recording
-from common.geometry import transform
+from common.geometry.transforms import transform
+from common.recording.frame_recording import open_recording
 from master.calibrate.wrist.subject import calibrate_subject
-from master.recorded import recorded_cycles
+from master.commands.summary import read_summary, write_summary
+from master.replay.recorded import recorded_cycles
 from master.study.line import Inputs, SolverMode, claim, detect, solved, write_exact
 from master.study.participant import Known, Participant, about, participant
 from master.study.session import TRIAL_S, record_guided, record_trials
 from master.study.trials import Trial, trials_of
-from master.summary import read_summary, write_summary
 
 Condition = tuple[Known, Inputs]
 Resume = Literal["frames", "detections"]

@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.hand_model import FINGERS
-from common.replacing import replacing
+from common.hand.model import FINGERS
 from common.sim.motion import POSES
 from master.study import paper
 from master.study.report import Result

@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import SolverMode
-from common.replacing import replacing
 from common.sim.motion import POSES
 from master.study import paper
 from master.study.one import Calibrated

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from common.calibration import HandProfile
 from common.errors import RecordingError
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from master.study.line import SolverMode, detect, solved
 from master.study.one import Condition, Outcome, Task, name_of, run_participant
 from master.study.plot import draw_study

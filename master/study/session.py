@@ -15,7 +15,7 @@ import numpy as np
 
 from common.calibration import CameraCalibration
 from common.errors import RecordingError
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.sim.motion import POSES, REST
 from common.sim.record import FIRST_NS
 from common.sim.wrist.motion import SUBJECT_S, GuidedSubject, Stations

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.sim.motion import POSES
 from master.study.trials import Trial
 

@@ -11,13 +11,13 @@ from msgspec import Struct
 
 from common.arrays import Bool, Float
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording
-from common.hand_model import FINGER_JOINTS
-from common.recorded_files import read_truth
+from common.hand.model import FINGER_JOINTS
+from common.recording.frame_recording import FrameRecording
+from common.recording.recorded_files import read_truth
 from common.sim.motion import POSES
+from master.evaluation.wrist_score import WristTruth, at_rows, clear_line, load_wrist_truth, rows_at
 from master.outputs.poses import Poses
 from master.study.session import COLUMNS, TRIALS, Held
-from master.wrist_score import WristTruth, at_rows, clear_line, load_wrist_truth, rows_at
 
 LETTERS = dict(zip("ABCDEF", POSES, strict=True))  # as the paper names the poses
 Five = tuple[float, ...]

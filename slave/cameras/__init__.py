@@ -1,1 +1,1 @@
-"""Cameras: one seam, one file per driver."""
+"""Camera drivers, one file each: settings enter, frames with times leave."""

@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
+from common.calibration.json_file import decode_json
 from common.errors import CalibrationError, CameraError
-from common.json_file import decode_json
 from slave.cameras.synthetic import SyntheticCamera
 from slave.sources import Frame
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from common.arrays import Image
 from common.errors import CameraError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 
 
 class Pixels(StrEnum):

@@ -30,10 +30,8 @@ GLOBAL_SHUTTER_ROW_US = (
 EXPOSURE_SHARE = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
 COLOUR_GAIN = 0.01
 DIOPTRES = 0.05
-SYNC_FRAMES = (
-    100  # libcamera's default: the server notifies the clients every 30 frames, so each receives it three
-)
-times
+# libcamera's default: the server notifies the clients every 30 frames, so each receives it three times
+SYNC_FRAMES = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +179,7 @@ def wanted_settings(
 def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
     """Read the settings and more from the metadata of a frame.
 
-    The names are those of `common.camera_settings`.
+    The names are those of `common.calibration.camera_settings`.
     """
     found: dict[str, float] = {}
     for name, metrics in (

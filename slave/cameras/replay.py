@@ -8,12 +8,12 @@ from pathlib import Path
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.camera_settings import figures, same_exposed
+from common.calibration.camera_settings import figures, same_exposed
 from common.clock import Clock
 from common.errors import CameraError, PictureError, RecordingError
-from common.frame_pictures import FramePictures
-from common.frame_recording import FrameRow, Manifest, open_recording
-from common.pictures import decode, read_picture
+from common.recording.frame_pictures import FramePictures
+from common.recording.frame_recording import FrameRow, Manifest, open_recording
+from common.recording.pictures import decode, read_picture
 from slave.sources import Frame
 
 GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame

@@ -24,10 +24,10 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from common.camera_settings import figures
+from common.calibration.camera_settings import figures
 from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.scene import Scene
 from common.sim.scenes import renderer_of

@@ -33,7 +33,7 @@ from msgspec import structs
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.camera_settings import same_exposed
+from common.calibration.camera_settings import same_exposed
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi

@@ -17,7 +17,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import CameraError, PictureError
-from common.pictures import decode
+from common.recording.pictures import decode
 from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma
 from slave.cameras.v4l2_abi import (
     CAPTURE,

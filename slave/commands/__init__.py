@@ -1,4 +1,1 @@
-"""Commands of `phalanx-slave`, one file each.
-
-Each file has purpose and examples, its options, and what it does.
-"""
+"""What commands of a slave do: parsed options enter, lines and codes leave."""

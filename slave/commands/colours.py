@@ -44,7 +44,7 @@ def _recording(options: argparse.Namespace) -> Generator[Path]:
         PhalanxError: They cannot be read, or are not those of the camera.
     """
     from common.errors import RecordingError
-    from common.frame_recording import MANIFEST
+    from common.recording.frame_recording import MANIFEST
     from slave.foreign.importing import Wish, import_pictures
 
     if (options.recording / MANIFEST).is_file():

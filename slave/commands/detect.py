@@ -20,7 +20,7 @@ def detect(options: argparse.Namespace) -> int:
     Raises:
         PhalanxError: The recording or a file of calib_json is missing or broken, or an option makes no sense for it.
     """
-    from common.frame_recording import load_manifest
+    from common.recording.frame_recording import load_manifest
     from slave.cameras.replay import is_grey
 
     camera, recording = _source(options)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME
+from common.imu.csv_columns import ACCEL, GYRO, MAG, TIME
 from common.terminal import echo
 from slave import devices
 from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, world_of
@@ -68,7 +68,7 @@ def import_table_of_imu(options: argparse.Namespace) -> int:
     Raises:
         PhalanxError: It is missing or broken.
     """
-    from common.imu_csv import read_csv
+    from common.imu.csv_table import read_csv
     from slave.imu.importing import import_table
 
     units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
 from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError
-from common.object_profile import ObjectProfile
 
 if TYPE_CHECKING:
-    from common.keys import Access
-    from common.link_key import LinkKey
+    from common.bus.keys import Access
+    from common.link.link_key import LinkKey
 
 USUAL_RIG = "desk"
 USUAL_TREE = Path("calib_json")
@@ -101,7 +101,7 @@ def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
     Raises:
         PhalanxError: There is no rig key, or the keys folder has no certificate or no secret of this device.
     """
-    from common.keys import access_of, link_key
+    from common.bus.keys import access_of, link_key
 
     access = access_of(os.environ, options.name, options.keys, options.open)
     if access.folder is not None:

@@ -28,7 +28,7 @@ from slave.commands.options import camera_of, camera_path, clock_of, objects_of,
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
-    from common.frame_recording import Manifest
+    from common.recording.frame_recording import Manifest
     from slave.imu.recording import ImuRecorder
     from slave.progress import Progress
 
@@ -73,7 +73,7 @@ def record_camera(options: argparse.Namespace) -> int:
     Raises:
         PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
     """
-    from common.frame_writing import refuse_occupied
+    from common.recording.frame_writing import refuse_occupied
     from slave.simulated import add_imu, imu_of
 
     scene = _scene(options)
@@ -114,7 +114,7 @@ def _scene(options: argparse.Namespace) -> _Scene:
 
 
 def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
-    from common.frame_recording import Manifest
+    from common.recording.frame_recording import Manifest
     from slave.recorder import clock_of as recorded_clock
 
     rig, skewed = scene.rig, skew_of(options, scene.true_clock)

@@ -5,9 +5,9 @@ import os
 import threading
 
 from common.calibration import RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.clock import SkewedClock, SystemClock
 from common.errors import PhalanxError
-from common.object_profile import ObjectProfile
 from common.terminal import echo
 from slave import devices
 from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, tree_of, world_of

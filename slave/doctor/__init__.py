@@ -1,4 +1,1 @@
-"""`phalanx-slave doctor`: diagnosis of a device.
-
-It reports what is well, what is not, and how to mend that. It changes nothing.
-"""
+"""Diagnosis of a device: its host and sensors enter, findings with a fix leave."""

@@ -11,9 +11,9 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 
-from common.certificates import CLOCK_FIX, shown
+from common.bus.certificates import CLOCK_FIX, shown
+from common.bus.keys import RIG_KEY, access_of, link_key, rig_key, secret_of
 from common.errors import PhalanxError
-from common.keys import RIG_KEY, access_of, link_key, rig_key, secret_of
 from slave.doctor.finding import Finding, fail, ok, unseen, warn
 from slave.doctor.system import System
 

@@ -9,10 +9,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from common.bus.keys import RIG_KEY, rig_key
 from common.clock import SystemClock
 from common.errors import PhalanxError
-from common.keys import RIG_KEY, rig_key
-from common.udp import UdpSocket
+from common.link.udp import UdpSocket
 from slave.doctor.finding import Finding, fail, ok, unseen, warn
 from slave.doctor.system import System
 from slave.link import SlaveLink

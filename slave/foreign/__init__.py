@@ -1,4 +1,1 @@
-"""Import of videos and pictures of foreign cameras as a recording.
-
-It finds which camera they belong to and when they were taken.
-"""
+"""Import of foreign videos and pictures: files enter, a recording leaves."""

@@ -17,14 +17,14 @@ import numpy as np
 
 from common.arrays import Int
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
 from common.errors import PictureError, RecordingError
-from common.frame_pictures import frame_name
-from common.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
-from common.frame_writing import RecordingWriter, refuse_occupied
-from common.object_profile import ObjectProfile
-from common.picture_size import size_of
-from common.pictures import decode, read_picture
-from common.video import VideoFrames
+from common.recording.frame_pictures import frame_name
+from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
+from common.recording.frame_writing import RecordingWriter, refuse_occupied
+from common.recording.picture_size import size_of
+from common.recording.pictures import decode, read_picture
+from common.recording.video import VideoFrames
 from slave.foreign.sources import Source, found_in, pictures_in, rig_for, sources_of
 from slave.foreign.times import Timed, by_rate, by_table, read_times
 

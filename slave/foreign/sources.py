@@ -7,7 +7,7 @@ from pathlib import Path
 
 from common.calibration import RigCalibration, load
 from common.errors import RecordingError
-from common.video import ENDINGS as VIDEOS
+from common.recording.video import ENDINGS as VIDEOS
 
 PICTURES = (".png", ".jpg", ".jpeg")
 

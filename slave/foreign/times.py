@@ -14,8 +14,8 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import RecordingError
-from common.message_parts import MAX_TIME_NS
-from common.recorded_files import read_table
+from common.messages.parts import MAX_TIME_NS
+from common.recording.recorded_files import read_table
 
 Times = Mapping[int, int]
 """Number of a frame, from 0 -> when it was taken [ns]."""

@@ -1,1 +1,1 @@
-"""IMUs: one seam, one file per driver."""
+"""IMU drivers, one file each: a port enters, samples with times leave."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.imu_csv import Table
-from common.imu_csv_columns import QUATERNION
-from common.imu_fusion import OrientationFilter
-from common.imu_recording import IMU, write_imu
+from common.imu.csv_columns import QUATERNION
+from common.imu.csv_table import Table
+from common.imu.fusion import OrientationFilter
+from common.imu.recording import IMU, write_imu
 from common.imu_score import TiltErrors
 from common.messages import ImuSample
 

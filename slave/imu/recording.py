@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TextIO
 
 from common.errors import ImuError, PhalanxError, RecordingError
-from common.imu_fusion import OrientationFilter
-from common.imu_recording import HEADERS, IMU, row
+from common.imu.fusion import OrientationFilter
+from common.imu.recording import HEADERS, IMU, row
 from slave.counters import imu_counters
 from slave.sources import ImuSource
 

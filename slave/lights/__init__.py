@@ -1,4 +1,1 @@
-"""Laser and LEDs of a wrist device.
-
-Who switches them, when, and within which limits.
-"""
+"""Laser and LEDs: a strobe schedule enters, pulses within safe limits leave."""

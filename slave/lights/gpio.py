@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from common.errors import LightsError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.lights.gpio_watchdog import DARK, LIT
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ from collections import Counter
 
 from smbus2 import SMBus
 
+from common.calibration.strobe import StrobeCalibration
 from common.errors import LightsError
-from common.frame_recording import Illumination
-from common.strobe_calibration import StrobeCalibration
+from common.recording.frame_recording import Illumination
 
 ADDRESS = 0x63  # 8.5.2.4
 # 8.6.1 to 8.6.12

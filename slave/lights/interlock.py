@@ -16,10 +16,10 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Protocol
 
+from common.calibration.strobe import StrobeCalibration
 from common.clock import Clock, SystemClock
 from common.errors import LightsError
-from common.frame_recording import Illumination
-from common.strobe_calibration import StrobeCalibration
+from common.recording.frame_recording import Illumination
 
 WINDOW_NS = 1_000_000_000  # over which the duty is reckoned; any second, not every second
 EVENTS = ("pulses", "refused", "off_by_watchdog", "failed")

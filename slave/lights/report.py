@@ -6,10 +6,10 @@ This is what `doctor --lights` prints and does.
 import threading
 
 from common.calibration import CameraCalibration, RigCalibration
+from common.calibration.strobe import Limit, StrobeCalibration, limits_of
 from common.clock import SystemClock
 from common.errors import LightsError
-from common.frame_recording import Illumination
-from common.strobe_calibration import Limit, StrobeCalibration, limits_of
+from common.recording.frame_recording import Illumination
 from slave.lights.interlock import Interlock
 from slave.lights.schedule import CYCLE
 from slave.lights.strobed import check_pulses, schedule_of

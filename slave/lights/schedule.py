@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 
 CYCLE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 KEPT = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by a microsecond

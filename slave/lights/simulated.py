@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
+from common.calibration.strobe import StrobeCalibration
 from common.clock import Clock
-from common.frame_recording import Illumination
-from common.strobe_calibration import StrobeCalibration
+from common.recording.frame_recording import Illumination
 from slave.lights.controller import Strobe
 from slave.lights.interlock import Interlock
 from slave.lights.schedule import StrobeSchedule

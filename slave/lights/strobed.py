@@ -6,8 +6,8 @@ Every frame's stamp goes to the controller on its way to the detector.
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, RigCalibration
+from common.calibration.strobe import StrobeCalibration
 from common.errors import CalibrationError, CameraError
-from common.strobe_calibration import StrobeCalibration
 from slave.lights.controller import Strobe
 from slave.lights.schedule import CYCLE, MARGIN_NS, StrobeSchedule
 from slave.sources import Frame, FrameSource, Tunable

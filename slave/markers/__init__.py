@@ -1,1 +1,1 @@
-"""Coloured markers in one image: classify, blobs, roi, detector."""
+"""Coloured markers: an image enters; classes, blobs, ROI; centroids leave."""

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from common.arrays import Float, Int
 from common.calibration import HandProfile, HsvRange
 from common.errors import CalibrationError, FitError
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from slave.markers.autocolour import MarkerColour, Namer, Notify
 from slave.markers.classify import HUES
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration import HsvRange
-from common.srgb import to_srgb
+from common.geometry.srgb import to_srgb
 from slave.markers.classify import HUES
 
 TIME_S = 0.5

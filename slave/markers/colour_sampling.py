@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.errors import FitError
-from common.srgb import gain_tables
+from common.geometry.srgb import gain_tables
 from slave.markers.classify import HUES, SKIN, in_range
 from slave.markers.colour_monitor import hsv as hsv_of_light
 from slave.markers.colours import (

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.errors import FitError
-from common.srgb import to_linear
+from common.geometry.srgb import to_linear
 from slave.markers.classify import HUES, in_range
 
 HUE_GROW = 10  # how far the hue of one marker varies between its lit and its shadow side

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image
-from common.srgb import gain_tables, to_linear
+from common.geometry.srgb import gain_tables, to_linear
 from slave.markers.classify import ColourTable
 from slave.markers.drift import bounded, fit_gains
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from common.srgb import gain_tables
+from common.geometry.srgb import gain_tables
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.colour_monitor import ColourMonitor, ColourWarning
 from slave.markers.detector import Detections, MarkerDetector

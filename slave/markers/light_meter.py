@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.srgb import to_linear
+from common.geometry.srgb import to_linear
 
 GRID = 16  # points along each side
 DARK, BRIGHT = 12, 250  # bytes beyond which a point measures nothing: noise, or clipped

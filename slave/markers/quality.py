@@ -138,6 +138,6 @@ def _hue(blue: float, green: float, red: float) -> float:
 
 
 def _srgb(linear: float) -> float:
-    """As `common.srgb.to_srgb`, of one number."""
+    """As `common.geometry.srgb.to_srgb`, of one number."""
     linear = min(max(linear, 0.0), 1.0)
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055

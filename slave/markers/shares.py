@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image
-from common.srgb import to_linear
+from common.geometry.srgb import to_linear
 
 Float32: TypeAlias = npt.NDArray[np.float32]
 

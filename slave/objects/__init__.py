@@ -1,4 +1,1 @@
-"""Devices that track themselves, such as a Vive tracker.
-
-One interface, one file per driver.
-"""
+"""Devices that track themselves: a driver enters, poses with times leave."""

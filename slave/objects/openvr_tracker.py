@@ -18,7 +18,7 @@ import numpy as np
 from common.arrays import Float
 from common.clock import Clock
 from common.errors import TrackerChoiceError, TrackerError
-from common.geometry import matrix_to_quaternion
+from common.geometry.transforms import matrix_to_quaternion
 from common.messages import TrackerPose
 from slave.objects.openvr_library import Library, VrSystem, connect, load_library
 

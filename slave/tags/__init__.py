@@ -1,1 +1,1 @@
-"""Fiducial tags (AprilTag, ArUco) on tracked objects."""
+"""Fiducial tags (AprilTag, ArUco): an image enters, corners leave."""

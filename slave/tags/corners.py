@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image
-from common.camera_model import CameraModel
-from common.srgb import to_linear
+from common.geometry.camera_model import CameraModel
+from common.geometry.srgb import to_linear
 
 LIGHT = to_linear(np.arange(256) / 255.0)  # of a byte
 ALONG, ACROSS = 18, 9  # samples of a side: places on it, and steps from black to white

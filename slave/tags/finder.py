@@ -20,11 +20,11 @@ import numpy as np
 
 from common.arrays import Float, Ids, Image
 from common.calibration import CameraCalibration
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile, TagFamily
 from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
+from common.geometry.tag_family import GRIDS
 from common.messages import MAX_TAGS
-from common.object_profile import ObjectProfile, TagFamily
-from common.tag_family import GRIDS
 from slave.tags.corners import Corners, refine
 from slave.tags.quads import quads
 from slave.tags.reading import Codes

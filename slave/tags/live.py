@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from common.calibration import CameraCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.messages import TagDetections
-from common.object_profile import ObjectProfile
 from slave.sources import Frame
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import numpy as np
 
 from common.arrays import Float, Ids, Image, Int
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.frame_recording import FrameRow
-from common.object_profile import ObjectProfile
+from common.recording.frame_recording import FrameRow
 from slave.tags.finder import FoundTags, TagFinder
 
 

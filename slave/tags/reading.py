@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Ids, Image, Int
-from common.object_profile import TagFamily
-from common.tag_family import GRIDS, tag_bits
+from common.calibration.object_profile import TagFamily
+from common.geometry.tag_family import GRIDS, tag_bits
 from slave.tags.corners import LIGHT, Corners, normal_law
 
 SPOTS = np.array(

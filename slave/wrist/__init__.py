@@ -1,4 +1,1 @@
-"""Processing beside the camera of a wrist device.
-
-From strobed frames to laser points and fingertips.
-"""
+"""Wrist camera: strobed images enter, laser and fingertip points leave."""

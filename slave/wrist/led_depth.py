@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.flat_field import flat_of
+from common.calibration.flat_field import flat_of
 from slave.wrist.view import WristView
 
 Float32: TypeAlias = npt.NDArray[np.float32]

@@ -16,8 +16,8 @@ import numpy as np
 from common.arrays import Float, Int
 from common.calibration import HandProfile, RigCalibration, load
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import FrameRecording, Illumination, open_recording
 from common.messages import WristDetections
+from common.recording.frame_recording import FrameRecording, Illumination, open_recording
 from slave.cameras.replay import read_png
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector

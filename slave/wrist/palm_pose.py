@@ -19,9 +19,9 @@ from functools import lru_cache
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
-from common.geometry import rigid
-from common.hand_model import CHAINS, METACARPALS
-from common.wrist_joint import STRAIGHT, forearm_palm
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, METACARPALS
+from common.hand.wrist_joint import STRAIGHT, forearm_palm
 from slave.wrist.led_depth import SHRINK, Float32, shrink
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import NEAREST_M, in_image
@@ -56,7 +56,7 @@ class PalmPose:
     """How the palm lies now.
 
     Attributes:
-        wrist_angles_rad: (2,) bend of the wrist (`common.wrist_joint`).
+        wrist_angles_rad: (2,) bend of the wrist (`common.hand.wrist_joint`).
         T_camera_palm: (4, 4) with it [m].
         view: One as if the palm lay about like that: what search bands and reach are made of.
     """

@@ -19,10 +19,10 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.fingertips import Fingertips
-from common.geometry import rotation_vector_to_matrix
-from common.hand_model import CHAINS, FINGER_JOINTS
-from common.tapered_capsules import Capsules, first_hits, terms
+from common.geometry.tapered_capsules import Capsules, first_hits, terms
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.fingertips import Fingertips
+from common.hand.model import CHAINS, FINGER_JOINTS
 from slave.wrist.led_depth import Float32
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import NEAREST_M, thumb_postures

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from common.arrays import Float, Int
 from common.errors import CalibrationError
-from common.hand_limits import ABDUCTION
-from common.hand_model import CHAINS, METACARPALS
+from common.hand.limits import ABDUCTION
+from common.hand.model import CHAINS, METACARPALS
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import (
     NEAREST_M,

@@ -9,9 +9,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
-from common.hand_model import HandModel
-from common.wrist_calibration import FlatField
-from common.wrist_device import WristDevice
+from common.calibration.wrist import FlatField
+from common.hand.model import HandModel
+from common.hand.wrist_device import WristDevice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

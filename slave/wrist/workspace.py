@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image, Int
-from common.camera_model import CameraModel
-from common.geometry import intersect_plane
-from common.hand_model import CHAINS
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import intersect_plane
+from common.hand.model import CHAINS
 from slave.wrist.palm_pose import PalmPose
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from slave.wrist.view import WristView
 
 PER_BONE = 6  # points along each bone

@@ -21,11 +21,11 @@ import slave
 from bench.aarch64.frames import FRAME_NS, SIX, read
 from bench.aarch64.guest import Digest, arrays_of
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.datagram import Kind, Opener, Sealer, parse
 from common.errors import PhalanxError
-from common.frame_recording import Illumination
+from common.link.datagram import Kind, Opener, Sealer, parse
+from common.link.session import RigKeys
 from common.messages import Health, ImuSample, MarkerDetections, Message, WristDetections, decode, encode
-from common.session import RigKeys
+from common.recording.frame_recording import Illumination
 from slave.markers.detector import MarkerDetector
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector

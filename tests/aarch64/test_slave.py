@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from bench.local_rig import free_port
-from common.bus import Subscription
+from common.bus.bus import Subscription
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
 from common.messages import Command, Health, MarkerDetections
-from common.zenoh_bus import ZenohBus
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 from tests.aarch64.machine import guest_or_skip
 from tests.network_helpers import until
 

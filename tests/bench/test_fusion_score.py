@@ -8,8 +8,8 @@ from bench.fusion_score import Figures, Sighted, ratios
 from bench.fusion_solved import RejectedPeer, Solved
 from bench.played import START_NS
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion
-from common.hand_model import CHAINS, TIPS, WRIST
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import CHAINS, TIPS, WRIST
 from common.messages import HandPose, MarkerDetections, Source, WristDetections
 
 BOTH = Both.of("both-poses", 3)

@@ -4,7 +4,7 @@ import numpy as np
 
 from bench.gesture_recorded import agrees
 from bench.recognised_poses import RecognisedPoses
-from common.geometry import axis_rotation
+from common.geometry.transforms import axis_rotation
 from common.sim.motion import POSES
 from tests.hand_helpers import LEFT, RIGHT
 from tests.master.gestures.shown_hands import posture

@@ -9,12 +9,12 @@ import pytest
 from bench.gesture_truth import GestureTruth
 from bench.gestures import Score, recognised_in, seen_poses
 from bench.played import START_NS
-from common.gesture_settings import default_gestures
+from common.calibration.gesture_settings import default_gestures
 from common.messages import Gesture
 from common.sim.gestures import Gestures
 from common.sim.scenes import scene_by_name
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 CALIBRATION = Path(__file__).parents[2] / "calib_json"
 SETTINGS = default_gestures()

@@ -12,11 +12,11 @@ from msgspec import Meta, Struct
 from bench.hostile_examples import Speaker, examples
 from bench.hostile_messages import SAID, Attack, Now, all_attacks, attacks, flood, plausible
 from common.arrays import Float
-from common.datagram import Kind
 from common.errors import MessageError
-from common.message_parts import Count, within
+from common.link.datagram import Kind
+from common.link.session import EchoAnswer, Hello, Started, read
 from common.messages import Message, TrackerPose, decode, encode
-from common.session import EchoAnswer, Hello, Started, read
+from common.messages.parts import Count, within
 
 MESSAGES = [kind for kind in SAID if issubclass(kind, Message)]
 SHAKES: dict[type[Struct], Kind] = {Hello: Kind.HELLO, Started: Kind.STARTED, EchoAnswer: Kind.ECHO_ANSWER}

@@ -7,7 +7,7 @@ from bench.mounts import pair_at
 from bench.occlusion import CALIBRATION, Unseen
 from bench.volume import SWAY_M, Tour
 from common.calibration import HandProfile, RigCalibration, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 
 RIG = load(CALIBRATION / "rigs" / "desk4.json", RigCalibration)
 

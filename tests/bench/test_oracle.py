@@ -20,9 +20,9 @@ from bench.oracle_truth import Truth, sets_of, truths_of
 from bench.real_motion import recordings
 from common.arrays import Float
 from common.errors import RecordingError
-from common.npz import read_npz, write_npz
+from common.recording.npz import read_npz, write_npz
 from common.sim.scenes import scene_by_name
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 _STEP_NS = 10_000_000
 

@@ -15,10 +15,10 @@ from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import Couplings
-from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
-from common.hand_model import FINGERS, HandModel
-from common.hand_presets import preset_limits
-from common.hand_profiles import generated_profile
+from common.calibration.hand_presets import preset_limits
+from common.geometry.transforms import quaternion_to_matrix, rotation_vector_to_matrix
+from common.hand.model import FINGERS, HandModel
+from common.hand.profiles import generated_profile
 from master.estimator.settings import DEFAULT
 from master.fabrik.rotations import Vector
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from bench.real_motion import Recorded, held_poses, jitter, play, recordings, wide_limits
 from bench.solved_hand import PointHand
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from tests.hand_helpers import MARKERS, palm, small_cov
 
 

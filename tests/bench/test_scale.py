@@ -11,7 +11,7 @@ from bench.scale import cost_per_camera, summary
 from bench.scale_page import into_page
 from bench.scale_rig import ROOM, detections_of, dome, room
 from bench.scale_run import ScaleRun
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
 

@@ -5,7 +5,7 @@ import pytest
 
 from bench.sync_hands import derivatives
 from bench.sync_rig import CALIBRATION, MOTIONS, Shooting, centroids, outcome
-from master.rig import load_setup
+from master.rig.files import load_setup
 
 RATES_HZ = (30.0, 60.0, 90.0)
 SEEDS = range(1)

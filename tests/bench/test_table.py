@@ -11,7 +11,7 @@ import pytest
 from bench import filters, pose_cost
 from bench.__main__ import SECTIONS, main
 from bench.row import Row
-from master.stages import StageTimes
+from master.run.stages import StageTimes
 
 
 @pytest.mark.parametrize("section", SECTIONS)

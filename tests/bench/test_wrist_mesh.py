@@ -11,7 +11,7 @@ from bench.wrist_mesh.render import Device, Moment
 from bench.wrist_mesh.room import BLACK, Room
 from bench.wrist_mesh.sets import set_named, write_set
 from common.arrays import Image
-from common.frame_recording import load_manifest, open_recording
+from common.recording.frame_recording import load_manifest, open_recording
 
 
 @pytest.mark.parametrize(("name", "k"), [("curl", 12), ("spread", 3), ("left_small", 0)])

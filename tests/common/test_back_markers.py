@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.back_markers import with_three_back_markers
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.back_markers import with_three_back_markers
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from common.sim.light import marker_colour
 from common.sim.render import Renderer
 from common.sim.scene import Scene

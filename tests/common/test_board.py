@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
-from common.geometry import transform
+from common.geometry.transforms import transform
 from common.sim.board import COLUMNS, HELD_S, MOVED_S, ROWS, SQUARE_M, BoardRenderer, BoardScene
 
 CALIB = Path(__file__).parents[2] / "calib_json"

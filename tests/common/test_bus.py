@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from common.bus import MOST_SENDERS, Bus, Inbox, LoopbackBus
+from common.bus.bus import MOST_SENDERS, Bus, Inbox, LoopbackBus
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.messages import Command, Health, encode
-from common.zenoh_bus import ZenohBus
 from tests.network_helpers import free_endpoint, health, until
 
 

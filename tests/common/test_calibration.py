@@ -27,8 +27,8 @@ from common.calibration import (
     parse,
     save,
 )
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.object_profile import ObjectProfile
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from common import calibration
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
-from common.camera_model import CameraModel
+from common.calibration.gesture_settings import GestureSettings
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.output_settings import OutputSettings
 from common.errors import CalibrationError
-from common.frame_recording import Manifest, check_manifest
-from common.gesture_settings import GestureSettings
-from common.hand_model import HandModel
-from common.object_profile import ObjectProfile
-from common.output_settings import OutputSettings
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandModel
+from common.recording.frame_recording import Manifest, check_manifest
 from tests.common.file_values import bounds_of, edited, edits, numbers_without_bounds
 
 ROOT = Path(__file__).resolve().parents[2]

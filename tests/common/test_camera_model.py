@@ -9,9 +9,9 @@ from hypothesis.extra.numpy import arrays
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, Intrinsics
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, invert, rigid, transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, invert, rigid, transform
 
 DISTORTION = (0.105, -0.21, 0.0006, -0.0009, 0.05)  # a Camera v1, from the description of the file format
 T_RIG_CAMERA = rigid(axis_rotation(1, -0.05) @ axis_rotation(0, 0.02), np.array([0.075, 0.001, -0.002]))

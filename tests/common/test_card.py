@@ -10,10 +10,10 @@ import pytest
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
-from common.geometry import transform
+from common.geometry.srgb import to_linear
+from common.geometry.transforms import transform
 from common.sim.board import HELD_S, MOVED_S, BoardRenderer
 from common.sim.card import DISTANCES_M, HEIGHT_M, MARKER, WIDTH_M, CardScene
-from common.srgb import to_linear
 
 CALIB = Path(__file__).parents[2] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.clock import SkewedClock, SystemClock, Ticker
-from common.clock_offset import ClockEstimate, OffsetEstimator
+from common.link.clock_offset import ClockEstimate, OffsetEstimator
 from tests.network_helpers import ManualClock
 
 MS = 1_000_000
 S = 1_000_000_000
-ECHO_FAST_NS = 10 * MS  # as master.link asks in the first two seconds
+ECHO_FAST_NS = 10 * MS  # as master.run.link asks in the first two seconds
 Delay = Callable[[random.Random], float]
 
 

@@ -5,7 +5,7 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.datagram import (
+from common.link.datagram import (
     HEADER,
     MAX_DATAGRAM,
     OVERHEAD,

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import Subscription
-from common.certificates import MASTER, OPERATOR
+from common.bus.bus import Subscription
+from common.bus.certificates import MASTER, OPERATOR
+from common.bus.keys import Access
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from common.keys import Access
 from common.messages import Command, Gesture, Health
-from common.zenoh_bus import ZenohBus
-from master.keys_folder import make
+from master.commands.keys_folder import make
 from tests.network_helpers import free_endpoint, health, until
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from common.endpoints import check, default_bus, encrypted, host_of, port_of, reached_at
+from common.bus.endpoints import check, default_bus, encrypted, host_of, port_of, reached_at
 from common.errors import BusError
 
 

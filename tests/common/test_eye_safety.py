@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common import eye_safety
+from common.calibration import eye_safety
 
 
 def test_the_milliwatt_of_class_2_is_a_quarter_second_of_the_pulse_formula() -> None:

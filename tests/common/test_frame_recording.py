@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from common.errors import RecordingError
-from common.frame_recording import FrameRow, Illumination, open_recording
+from common.recording.frame_recording import FrameRow, Illumination, open_recording
 
 HEADER = "camera,seq,t_ns,illumination,file"
 ROWS = ("right,0,1005,none,right/0.png", "left,1,2000,none,left/1.png", "left,0,1000,none,left/0.png")

@@ -17,8 +17,8 @@ import pytest
 from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import RecordingError
-from common.frame_recording import Illumination, Manifest, RecordedClock, open_recording
-from common.frame_writing import RecordingWriter, encode_png
+from common.recording.frame_recording import Illumination, Manifest, RecordedClock, open_recording
+from common.recording.frame_writing import RecordingWriter, encode_png
 from tests.network_helpers import until
 from tests.programs import needs
 
@@ -218,7 +218,7 @@ def test_a_full_disk_takes_no_new_recording_and_keeps_nothing_of_it(tmp_path: Pa
 ENDLESS = """
 import sys
 from pathlib import Path
-from common.frame_writing import RecordingWriter, encode_png
+from common.recording.frame_writing import RecordingWriter, encode_png
 from tests.common.test_frame_writing import MANIFEST, NONE, noise
 writer = RecordingWriter(Path(sys.argv[1]), MANIFEST)
 png = encode_png(noise(0, 200, 200, 3))

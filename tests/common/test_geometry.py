@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.geometry import (
+from common.geometry.transforms import (
     axis_rotation,
     cross,
     fit_rigid,

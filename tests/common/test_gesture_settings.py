@@ -6,8 +6,14 @@ import msgspec
 import pytest
 
 from common.calibration import load, parse, save
+from common.calibration.gesture_settings import (
+    GestureSettings,
+    HoldSettings,
+    PoseShape,
+    Span,
+    default_gestures,
+)
 from common.errors import CalibrationError
-from common.gesture_settings import GestureSettings, HoldSettings, PoseShape, Span, default_gestures
 from common.sim.motion import POSES
 
 FILE = Path(__file__).parents[2] / "calib_json" / "gestures" / "default.json"

@@ -8,8 +8,8 @@ import pytest
 
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.geometry import invert
-from common.hand_model import HandModel
+from common.geometry.transforms import invert
+from common.hand.model import HandModel
 from common.sim.grasp import BACK_S, CLOSED_S, LIFT_S, LIFTED_S, LOWER_S, RELEASE_S, ROUND_S, ROUNDS, Grasp
 from common.sim.grip import MCP_PER_PIP, bar_in_palm, closed_round, gaps_m
 from common.sim.held import Cylinder

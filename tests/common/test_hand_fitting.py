@@ -10,9 +10,9 @@ from bench.real_motion import floor_m, recordings
 from common.arrays import Float
 from common.calibration import HandProfile
 from common.errors import CalibrationError
-from common.hand_fitting import profile_from_joints, profile_from_rest
-from common.hand_model import CHAINS, HandModel
-from common.hand_profiles import generated_profile
+from common.hand.fitting import profile_from_joints, profile_from_rest
+from common.hand.model import CHAINS, HandModel
+from common.hand.profiles import generated_profile
 
 
 def motion(model: HandModel, count: int = 200) -> Float:

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.calibration import HandProfile, load, save
-from common.geometry import quaternion_to_matrix
-from common.hand_model import CHAINS, FINGER_JOINTS, HandModel
-from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
+from common.hand.profiles import generated_profile, mirrored_profile, scaled_profile
 
 # Buchholz, Armstrong & Goldstein, 1992: proximal and middle bone as shares of hand length.
 BONES = {1: (0.245, 0.143), 2: (0.266, 0.170), 3: (0.244, 0.165), 4: (0.204, 0.117)}

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
-from common.hand_routine import MOVES, ROUTINE_S, STEPS, move_at, posture_at
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
+from common.hand.routine import MOVES, ROUTINE_S, STEPS, move_at, posture_at
 from common.sim.routine import PERIOD_S, REACTION_S, HandRoutine
 
 MODEL = HandModel.of(generated_profile("any", "right"))

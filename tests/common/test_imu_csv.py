@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.imu_csv import Table, read_csv
-from common.imu_csv_columns import UNITS, find_columns
+from common.imu.csv_columns import UNITS, find_columns
+from common.imu.csv_table import Table, read_csv
 
 G = 9.80665
 

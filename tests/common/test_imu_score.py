@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from common.geometry import axis_rotation, matrix_to_quaternion
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion
 from common.imu_score import TiltErrors
 from tests.hand_helpers import any_rotation
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.calibration.json_file import MAX_BYTES, MAX_DEPTH, decode_json, read_json
 from common.errors import CalibrationError
-from common.json_file import MAX_BYTES, MAX_DEPTH, decode_json, read_json
 
 
 class Inner(msgspec.Struct, forbid_unknown_fields=True):

@@ -8,8 +8,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.lens import Lens, contraction, distorted, fold_of, undistorted
+from common.geometry.camera_model import CameraModel
+from common.geometry.lens import Lens, contraction, distorted, fold_of, undistorted
 
 SIZE = (640, 480)
 CENTRE = (319.5, 239.5)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from common.arrays import Bool, Float
-from common.datagram import MAX_DATAGRAM, OVERHEAD
 from common.errors import BoundsError, MessageError
-from common.message_parts import MAX_TIME_NS, bounds_of, printable
+from common.link.datagram import MAX_DATAGRAM, OVERHEAD
 from common.messages import (
     FINGER_COUNT,
     JOINT_COUNT,
@@ -47,6 +46,7 @@ from common.messages import (
     encode,
     restamped,
 )
+from common.messages.parts import MAX_TIME_NS, bounds_of, printable
 
 JPEG_HEAD = b"\xff\xd8\xff\xc0\0\x11\x08\0\xf0\x01\x40\x03"  # a frame header of 320 x 240 px
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import RecordingError
-from common.geometry import quaternion_to_matrix, rigid
-from common.hand_model import CHAINS, HandModel
+from common.geometry.transforms import quaternion_to_matrix, rigid
+from common.hand.model import CHAINS, HandModel
 from common.sim.leap import joint_angles, load_leap, palm_rotation
 from common.sim.motion import PERIOD_S, POSES, ScriptedMotion, smooth_step
 

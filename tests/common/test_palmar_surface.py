@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from common.calibration import HandProfile, load
-from common.fingertips import Fingertips
-from common.hand_model import CHAINS, HandModel
-from common.hand_profiles import generated_profile
-from common.palmar_surface import PalmarSurface, first_hits
+from common.hand.fingertips import Fingertips
+from common.hand.model import CHAINS, HandModel
+from common.hand.palmar_surface import PalmarSurface, first_hits
+from common.hand.profiles import generated_profile
 
 
 @pytest.fixture(scope="module")

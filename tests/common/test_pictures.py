@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from common.errors import MessageError, PhalanxError, PictureError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still, decode, encode
-from common.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
-from common.pictures import decode as picture
-from common.pictures import decode_file, read_picture
+from common.recording.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
+from common.recording.pictures import decode as picture
+from common.recording.pictures import decode_file, read_picture
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.wrist.lit_views import load_grey
 from slave.cameras.replay import read_png
@@ -207,8 +207,8 @@ from pathlib import Path
 import cv2, numpy as np
 from common.errors import MessageError, PhalanxError
 from common.messages import decode
-from common.picture_size import size_of
-from common.pictures import decode as picture, decode_file
+from common.recording.picture_size import size_of
+from common.recording.pictures import decode as picture, decode_file
 from master.calibrate.cameras.image_sets import _load
 from master.calibrate.wrist.lit_views import load_grey
 from slave.cameras.grey import Pixels
@@ -284,4 +284,4 @@ def test_one_file_alone_calls_a_decoder_of_pictures_and_one_of_videos() -> None:
         path for package in ("common", "slave", "master", "deploy") for path in (ROOT / package).rglob("*.py")
     ]
     calling = {path.relative_to(ROOT).as_posix() for path in files if decoders(path.read_text())}
-    assert calling == {"common/pictures.py", "common/video.py"}
+    assert calling == {"common/recording/pictures.py", "common/recording/video.py"}

@@ -8,8 +8,8 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, Matrix4, RigCalibration, load
-from common.frame_recording import open_recording
-from common.hand_model import CHAINS, HandModel
+from common.hand.model import CHAINS, HandModel
+from common.recording.frame_recording import open_recording
 from common.sim.motion import PERIOD_S, POSES, HandState
 from common.sim.poses import MOVE_S, REACH_M, ROTATION_DEG, ROUNDS, STATION_S, StudyPoses
 from common.sim.render import Renderer

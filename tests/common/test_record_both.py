@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination, open_recording
-from common.imu_recording import read_imu
+from common.imu.recording import read_imu
+from common.recording.frame_recording import Illumination, open_recording
 from common.sim.motion import HandMotion, HandState
 from common.sim.record_both import record_both
 from common.sim.scene import Scene

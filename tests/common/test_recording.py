@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 
 from common.errors import RecordingError
 from common.messages import Health, Message, TagDetections, encode
-from common.recording import MessageRecording, MessageWriter, Recorded, open_messages
-from common.streams import sender_of
+from common.messages.streams import sender_of
+from common.recording.messages import MessageRecording, MessageWriter, Recorded, open_messages
 from tests.network_helpers import cycle, detections
 
 FILES = {"rigs/desk.json": b'{"version": 1}', "cameras/left.json": b"{}"}
@@ -296,7 +296,7 @@ LIMITED = """
 import sys, resource, signal
 from pathlib import Path
 from common.errors import RecordingError
-from common.recording import MessageWriter
+from common.recording.messages import MessageWriter
 from tests.common.test_recording import FILES, told
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))

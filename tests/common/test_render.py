@@ -12,8 +12,8 @@ import pytest
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import open_recording
-from common.geometry import rigid
+from common.geometry.transforms import rigid
+from common.recording.frame_recording import open_recording
 from common.sim import light, raster
 from common.sim.motion import HandState
 from common.sim.raster import Shape

@@ -11,7 +11,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from common.messages import Backlog, Message
-from common.recording import MessageWriter, open_messages
+from common.recording.messages import MessageWriter, open_messages
 from tests.common.hostile_mcap import HostileMcap, streamed
 from tests.master.export.made import poses_of
 

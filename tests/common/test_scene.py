@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
-from common.hand_model import CHAINS, HandModel
+from common.hand.model import CHAINS, HandModel
 from common.sim.scene import STANDARD_CARDS, Card, Scene
 from common.sim.surface import CYLINDER_SHARE, HandSurface, box_corners, cap_outline, unit, unit_circle
 

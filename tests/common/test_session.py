@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.datagram import Header, Kind, Refusal, parse
+from common.bus.keys import ENVIRONMENT, new_key, rig_key
 from common.errors import PhalanxError
-from common.keys import ENVIRONMENT, new_key, rig_key
-from common.link_key import LinkKey, device_secret
-from common.session import (
+from common.link.datagram import Header, Kind, Refusal, parse
+from common.link.link_key import LinkKey, device_secret
+from common.link.session import (
     Beacon,
     EchoAnswer,
     EchoAsk,

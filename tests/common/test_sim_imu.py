@@ -7,8 +7,8 @@ import pytest
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, cross, quaternion_to_matrix, rigid
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import axis_rotation, cross, quaternion_to_matrix, rigid
+from common.imu.fusion import OrientationFilter
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState
 

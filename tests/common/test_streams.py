@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 
 from common.messages import AnyMessage, Backlog
-from common.streams import ALIVE_KEY, STREAMS, Path, key_of
+from common.messages.streams import ALIVE_KEY, STREAMS, Path, key_of
 
 
 def test_every_message_travels_on_exactly_one_stream() -> None:

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from common.calibration import RigCalibration, load, parse
+from common.calibration.strobe import StrobeCalibration, limits_of
 from common.errors import CalibrationError
-from common.strobe_calibration import StrobeCalibration, limits_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "calib_json/rigs/wrist.json").read_bytes()

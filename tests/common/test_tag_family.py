@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from common import tag_family
 from common.arrays import Image
-from common.object_profile import TagFamily
-from common.tag_family import GRIDS, Grid, dictionary, tag_bits, tag_image
+from common.calibration.object_profile import TagFamily
+from common.geometry import tag_family
+from common.geometry.tag_family import GRIDS, Grid, dictionary, tag_bits, tag_image
 
 # 0xd7e00984b of tag36h11.c, and the cells its bits belong to, in order (AprilRobotics, apriltag).
 CODE = 0x0000000D7E00984B

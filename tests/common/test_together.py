@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.geometry import quaternion_to_matrix
-from common.hand_model import HandModel
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import HandModel
+from common.hand.wrist_joint import forearm_palm
+from common.imu.fusion import OrientationFilter
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
 from common.sim.together import TOGETHER, together_motion
 from common.sim.wrist.scene import WristScene
-from common.wrist_joint import forearm_palm
 
 ROOT = Path(__file__).resolve().parents[2]
 DESK = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)

@@ -11,10 +11,11 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile, TagFamily, Tags, tag_corners
 from common.errors import CalibrationError
-from common.frame_recording import open_recording
-from common.geometry import axis_rotation, invert, rigid, transform
-from common.object_profile import ObjectProfile, TagFamily, Tags, tag_corners
+from common.geometry.tag_family import dictionary, tag_image
+from common.geometry.transforms import axis_rotation, invert, rigid, transform
+from common.recording.frame_recording import open_recording
 from common.sim.motion import PERIOD_S, HandState
 from common.sim.painter import MarkerView, Painter
 from common.sim.record import record_scene
@@ -25,7 +26,6 @@ from common.sim.tag_painter import INK, PAPER, TEXELS, printed
 from common.sim.tracked import facing
 from common.sim.travel import SHUTTLE_M_S
 from common.sim.view import View
-from common.tag_family import dictionary, tag_image
 
 ROOT = Path(__file__).resolve().parents[2]
 RIGS = {

@@ -6,11 +6,21 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from common import datagram, session
-from common.datagram import HEADER, MAX_DATAGRAM, OVERHEAD, WINDOW, Kind, Refusal
+from common.link import datagram, session
+from common.link.datagram import HEADER, MAX_DATAGRAM, OVERHEAD, WINDOW, Kind, Refusal
+from common.link.session import (
+    Beacon,
+    EchoAnswer,
+    EchoAsk,
+    Handshake,
+    Hello,
+    Start,
+    Started,
+    Unproven,
+    Welcome,
+)
 from common.messages import MAX_MARKERS, WIRE_VERSION
-from common.session import Beacon, EchoAnswer, EchoAsk, Handshake, Hello, Start, Started, Unproven, Welcome
-from common.streams import ALIVE_KEY, STREAMS
+from common.messages.streams import ALIVE_KEY, STREAMS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 CODE = set(re.findall(r"`([^`\n]+)`", TEXT))

@@ -8,11 +8,11 @@ import pytest
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse
+from common.calibration.wrist import Laser, LaserPlane
 from common.errors import CalibrationError
-from common.hand_model import HandModel
-from common.wrist_calibration import Laser, LaserPlane
-from common.wrist_device import WristDevice
-from master.wrist_setup import WristSetup
+from common.hand.model import HandModel
+from common.hand.wrist_device import WristDevice
+from master.rig.wrist import WristSetup
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).parents[2] / "calib_json"

@@ -9,8 +9,9 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination
-from common.geometry import axis_rotation, quaternion_to_matrix, rigid
+from common.geometry.transforms import axis_rotation, quaternion_to_matrix, rigid
+from common.hand.wrist_joint import STRAIGHT, forearm_palm
+from common.recording.frame_recording import Illumination
 from common.sim.held import Cylinder
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
@@ -22,7 +23,6 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.surface import HandSurface
 from common.sim.wrist.things import bodies_of
-from common.wrist_joint import STRAIGHT, forearm_palm
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import RecordingError
-from common.frame_recording import Illumination, open_recording
+from common.recording.frame_recording import Illumination, open_recording
 from common.sim.wrist.record import Shot, record_wrist, with_faults
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene

@@ -10,7 +10,7 @@ import pytest
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.scenes import renderer_of
 from common.sim.wrist.light import SURFACE_AT_M, Leds, Sensor
 from common.sim.wrist.render import WristRenderer

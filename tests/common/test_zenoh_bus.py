@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from common.bus.keys import access_of
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from common.keys import access_of
 from common.messages import Command, Health
-from common.zenoh_bus import ZenohBus
 from tests.network_helpers import free_endpoint, health, until
 
 
@@ -86,7 +86,7 @@ def test_everything_declared_holds_again_after_the_master_restarts() -> None:
 
 KILLED = """
 import sys, time
-from common.zenoh_bus import ZenohBus
+from common.bus.zenoh_bus import ZenohBus
 bus = ZenohBus(None, sys.argv[1])
 bus.announce("left")
 time.sleep(60)
@@ -187,7 +187,7 @@ def test_a_target_that_never_answers_is_a_timeout_that_names_the_living() -> Non
 
 LEFT_OPEN = """
 import sys
-from common.zenoh_bus import ZenohBus
+from common.bus.zenoh_bus import ZenohBus
 from tests.network_helpers import free_endpoint, health
 bus = ZenohBus(free_endpoint(), None)
 bus.subscribe("health")

@@ -11,9 +11,9 @@ from common.sim.scenes import NAMES
 from common.sim.together import TOGETHER
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import commands, demo, sensors
-from master import replay
 from master.cli.table import program
-from master.summary_lines import summary_lines
+from master.commands.summary_lines import summary_lines
+from master.replay import detect
 from slave.cli.table import PROGRAM
 from tests.common.test_frame_recording import camera, rig, write
 
@@ -72,17 +72,17 @@ def steps_of_replay(
     def step(*words: str) -> None:
         steps.append(words)
 
-    monkeypatch.setattr(replay, "_slave", step)
-    monkeypatch.setattr(replay, "setups_with_hands", setups)
-    monkeypatch.setattr(replay, "solve_hands", solve)
+    monkeypatch.setattr(detect, "_slave", step)
+    monkeypatch.setattr(detect, "setups_with_hands", setups)
+    monkeypatch.setattr(detect, "solve_hands", solve)
     write(folder, cameras={name: camera(name) for name in ("left", "right", "palm")}, kind="both", rig=None,
           rigs=[rig("wrist", ("palm",)), rig()])  # fmt: skip
     (folder / "hand.json").write_text("{}")
     command, options = program().parse(
         ["replay", str(folder), "--out", str(folder / "out"), "--hand", str(folder / "hand.json"), *words]
     )
-    assert command.work == "master.replay_command:replay"
-    replay.replay_recording(options, lambda _line: None)
+    assert command.work == "master.commands.replay:replay"
+    detect.replay_recording(options, lambda _line: None)
     return steps, solved
 
 

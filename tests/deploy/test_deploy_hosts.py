@@ -24,8 +24,8 @@ from deploy.sender_check import Ears, Received
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
 from deploy.wheelhouse import own_wheel, wheelhouse
 from master.cli.table import program
-from master.fleet import Device, table
-from master.keys_folder import make
+from master.commands.fleet import Device, table
+from master.commands.keys_folder import make
 
 ROOT = Path(__file__).resolve().parents[2]
 

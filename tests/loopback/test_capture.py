@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from common.keys import new_key
+from common.bus.keys import new_key
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.cameras.views import look

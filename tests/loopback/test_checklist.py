@@ -17,7 +17,7 @@ from bench.checklist import Shown, clean, rehearse
 from bench.checklist_faults import of_markers, of_wrist
 from bench.checklist_rig import Rig
 from bench.local_rig import until
-from common.streams import MASTER
+from common.messages.streams import MASTER
 
 FAULTS = {fault.code: fault for fault in (*of_markers(), *of_wrist())}
 # The others take a fresh process or a slow way to come about, or are the same path as one of these with another number:

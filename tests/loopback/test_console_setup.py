@@ -19,13 +19,13 @@ from playwright.sync_api import Locator, Page, expect
 from playwright.sync_api import TimeoutError as NotYet
 
 from common.arrays import Float
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.geometry import transform as apply
-from common.hand_model import JOINTS
+from common.geometry.transforms import transform as apply
+from common.hand.model import JOINTS
 from common.messages import HandPose
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from common.zenoh_bus import ZenohBus
 from tests.browser import chromium
 from tests.network_helpers import free_endpoint, free_udp_port
 

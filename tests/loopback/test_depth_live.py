@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
+from common.bus.keys import new_key
 from common.calibration import RigCalibration, load, save
 from common.clock import SystemClock, Ticker
-from common.keys import new_key
 from common.messages import MarkerDetections
 from master.fabrik.depth import AffineDisparity
 from slave.uplink import Uplink

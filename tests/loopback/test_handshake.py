@@ -13,8 +13,9 @@ import msgspec
 import pytest
 
 from common.clock import SkewedClock
-from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
-from common.link_key import LinkKey
+from common.link.datagram import Address, Header, Kind, Refusal, Sealer, parse
+from common.link.link_key import LinkKey
+from common.link.session import Hello, RigKeys, seal
 from common.messages import (
     Command,
     Detections,
@@ -24,8 +25,7 @@ from common.messages import (
     encode,
     restamped,
 )
-from common.session import Hello, RigKeys, seal
-from master.link import MasterLink
+from master.run.link import MasterLink
 from slave.link import SlaveLink
 from tests.network_helpers import ManualClock, detections, seeded
 

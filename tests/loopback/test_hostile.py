@@ -19,8 +19,8 @@ from msgspec import Struct
 from bench.hostile import Limits, all_attacked, row
 from bench.hostile_rig import ROOT, STOLEN, HostileRig
 from bench.scale_rig import ROOM
+from common.link.session import EchoAnswer
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
-from common.session import EchoAnswer
 from tests.hostile_rigs import (
     BOUNDS,
     LATE,

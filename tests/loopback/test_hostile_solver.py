@@ -16,16 +16,16 @@ from bench.hostile_examples import Speaker, own_kinds
 from bench.hostile_messages import Attack, all_attacks
 from bench.hostile_rig import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
 from bench.scale_rig import ROOM, detections_of
-from common.datagram import MAX_DATAGRAM, OVERHEAD, Kind
+from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
+from common.link.session import EchoAnswer, Started
 from common.messages import HandPose, decode, encode
-from common.session import EchoAnswer, Started
-from master.admission import limits_of
-from master.app import result_at
-from master.dispatcher import new_dispatcher
-from master.link import MasterLink
-from master.link_senders import SensorMessage
-from master.rig import load_setup, load_setups
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup, load_setups
+from master.rig.setup import RigSetup
+from master.run.admission import limits_of
+from master.run.app import result_at
+from master.run.dispatcher import new_dispatcher
+from master.run.link import MasterLink
+from master.run.link_senders import SensorMessage
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import seeded

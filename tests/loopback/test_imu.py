@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
-from common.keys import new_key
 from common.messages import Command, Health, ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
-from common.zenoh_bus import ZenohBus
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 from slave.simulated import scene_of
 from slave.uplink import Uplink
 from tests.network_helpers import PATIENCE_S, clock_known, free_endpoint, free_udp_port, until

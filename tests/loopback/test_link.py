@@ -8,9 +8,9 @@ import pytest
 
 from bench.udp_relay import Impairment, UdpRelay
 from common.clock import Clock, SkewedClock, SystemClock
-from common.clock_offset import ClockEstimate
+from common.link.clock_offset import ClockEstimate
 from common.messages import MarkerDetections
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 from slave.uplink import Uplink
 from tests.network_helpers import PATIENCE_S, detections, free_udp_port, until
 

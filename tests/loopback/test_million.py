@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.datagram import HEADER, MAGIC, MAX_DATAGRAM, Kind, Refusal
+from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Kind, Refusal
+from common.link.session import RigKeys
 from common.messages import WIRE_VERSION, encode
-from common.session import RigKeys
-from master.link import MasterLink
+from master.run.link import MasterLink
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import KEY, MASTER, Wires, started_pair
 from tests.network_helpers import detections

@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import cast
 
-from common.keys import new_key
+from common.bus.keys import new_key
 from common.messages import ResultMessage
-from common.recording import open_messages
+from common.recording.messages import open_messages
 from master.recording.digest import ResultDigest
 from master.recording.files import recorded_setups
 from master.recording.player import Player

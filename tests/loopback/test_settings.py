@@ -9,8 +9,8 @@ from shutil import copytree
 
 import msgspec
 
+from common.bus.keys import new_key
 from common.calibration import CameraCalibration, load, save
-from common.keys import new_key
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import Subscription
-from common.certificates import MASTER as AS_MASTER
-from common.certificates import OPERATOR
+from common.bus.bus import Subscription
+from common.bus.certificates import MASTER as AS_MASTER
+from common.bus.certificates import OPERATOR
+from common.bus.keys import FOLDER, access_of
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from common.keys import FOLDER, access_of
 from common.messages import Command, Gesture, Health
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
-from master.keys_folder import make
+from common.messages.streams import MASTER
+from master.commands.keys_folder import make
 from tests.network_helpers import free_endpoint, until
 
 SITES = {"room-a": "star", "room-b": "hash"}  # and the key that is tapped there, to tell them apart

@@ -3,9 +3,9 @@
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from common.datagram import Address, Header, Kind, Refusal, Sealer, parse, unseal
-from common.link_key import LinkKey, device_secret
-from common.session import (
+from common.link.datagram import Address, Header, Kind, Refusal, Sealer, parse, unseal
+from common.link.link_key import LinkKey, device_secret
+from common.link.session import (
     NONCE_BYTES,
     Beacon,
     EchoAnswer,
@@ -17,7 +17,7 @@ from common.session import (
     Welcome,
     seal,
 )
-from master.link import PENDING_NS, MasterLink
+from master.run.link import PENDING_NS, MasterLink
 from slave.link import VANISHED_NS, SlaveLink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import detections, seeded

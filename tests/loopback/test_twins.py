@@ -5,8 +5,8 @@ from typing import TypeVar
 
 import pytest
 
-import common.datagram
-from common.datagram import HEADER, Kind, Refusal
+import common.link.datagram
+from common.link.datagram import HEADER, Kind, Refusal
 from common.messages import WIRE_VERSION
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import BROADCAST, MASTER, Wires, started_pair
@@ -113,7 +113,7 @@ class Versions:
 
     def _old(self, call: Callable[[], Said]) -> Said:
         with self._patch.context() as patch:
-            patch.setattr(common.datagram, "WIRE_VERSION", OTHER)
+            patch.setattr(common.link.datagram, "WIRE_VERSION", OTHER)
             return call()
 
 

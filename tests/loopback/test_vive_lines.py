@@ -3,9 +3,9 @@
 import numpy as np
 
 from common.calibration import RigCalibration
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import TrackerPose
-from common.object_profile import ObjectProfile
 from master.calibrate.tracker.registration import documented, register
 from master.objects.tracker import TrackerLine
 from slave.objects.survive_lines import SurviveDevice

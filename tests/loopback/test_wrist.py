@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus import Bus
+from common.bus.bus import Bus
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import RigCalibration, load, save
 from common.clock import SystemClock
-from common.keys import new_key
 from common.messages import Command, Health, Preview, WristDetections
-from common.zenoh_bus import ZenohBus
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,10 +7,10 @@ from contextlib import ExitStack
 import pytest
 
 from common.clock import SkewedClock, SystemClock
-from common.datagram import Kind, Refusal
+from common.link.datagram import Kind, Refusal
 from common.messages import Detections, WristDetections, encode
-from master.ingest import Ingest
-from master.link import MasterLink
+from master.run.ingest import Ingest
+from master.run.link import MasterLink
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires

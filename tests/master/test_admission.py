@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.datagram import Refusal
+from common.link.datagram import Refusal
 from common.messages import MarkerDetections, TagDetections, WristDetections
-from master.admission import READY_NS, SenderLimits, bucket_of, limits_of, refused
-from master.link_senders import Sender
-from master.rig import load_setups
+from master.rig.files import load_setups
+from master.run.admission import READY_NS, SenderLimits, bucket_of, limits_of, refused
+from master.run.link_senders import Sender
 from tests.network_helpers import cycle, detections
 
 S = 1_000_000_000

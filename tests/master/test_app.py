@@ -9,15 +9,15 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import ImuCalibration
-from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
-from common.hand_model import WRIST
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.hand.model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
-from master.app import AuxiliaryMessage, Observed, RunFigures, health, run
-from master.dispatcher import Dispatcher
-from master.live import cameras_line
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.app import AuxiliaryMessage, Observed, RunFigures, health, run
+from master.run.dispatcher import Dispatcher
+from master.run.live import cameras_line
+from master.run.stages import StageTimes
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 

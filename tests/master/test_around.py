@@ -6,12 +6,12 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import Matrix4, RigCalibration
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rigid
-from common.hand_model import WRIST
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix, rigid
+from common.hand.model import WRIST
 from common.messages import HandPose, MarkerDetections
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

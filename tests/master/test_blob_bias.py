@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.fabrik.blob_bias import LensShift, card_outline, centre_of_blob, round_outline
 
 MATRIX = np.array([[503.0, 0.0, 319.5], [0.0, 503.0, 239.5], [0.0, 0.0, 1.0]])

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, RigCalibration, parse
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
 from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import depth_law
 from master.fabrik.intersection import triangulate

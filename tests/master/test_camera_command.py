@@ -7,13 +7,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from common.bus import Bus, LoopbackBus
+from common.bus.bus import Bus, LoopbackBus
 from common.calibration import CameraCalibration, load
-from common.camera_settings import CameraSettings, ColourPick
+from common.calibration.camera_settings import CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, CameraError, PhalanxError
 from common.messages import Command, Health
-from master import camera_command
-from master.camera_command import commands, send_all, settings, table
+from master.commands import camera
+from master.commands.camera import commands, send_all, settings, table
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = ROOT / "calib_json/cameras/left.json"
@@ -119,7 +119,7 @@ def test_a_refusal_ends_the_steps() -> None:
 
 
 def test_a_camera_that_is_not_there_is_named_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_command, "APPEAR_S", 0.1)
+    monkeypatch.setattr(camera, "APPEAR_S", 0.1)
     with pytest.raises(BusError, match="no camera 'left' is on the bus; there are: right"):
         send_all(served("right", {}), asked())
 

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration
-from common.geometry import rigid
+from common.geometry.transforms import rigid
 from common.messages import HandPose, MarkerDetections, Source
 from master.fabrik.caps import CapTables
 from master.fabrik.estimate import MarkerPositions
 from master.fabrik.rays import RayTriangulator
-from master.rig_pipeline import build_pipeline
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline
+from master.run.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

@@ -11,9 +11,9 @@ from common.calibration import (
     RigCalibration,
     Volume,
 )
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, rigid
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, rigid
 from master.fabrik.depth import (
     AffineDisparity,
     DepthLaw,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand_model import HandJoints
+from common.hand.model import HandJoints
 from common.messages import HandPose
 from master.console.filter_trial import try_filter
 from tests.hand_helpers import RIGHT, palm

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from common.messages import MarkerDetections
-from common.streams import sender_of
-from master.app import Solved
-from master.link_senders import SensorMessage
-from master.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
-from master.solver_supervisor import SolverSupervisor, culprit
+from common.messages.streams import sender_of
+from master.run.app import Solved
+from master.run.link_senders import SensorMessage
+from master.run.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
+from master.run.solver_supervisor import SolverSupervisor, culprit
 from tests.network_helpers import ManualClock, detections
 
 S = 1_000_000_000

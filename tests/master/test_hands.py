@@ -13,15 +13,15 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
-from master.clock_monitor import ClockMonitor
-from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose
-from master.needs_restart import refuse_restart
+from master.monitor.clocks import ClockMonitor
 from master.outputs.files import RunFiles, load_poses
-from master.rig import RigFiles, load_setup
-from master.rig_pipeline import pipeline_of
-from master.stages import StageTimes
-from master.tuning import LivePipeline, RigTuning
+from master.rig.files import RigFiles, load_setup
+from master.rig.needs_restart import refuse_restart
+from master.rig.pipeline import pipeline_of
+from master.run.dispatcher import Dispatcher
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline, RigTuning
 from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose
 from tests.master.test_rig_merge import setups, two_hands

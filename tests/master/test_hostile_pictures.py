@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, load
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.messages import Command, Health, Preview, Still
-from common.picture_size import Size
-from common.zenoh_bus import ZenohBus
+from common.recording.picture_size import Size
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
 from master.console.picture_sizes import PictureSizes
 from master.console.state import ConsoleSettings, ConsoleState
-from master.ingest import Ingest
 from master.outputs.rerun_images import CameraImages
+from master.run.ingest import Ingest
 from tests.network_helpers import free_endpoint, until
 from tests.picture_helpers import TINY, claiming, hostile
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.npz import PACKED_BYTES
+from common.recording.npz import PACKED_BYTES
 from master.calibrate.depth.recording import Pairs, by_truth
-from master.object_score import load_object_truth
-from master.score import load_truth
+from master.evaluation.object_score import load_object_truth
+from master.evaluation.score import load_truth
+from master.evaluation.wrist_score import load_wrist_truth
 from master.study.trials import held_in
-from master.wrist_score import load_wrist_truth
 from tests.common.hostile_npz import MIB, member, write_bomb, write_members
 from tests.master.test_wrist_score import N, recording, truth, write_truth
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from common.clock import SystemClock
-from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
+from common.link.datagram import MAX_DATAGRAM
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose
-from master.ingest import Ingest
-from master.link_senders import SensorMessage
-from master.message_queue import QUEUE
+from master.run.ingest import Ingest
+from master.run.link_senders import SensorMessage
+from master.run.message_queue import QUEUE
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))

@@ -15,11 +15,11 @@ import pytest
 from common.errors import PhalanxError
 from common.service_manager import ServiceManager
 from master.cli.table import program
-from master.install_command import KEPT, ONE_RUN, command_of, environment_of
-from master.keys_folder import make
-from master.loop_monitor import MonitoredLoop
-from master.service_unit import UNIT, unit_text
-from master.user_services import UserServices
+from master.commands.install import KEPT, ONE_RUN, command_of, environment_of
+from master.commands.keys_folder import make
+from master.commands.service_unit import UNIT, unit_text
+from master.commands.user_services import UserServices
+from master.monitor.loop import MonitoredLoop
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(sys.executable).with_name("phalanx-master")

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from bench.local_rig import free_port
-from master.keys_folder import make
-from master.service_unit import UNIT
+from master.commands.keys_folder import make
+from master.commands.service_unit import UNIT
 from tests.master.user_manager import user_manager, why_not
 from tests.network_helpers import until
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from common.certificates import shown
+from common.bus.certificates import shown
+from common.bus.keys import link_key, new_key
 from common.errors import PhalanxError
-from common.keys import link_key, new_key
-from common.link_key import device_secret
-from master.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
+from common.link.link_key import device_secret
+from master.commands.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
 from tests.cli import invoke
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from master.listening import places_of
+from master.outputs.web.listening import places_of
 
 
 @pytest.mark.parametrize(

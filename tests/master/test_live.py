@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
 from common.errors import BusError
-from common.keys import new_key
 from common.messages import Command, HandPose
-from common.zenoh_bus import ZenohBus
-from master.live import LiveSettings, run_live
 from master.outputs.files import load_poses
-from master.rig import load_setup, load_setups
+from master.rig.files import load_setup, load_setups
+from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port, until
 from tests.wrist_run import exact_cycle, wrist_scene

@@ -7,14 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
-from common.keys import new_key
 from common.messages import Command, Detections, WristDetections
-from common.zenoh_bus import ZenohBus
 from master.estimator.pipeline import SolvedPose
-from master.live import LiveSettings, run_live
-from master.rig import RigFiles
-from master.tuning import LivePipeline
+from master.rig.files import RigFiles
+from master.run.live import LiveSettings, run_live
+from master.run.tuning import LivePipeline
 from slave.uplink import Uplink
 from tests.master.test_live import free_tcp_port
 from tests.network_helpers import detections, free_udp_port, until

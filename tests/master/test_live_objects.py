@@ -9,9 +9,11 @@ from shutil import copytree
 import msgspec
 import pytest
 
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import RigCalibration, load, save
+from common.calibration.object_profile import ObjectProfile
 from common.clock import SystemClock
-from common.keys import new_key
 from common.messages import (
     Command,
     Contact,
@@ -21,11 +23,9 @@ from common.messages import (
     ObjectSource,
     TrackerPose,
 )
-from common.object_profile import ObjectProfile
-from common.zenoh_bus import ZenohBus
-from master.live import LiveSettings, cameras_line, run_live
 from master.outputs.result_files import contact_path, load_contact, load_object, object_path
-from master.rig import RigFiles, load_setups
+from master.rig.files import RigFiles, load_setups
+from master.run.live import LiveSettings, cameras_line, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import free_endpoint, free_udp_port, until
 from tests.object_run import (

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from common.messages import HandPose, MarkerDetections
-from master.load_shedding import MOST, LoadShedding, Shedding
-from master.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, capacity
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.load_shedding import MOST, LoadShedding, Shedding
+from master.run.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, capacity
+from master.run.stages import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
 from tests.network_helpers import cycle, detections
 from tests.synthetic_run import hand_at, synthetic_run

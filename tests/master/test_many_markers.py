@@ -8,14 +8,14 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import RigCalibration, parse
+from common.calibration.hand import MarkerMount
 from common.errors import CalibrationError
-from common.hand_calibration import MarkerMount
-from common.hand_model import TIPS, HandModel
+from common.hand.model import TIPS, HandModel
 from common.messages import HandPose, MarkerDetections, decode, encode
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.solve import fingers_of
-from master.stages import StageTimes
+from master.replay.solve import fingers_of
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

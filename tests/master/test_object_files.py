@@ -20,7 +20,7 @@ from master.outputs.result_files import (
     load_object,
     object_path,
 )
-from master.recorded_tags import recorded_tags
+from master.replay.recorded_tags import recorded_tags
 from tests.master.test_outputs_files import random_pose
 
 HAND = "default-right"

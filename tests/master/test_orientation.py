@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import (
+from common.geometry.transforms import (
     axis_rotation,
     matrix_to_quaternion,
     quaternion_to_matrix,

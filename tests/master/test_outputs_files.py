@@ -109,7 +109,7 @@ def test_full_disk_is_a_clear_error_and_leaves_nothing_half_written(
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("common.replacing.os.fsync", full)
+    monkeypatch.setattr("common.calibration.replacing.os.fsync", full)
     with pytest.raises(RecordingError, match=r"poses\.npz: cannot write: No space left.*free the disk"):
         sink.close()
     assert list(tmp_path.iterdir()) == []

@@ -9,8 +9,8 @@ import pytest
 import rerun as rr
 
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion, quaternion_to_matrix, transform
-from common.hand_model import WRIST
+from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
+from common.hand.model import WRIST
 from common.messages import HandPose, Source
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene, WristTruth
@@ -20,8 +20,8 @@ from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.rerun_scene import RerunScene
-from master.rig import load_setups
-from master.rig_setup import RigSetup
+from master.rig.files import load_setups
+from master.rig.setup import RigSetup
 from tests.master.test_outputs_rerun import column, rows_of
 
 TIMES_S = np.linspace(0.5, 9.0, 5)

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 
 from common.calibration import RigCalibration, Volume
 from common.errors import RecordingError
-from common.geometry import matrix_to_quaternion, rigid
-from common.hand_model import TIPS, WRIST, HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.hand.model import TIPS, WRIST, HandModel
+from common.hand.profiles import generated_profile
 from common.messages import HandPose, Source
 from master.outputs import picture
 from master.outputs.hand_render import View, render_hand

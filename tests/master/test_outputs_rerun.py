@@ -10,12 +10,12 @@ import rerun as rr
 from msgspec.structs import replace
 
 from common.arrays import Image
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, Volume
 from common.errors import PhalanxError, RecordingError
-from common.geometry import matrix_to_quaternion, rigid
-from common.hand_model import JOINTS, TIPS, HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.hand.model import JOINTS, TIPS, HandModel
+from common.hand.profiles import generated_profile
 from common.messages import Command, HandPose, Health, Preview, Source
 from master.outputs.bus import BusSink
 from master.outputs.poses import Poses
@@ -23,7 +23,7 @@ from master.outputs.rerun import run_viewer, write_rrd
 from master.outputs.rerun_process import ViewerProcess, viewer_arguments
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 from tests.hand_helpers import detections
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))

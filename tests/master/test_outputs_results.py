@@ -8,9 +8,17 @@ import pytest
 import rerun as rr
 from msgspec.structs import replace
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
+from common.calibration.object_profile import (
+    Bead,
+    BoxShape,
+    CylinderShape,
+    ObjectProfile,
+    SphereShape,
+    Tag,
+    Tags,
+)
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource
-from common.object_profile import Bead, BoxShape, CylinderShape, ObjectProfile, SphereShape, Tag, Tags
 from master.outputs.object_appearance import ObjectAppearance
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health
 from master.outputs.previews import PictureAsker

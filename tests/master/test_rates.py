@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.messages import MarkerDetections
-from master.rates import CameraRates
+from master.monitor.rates import CameraRates
 
 PERIOD_NS = 16_666_667
 

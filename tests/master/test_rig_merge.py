@@ -19,14 +19,14 @@ from common.calibration import (
     save,
 )
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, matrix_to_quaternion, rigid
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigid
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from common.messages import MarkerDetections
-from master.rig import load_setup, load_setups, setups_of
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup, load_setups, setups_of
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file
 
 ASIDE = rigid(axis_rotation(1, 1.2), np.array([0.4, 0.0, 0.3]))

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.geometry import axis_rotation
-from common.keys import new_key
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.stages import StageTimes
+from common.bus.keys import new_key
+from common.geometry.transforms import axis_rotation
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.run.stages import StageTimes
 from tests.commands import Ended, command
 from tests.network_helpers import free_endpoint
 

@@ -8,8 +8,8 @@ import pytest
 from common.arrays import Float
 from common.errors import RecordingError
 from common.messages import HandPose, Source
+from master.evaluation.score import Truth, load_truth, score, score_hidden
 from master.outputs.poses import Poses
-from master.score import Truth, load_truth, score, score_hidden
 
 FINGERS = (0, 1, 2, 3, 4, -1)
 ALL = np.ones(6, dtype=bool)

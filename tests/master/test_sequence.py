@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.sequence import CYCLE_FRAMES, REMEMBERED, CameraCounts, Counted, Losses, Sequence
+from master.run.sequence import CYCLE_FRAMES, REMEMBERED, CameraCounts, Counted, Losses, Sequence
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=200, unique=True))

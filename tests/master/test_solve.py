@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, Manifest
+from common.recording.frame_recording import FrameRecording, Manifest
+from master.commands.summary import read_summary, write_summary
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
-from master.solve import fingers_of, solve
-from master.summary import read_summary, write_summary
+from master.replay.solve import fingers_of, solve
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, hand_at, synthetic_run
 

@@ -13,17 +13,17 @@ from bench.fusion_scene import Both, Observed
 from bench.fusion_shown import shown
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import FrameRecording, Manifest
-from common.imu_recording import write_imu
+from common.imu.recording import write_imu
 from common.messages import ImuSample, MarkerDetections, WristDetections
+from common.recording.frame_recording import FrameRecording, Manifest
 from common.sim.record import named_angles
 from common.sim.render import Renderer
 from common.sim.wrist.record import WristTake
 from master.outputs.files import load_poses
-from master.recorded_imu import recorded_samples
-from master.rig import setups_of
-from master.rig_setup import RigSetup
-from master.solve import rigs_to_solve, solve_hands
+from master.replay.recorded_imu import recorded_samples
+from master.replay.solve import rigs_to_solve, solve_hands
+from master.rig.files import setups_of
+from master.rig.setup import RigSetup
 from tests.hand_helpers import LEFT
 
 SECONDS = 0.4

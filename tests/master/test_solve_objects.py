@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, Manifest
 from common.messages import ObjectSource, TagDetections
+from common.recording.frame_recording import FrameRecording, Manifest
 from master.outputs.result_files import contact_path, load_contact, load_object, object_path
-from master.rig import load_setups, setups_with_hands
-from master.rig_setup import RigSetup
-from master.solve import rigs_to_solve, solve_hands
+from master.replay.solve import rigs_to_solve, solve_hands
+from master.rig.files import load_setups, setups_with_hands
+from master.rig.setup import RigSetup
 from tests.object_run import PERIOD_NS, START_NS, ObjectRun, Sent, object_run
 
 FRAMES = 18

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
-from common.clock_offset import ClockEstimate
+from common.link.clock_offset import ClockEstimate
 from common.messages import Health, MarkerDetections, decode, encode
-from master.clock_monitor import ClockMonitor
-from master.phases import CameraPhases
-from master.rig_setup import RigSetup
+from master.monitor.clocks import ClockMonitor
+from master.monitor.phases import CameraPhases
+from master.rig.setup import RigSetup
 from tests import timing_scenes as scenes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file
 from tests.timing_scenes import Motion, cameras, recorded

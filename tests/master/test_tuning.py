@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import FilterCalibration, ImuCalibration, RigCalibration, save
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
-from common.geometry import matrix_to_quaternion
-from common.hand_model import HandJoints
-from common.keys import new_key
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandJoints
 from common.messages import Command, HandPose, MarkerDetections
-from common.zenoh_bus import ZenohBus
-from master.live import LiveSettings, run_live
-from master.rig import RigFiles, load_setup
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.tuning import LivePipeline, RigTuning
+from master.rig.files import RigFiles, load_setup
+from master.rig.setup import RigSetup
+from master.run.live import LiveSettings, run_live
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, rig_file
 from tests.hand_helpers import detections as seen

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from common.calibration import Volume
-from common.hand_model import TIPS
+from common.hand.model import TIPS
 from common.messages import HandPose
-from master.rig_pipeline import build_pipeline
-from master.stages import StageTimes
-from master.volume import corners, edges, inside
+from master.monitor.volume import corners, edges, inside
+from master.rig.pipeline import build_pipeline
+from master.run.stages import StageTimes
 from tests.synthetic_run import synthetic_run
 
 CUBE = Volume(low_m=(-0.2, -0.1, 0.4), high_m=(0.2, 0.3, 0.8))

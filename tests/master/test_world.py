@@ -12,7 +12,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import (
     Contact,
     Detections,
@@ -25,16 +25,16 @@ from common.messages import (
     TagDetections,
     TrackerPose,
 )
-from master.app import Observed, RunFigures, health, run
-from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose
-from master.object_score import ObjectTruth, errors
+from master.evaluation.object_score import ObjectTruth, errors
 from master.outputs.result_files import ObjectPoses
-from master.rig import load_setups, setups_of
-from master.rig_pipeline import pipeline_of
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.tracked_object import TrackedObject
+from master.rig.files import load_setups, setups_of
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.app import Observed, RunFigures, health, run
+from master.run.dispatcher import Dispatcher
+from master.run.stages import StageTimes
+from master.run.tracked_object import TrackedObject
 from tests.master.test_app import Collector, ScriptedClock, ScriptedSource
 from tests.master.test_outputs_files import random_pose
 from tests.object_run import (

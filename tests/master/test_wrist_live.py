@@ -11,18 +11,18 @@ import msgspec
 import numpy as np
 import pytest
 
+from common.bus.keys import new_key
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.keys import new_key
 from common.messages import Command, Health
-from common.zenoh_bus import ZenohBus
-from master.live import LiveSettings, run_live
 from master.outputs.files import load_poses
-from master.rig import RigFiles, load_setup
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.tuning import LivePipeline, RigTuning
+from master.rig.files import RigFiles, load_setup
+from master.rig.setup import RigSetup
+from master.run.live import LiveSettings, run_live
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_endpoint, free_udp_port, until
 from tests.wrist_run import exact_cycle, wrist_scene, wrist_setup

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from common.errors import PhalanxError
-from common.frame_recording import Illumination
-from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
+from master.evaluation.report import Played, report_scene
+from master.evaluation.wrist_report import forearm_tilt, laser_scores, lit_view
 from master.outputs.files import save_poses
-from master.report import Played, report_scene
-from master.rig import load_setups
-from master.rig_setup import RigSetup
-from master.wrist_report import forearm_tilt, laser_scores, lit_view
+from master.rig.files import load_setups
+from master.rig.setup import RigSetup
 from tests.master.test_outputs_rerun import rows_of
 from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 

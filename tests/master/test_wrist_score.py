@@ -8,10 +8,17 @@ import pytest
 
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.messages import SolverMode, WristDetections
+from common.recording.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
+from master.evaluation.wrist_score import (
+    GROUPS,
+    WristTruth,
+    cycles_missed,
+    load_wrist_truth,
+    score_tips,
+    score_wrist,
+)
 from master.outputs.poses import Poses
-from master.wrist_score import GROUPS, WristTruth, cycles_missed, load_wrist_truth, score_tips, score_wrist
 from tests.hand_helpers import camera_file
 
 PERIOD_NS = 33_333_333

@@ -14,13 +14,13 @@ import pytest
 
 from common.arrays import Bool, Float, Image
 from common.calibration import HandProfile, load
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.outputs.files import load_poses
-from master.rig import load_hand, load_setup
-from master.rig_setup import RigSetup
-from master.solve import solve
+from master.replay.solve import solve
+from master.rig.files import load_hand, load_setup
+from master.rig.setup import RigSetup
 from slave.offline import detect_recording, save_detections
 
 SECONDS, RADIUS_PX, MARKER = 0.5, 8.0, 1

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from common.calibration import RigCalibration, load
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from master.outputs.files import load_poses
-from master.rig import load_hand
-from master.rig_setup import RigSetup
-from master.solve import solve
+from master.replay.solve import solve
+from master.rig.files import load_hand
+from master.rig.setup import RigSetup
 
 CAMERAS = ("left", "right")
 

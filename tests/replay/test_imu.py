@@ -16,18 +16,18 @@ from scipy.spatial.transform import Rotation
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import RecordingError
-from common.frame_recording import open_recording
-from common.geometry import quaternion_to_matrix
-from common.hand_model import WRIST
-from common.imu_fusion import OrientationFilter
-from common.imu_recording import read_imu, write_imu
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import WRIST
+from common.imu.fusion import OrientationFilter
+from common.imu.recording import read_imu, write_imu
+from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
+from master.commands.summary import read_summary
 from master.outputs.files import load_poses
-from master.rig import load_setup
-from master.rig_setup import RigSetup
-from master.solve import solve
-from master.summary import read_summary
+from master.replay.solve import solve
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 from slave.offline import detect_recording, save_detections
 from tests.replay.test_datasets import command
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from common.calibration import HandProfile, load
-from common.frame_recording import open_recording
-from common.hand_model import HandModel
+from common.hand.model import HandModel
+from common.recording.frame_recording import open_recording
 from common.sim.poses import MOVE_S, STATION_S, StudyPoses
 from common.sim.record import record_scene
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
+from master.commands.summary import read_summary
 from master.outputs.files import load_poses
-from master.rig import load_setup
-from master.rig_setup import RigSetup
-from master.solve import solve
-from master.summary import read_summary
+from master.replay.solve import solve
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 from tests.replay.test_datasets import command
 
 SECONDS, RATE_HZ, SEED = 1.0, 30.0, 7

@@ -15,7 +15,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, load, save
-from common.pictures import decode
+from common.recording.pictures import decode
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.frame_recording import FrameRecording, Illumination, open_recording
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
+from common.recording.frame_recording import FrameRecording, Illumination, open_recording
 from master.outputs.files import load_poses
-from master.rig import load_hand
-from master.rig_setup import RigSetup
-from master.solve import solve
+from master.replay.solve import solve
+from master.rig.files import load_hand
+from master.rig.setup import RigSetup
 from tests.replay.test_datasets import command
 
 _TIPS = pytest.mark.xfail(

@@ -11,11 +11,11 @@ from msgspec.structs import replace
 
 from common.arrays import Image
 from common.calibration import CameraCalibration, HsvRange, load, save
-from common.camera_settings import ColourPick
+from common.calibration.camera_settings import ColourPick
 from common.errors import CameraError, FitError
+from common.geometry.srgb import gain_tables
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.srgb import gain_tables
 from slave.colour_sampler import ColourSampler
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.classify import in_range

@@ -11,9 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from common.arrays import Float
 from common.calibration import HsvRange
+from common.geometry.srgb import gain_tables
 from common.sim.illuminant import Light
 from common.sim.light import MARKER_LINEAR_RGB
-from common.srgb import gain_tables
 from slave.markers.classify import ColourTable
 from slave.markers.colour_monitor import ColourMonitor, hsv
 from slave.markers.drift import (

@@ -15,9 +15,9 @@ from bench.marker_score import clicks
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.errors import PhalanxError
+from common.geometry.srgb import gain_tables
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.srgb import gain_tables
 from slave.markers import centroid
 from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured

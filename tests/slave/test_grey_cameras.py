@@ -11,7 +11,7 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from common.frame_recording import Illumination, open_recording
+from common.recording.frame_recording import Illumination, open_recording
 from slave import devices
 from slave.__main__ import main
 from slave.cameras import v4l2_abi as abi

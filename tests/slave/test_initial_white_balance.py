@@ -9,11 +9,11 @@ import pytest
 
 from bench.light import standard_scene
 from common.arrays import Float, Image
+from common.geometry.srgb import gain_tables
 from common.sim.grasp import Grasp
 from common.sim.illuminant import Light
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from common.srgb import gain_tables
 from slave.markers.classify import ColourTable
 from slave.markers.initial_white_balance import OTHER, initial_white_balance, lights
 from tests.slave import painted

@@ -11,11 +11,11 @@ import pytest
 
 from common.calibration import RigCalibration
 from common.errors import RecordingError
-from common.frame_recording import Illumination, Manifest, RecordedClock, open_recording
-from common.frame_writing import RecordingWriter, encode_png
-from common.imu_recording import read_imu, write_imu
+from common.imu.recording import read_imu, write_imu
 from common.messages import ImuSample
-from common.pictures import MAX_FILE_BYTES
+from common.recording.frame_recording import Illumination, Manifest, RecordedClock, open_recording
+from common.recording.frame_writing import RecordingWriter, encode_png
+from common.recording.pictures import MAX_FILE_BYTES
 from slave.__main__ import main
 from slave.join import join_recordings
 from slave.offline import detect_recording

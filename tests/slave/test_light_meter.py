@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float, Image
+from common.geometry.srgb import gain_tables
 from common.sim.illuminant import Light
-from common.srgb import gain_tables
 from slave.markers.light_meter import AGREE, EVERY_NS, Change, LightMeter
 
 SIZE = (320, 240)

@@ -8,7 +8,7 @@ import pytest
 
 from common.calibration import save
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from slave.__main__ import main
 from slave.offline import camera_of, detect_recording, save_detections
 from tests.slave.painted import CENTRES, NAMES, RANGES, camera, hand, render

@@ -6,11 +6,11 @@ import pytest
 from msgspec.structs import replace
 
 from common.arrays import Image
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import HsvRange
 from common.errors import CalibrationError
 from common.messages import Command, Preview
-from common.preview_wish import PreviewWish
+from common.messages.preview_wish import PreviewWish
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import ReloadableDetector

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Image
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview

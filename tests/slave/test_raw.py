@@ -12,13 +12,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
-from common.frame_recording import open_recording
 from common.messages import Command, Health
-from common.raw_wish import RawWish, raw_name
+from common.messages.raw_wish import RawWish, raw_name
+from common.recording.frame_recording import open_recording
 from slave import raw
 from slave.__main__ import main
 from slave.counters import DetectionCounters

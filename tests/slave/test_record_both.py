@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import open_recording
-from common.imu_recording import read_imu
+from common.imu.recording import read_imu
+from common.recording.frame_recording import open_recording
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.__main__ import main

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.errors import CameraError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.cameras.replay import ReplayCamera
 
 CAMERA = {

@@ -5,10 +5,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
-from common.bus import LoopbackBus
-from common.camera_settings import WANTED, figures
+from common.bus.bus import LoopbackBus
+from common.bus.keys import Access
+from common.calibration.camera_settings import WANTED, figures
 from common.clock import SystemClock
-from common.keys import Access
 from common.messages import Command, Health, decode, encode
 from master.checklist.slave_rules import AMBIGUOUS, OFF, OVERLAP, UNCOLOURED
 from master.checklist.unseen import COLOUR, SEEN

@@ -14,7 +14,7 @@ from bench.marker_frames import sequences
 from bench.marker_kinds import KINDS
 from bench.marker_score import clicks
 from common.arrays import Image
-from common.frame_recording import open_recording
+from common.recording.frame_recording import open_recording
 from common.sim.illuminant import LightSchedule
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png

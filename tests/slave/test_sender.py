@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message

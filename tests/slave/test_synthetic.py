@@ -9,9 +9,9 @@ import pytest
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import SkewedClock
 from common.errors import CalibrationError, CameraError
+from common.geometry.srgb import to_linear
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.srgb import to_linear
 from slave.cameras.synthetic import SyntheticCamera
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,7 +8,7 @@ import pytest
 
 from common.calibration import CameraCalibration, RigCalibration, load, save
 from common.errors import CalibrationError
-from common.frame_recording import Manifest, open_recording
+from common.recording.frame_recording import Manifest, open_recording
 from common.sim.board import BoardScene
 from slave.__main__ import main
 from slave.cameras.synthetic import SyntheticCamera

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError, CameraError

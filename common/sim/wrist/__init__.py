@@ -1,4 +1,1 @@
-"""Simulation of the wrist device.
-
-What its camera sees of the hand by ambient light, by its laser and by its LEDs.
-"""
+"""Simulated wrist device: a hand and its lights enter, camera pictures leave."""

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float, Int
-from common.hand_model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, HandModel
-from common.tapered_capsules import Capsules
+from common.geometry.tapered_capsules import Capsules
+from common.hand.model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, HandModel
 
 GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6

@@ -14,11 +14,11 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.hand_model import HandJoints
+from common.geometry.camera_model import CameraModel
+from common.geometry.tapered_capsules import Capsules, distances
+from common.hand.model import HandJoints
 from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules
-from common.tapered_capsules import Capsules, distances
 
 RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
 FINER = 24  # parts of a gap between rays at the end of a part

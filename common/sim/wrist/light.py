@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image
-from common.tapered_capsules import Capsules, Plane, first_hits, terms
+from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 
 BLACK_LEVEL = 2.0
 LED_LEVEL = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis

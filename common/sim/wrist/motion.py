@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rigid
-from common.hand_model import HandModel
+from common.geometry.transforms import rigid
+from common.hand.model import HandModel
+from common.hand.wrist_joint import STRAIGHT, forearm_palm
 from common.sim.motion import (
     FIST,
     PERIOD_S,
@@ -25,7 +26,6 @@ from common.sim.motion import (
     base_pose,
     smooth_step,
 )
-from common.wrist_joint import STRAIGHT, forearm_palm
 
 MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back

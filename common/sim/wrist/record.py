@@ -14,8 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from common.calibration import RigCalibration
-from common.frame_recording import Illumination, Manifest
-from common.hand_model import FINGERS, WEBXR_JOINTS
+from common.hand.model import FINGERS, WEBXR_JOINTS
+from common.recording.frame_recording import Illumination, Manifest
 from common.sim.record import (
     ANGLE_NAMES,
     FIRST_NS,

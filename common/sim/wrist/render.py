@@ -13,12 +13,12 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.errors import CalibrationError
-from common.frame_recording import Illumination
+from common.geometry.tapered_capsules import Capsules, Plane
+from common.recording.frame_recording import Illumination
 from common.sim.wrist import light
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.stripe import draw_stripe
 from common.sim.wrist.surface import HandSurface, SurfaceView
-from common.tapered_capsules import Capsules, Plane
 
 SURFACE_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and

@@ -11,10 +11,12 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
-from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
-from common.geometry import invert, rigid
-from common.hand_model import WRIST, HandJoints, HandModel
+from common.geometry.camera_model import CameraModel
+from common.geometry.tapered_capsules import Capsules
+from common.geometry.transforms import invert, rigid
+from common.hand.model import WRIST, HandJoints, HandModel
+from common.hand.wrist_joint import forearm_palm
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming
 from common.sim.together import TOGETHER, together_motion
@@ -22,8 +24,6 @@ from common.sim.wrist.capsules import HandCapsules
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
 from common.sim.wrist.things import bodies_of, with_things
-from common.tapered_capsules import Capsules
-from common.wrist_joint import forearm_palm
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
@@ -50,7 +50,7 @@ class WristTruth:
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
         tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
         tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
-        wrist_angles_rad: (2,) how the wrist is bent (`common.wrist_joint`).
+        wrist_angles_rad: (2,) how the wrist is bent (`common.hand.wrist_joint`).
     """
 
     t_s: float

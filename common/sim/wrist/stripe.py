@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
+from common.geometry.tapered_capsules import Capsules, Plane
 from common.sim.wrist.capsules import THING_GROUP
 from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SURFACE_AT_M
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
-from common.tapered_capsules import Capsules, Plane
 
 LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
 LENS_SIGMA_PX = 0.9

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
-from common.flat_field import flat_of
+from common.calibration.flat_field import flat_of
+from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
-from common.tapered_capsules import Capsules, Plane, first_hits, terms
 
 CREASE_M, CREASE_DEPTH = 0.0008, 0.08
 PALM_SMOOTH_PX = 9.0  # about 2 mm at the palm's distance

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.arrays import Float
+from common.geometry.tapered_capsules import Capsules
 from common.sim.held import Cylinder
-from common.tapered_capsules import Capsules
 
 ALBEDO = 0.05  # of matt black coating or rubber in the near infrared, against usual skin
 

@@ -1,1 +1,1 @@
-"""Lenses and places of cameras, from pictures of a board."""
+"""Lenses and places of cameras: pictures of a board enter, their files leave."""

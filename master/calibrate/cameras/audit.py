@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import invert, skew
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert, skew
 from master.calibrate.cameras.boards import Board, grid_edges
 
 

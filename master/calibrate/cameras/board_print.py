@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
+from common.calibration.replacing import replacing
 from common.errors import CalibrationError
-from common.replacing import replacing
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
 from master.calibrate.cameras.options import options_of
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import rigid, rotation_vector_to_matrix, transform
+from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 SHAPE_SD_M = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre

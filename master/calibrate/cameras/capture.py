@@ -15,15 +15,15 @@ import msgspec
 import numpy as np
 
 from common.arrays import Image
-from common.bus import Bus, Subscription
+from common.bus.bus import Bus, Subscription
 from common.clock import now_ns
 from common.errors import BusError, CalibrationError, PictureError
 from common.messages import Command, Still
-from common.picture_size import Size
-from common.pictures import decode
+from common.recording.picture_size import Size
+from common.recording.pictures import decode
 from master.calibrate.cameras.live_views import LiveViews, Verdict
 from master.calibrate.tree_files import date_now
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 
 ROUND_S = 0.3
 ANSWER_NS = 1_000_000_000

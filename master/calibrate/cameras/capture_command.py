@@ -9,20 +9,20 @@ from argparse import Namespace
 from contextlib import ExitStack
 from pathlib import Path
 
+from common.bus.keys import link_key
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.keys import link_key
 from common.terminal import echo
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
 from master.calibrate.cameras.options import board_of, options_of
-from master.ingest import Ingest
-from master.master_bus import host_bus
-from master.options import (
+from master.commands.options import (
     address,
 )
-from master.stopping import stop_on_signals
+from master.run.ingest import Ingest
+from master.run.master_bus import host_bus
+from master.run.stopping import stop_on_signals
 
 FEWEST = 5  # from which a lens can be fitted at all
 _START_S = 5.0

@@ -31,7 +31,7 @@ from master.calibrate.cameras.options import board_of
 from master.calibrate.cameras.report import report_json, report_lines
 from master.calibrate.cameras.result import CamerasResult, result
 from master.calibrate.cameras.views import BoardViews, View, look
-from master.summary import write_summary
+from master.commands.summary import write_summary
 
 
 def intrinsics(options: Namespace) -> None:

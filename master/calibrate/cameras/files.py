@@ -11,9 +11,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, check, load
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import invert
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.result import CamerasResult
 from master.calibrate.tree_files import provenance, write_camera, write_rig

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
-from common.geometry import rigid
+from common.geometry.transforms import rigid
 
 _FOCAL = np.geomspace(0.35, 6.0, 24)  # of the image's width: 110 to 10 degrees of view
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import PictureError, RecordingError
-from common.frame_pictures import FramePictures
-from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.pictures import decode_file, read_picture
+from common.recording.frame_pictures import FramePictures
+from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+from common.recording.pictures import decode_file, read_picture
 from master.calibrate.cameras.views import ImageSet
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import invert
+from common.geometry.transforms import invert
 from master.calibrate.cameras.alone import Rejection, corners_seen
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, rms, solve
 from master.calibrate.cameras.first_guess import place_board

@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Intrinsics, Matrix4
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 
 _FIGURES = 9  # decimals: nanometres, and far below any standard deviation
 

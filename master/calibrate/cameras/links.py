@@ -10,7 +10,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import FitError
-from common.geometry import fit_rigid, invert, transform
+from common.geometry.transforms import fit_rigid, invert, transform
 from master.calibrate.cameras.boards import Board, board_corners, orderings
 
 Places = Mapping[str, Mapping[str, Float]]

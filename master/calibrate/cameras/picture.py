@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.replacing import replacing
 from master.calibrate.cameras.bundle import rms
 from master.calibrate.cameras.coverage import CELLS
 from master.calibrate.cameras.fit import CamerasFit

@@ -10,9 +10,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Intrinsics, Matrix4
-from common.camera_calibration import check_lens
+from common.calibration.camera import check_lens
 from common.errors import CalibrationError, FitError
-from common.geometry import invert, skew
+from common.geometry.transforms import invert, skew
 from master.calibrate.cameras.alone import Rejection
 from master.calibrate.cameras.audit import PairAudit, audit_pair, pairs_with_views
 from master.calibrate.cameras.bundle import rms

@@ -1,1 +1,1 @@
-"""Depth from disparity, from a target at known distances; and how right a rig is."""
+"""Depth from disparity: a target at known distances enters, the law leaves."""

@@ -8,10 +8,10 @@ from argparse import Namespace
 from pathlib import Path
 
 from common.arrays import Float
+from common.bus.keys import link_key
 from common.calibration import RigCalibration
 from common.errors import CalibrationError
-from common.frame_recording import FrameRecording
-from common.keys import link_key
+from common.recording.frame_recording import FrameRecording
 from common.terminal import echo
 from master.calibrate.depth.fit import ideal_of
 from master.calibrate.depth.live import sweep_live
@@ -28,11 +28,11 @@ from master.calibrate.depth.source import (
 )
 from master.calibrate.depth.sweep import checked
 from master.calibrate.depth.verify import laws_of
-from master.fabrik.depth import DepthLaw
-from master.options import (
+from master.commands.options import (
     address,
 )
-from master.summary import write_summary
+from master.commands.summary import write_summary
+from master.fabrik.depth import DepthLaw
 
 _SWEEP = "1.00:0.20:-0.05"  # the published one
 

@@ -25,7 +25,7 @@ from math import atan
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw, ideal_law
 
 Fit = Callable[[Float, Float], tuple[DepthLaw, Float]]

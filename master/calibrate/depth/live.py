@@ -9,13 +9,13 @@ from pathlib import Path
 from common.arrays import Float
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.link_key import LinkKey
+from common.link.link_key import LinkKey
 from common.terminal import echo
 from master.calibrate.depth.session import run_session
 from master.calibrate.depth.source import Measured, Pair, straightened
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import parse_distances, write_table
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 
 Link = tuple[tuple[str, int], tuple[str, int], LinkKey]
 

@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from common.arrays import Bool, Float
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.replacing import replacing
 
 _LOOK = {
     "ideal": ("#8a8a8a", "s"),

@@ -15,12 +15,12 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import FrameRecording
 from common.messages import MarkerDetections
-from common.recorded_files import TRUTH, has_truth, read_truth
+from common.recording.frame_recording import FrameRecording
+from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import column, rows_of
-from master.recorded import recorded_detections
+from master.replay.recorded import recorded_detections
 
 STILL_S = 0.5  # shortest stretch that counts as standing
 STILL_FRAMES = 5

@@ -15,8 +15,8 @@ from common.arrays import Float, Int
 from common.clock import Clock
 from common.errors import FitError
 from common.messages import Detections, MarkerDetections
-from master.app import Source
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep
+from master.run.app import Source
 
 STILL_PX = 0.2  # drift over the reading, five times the noise of a quarter's mean; 0.5 % of the depth at 1 m
 SHAKE_PX = 0.5  # standard deviation of single frames, five times the noise of a good centroid

@@ -13,9 +13,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, load
-from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError
-from common.frame_recording import FrameRecording, open_recording
+from common.geometry.camera_model import CameraModel
+from common.recording.frame_recording import FrameRecording, open_recording
 from master.calibrate.depth.recording import Pairs, by_file, by_list, by_truth, read_pairs
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import parse_distances, read_table

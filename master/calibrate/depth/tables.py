@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
+from common.calibration.replacing import replacing
 from common.errors import CalibrationError
-from common.replacing import replacing
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep
 
 _MORE = "\0"  # key of what a row has beyond its columns; no name of a column

@@ -15,8 +15,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
-from common.geometry import invert, transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert, transform
 from master.calibrate.depth.fit import ideal_of
 from master.calibrate.depth.sweep import Sweep
 from master.estimator.cameras import CameraArrays

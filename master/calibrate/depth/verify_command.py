@@ -24,8 +24,8 @@ from master.calibrate.depth.verify_report import (
     off_axis_lines,
     verified_json,
 )
+from master.commands.summary import write_summary
 from master.fabrik.depth import tolerable_skew_s
-from master.summary import write_summary
 
 _WANTED = 0.02  # of the depth, as the published rig
 _TABLE = "0.20:1.00:0.10"  # where the budget is printed

@@ -9,18 +9,18 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
-from common.frame_recording import FrameRecording, open_recording
-from common.imu_fusion import OrientationFilter
-from common.imu_recording import IMU, read_imu
+from common.imu.fusion import OrientationFilter
+from common.imu.recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
+from common.recording.frame_recording import FrameRecording, open_recording
 from common.terminal import echo
 from master.calibrate.wrist.device import device_of, print_line, write_device
-from master.recorded import recorded_cycles, recorded_detections
-from master.rig import load_hand
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
-from master.summary import write_summary
+from master.commands.summary import write_summary
+from master.replay.recorded import recorded_cycles, recorded_detections
+from master.rig.files import load_hand
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 
 if TYPE_CHECKING:
     from master.calibrate.extrinsics.extrinsics import Extrinsics

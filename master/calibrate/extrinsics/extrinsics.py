@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, ImuCalibration, RigCalibration
 from common.errors import CalibrationError, FitError
-from common.geometry import cross, matrix_to_quaternion, transform
-from common.hand_model import CHAINS, FINGERS, HandModel
+from common.geometry.transforms import cross, matrix_to_quaternion, transform
+from common.hand.model import CHAINS, FINGERS, HandModel
 from common.messages import HandPose, ImuSample, WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.extrinsics.fit import fit_extrinsics
@@ -28,7 +28,7 @@ from master.calibrate.extrinsics.start import started
 from master.calibrate.extrinsics.tracks import GAP_S, HandTrack, ImuTrack
 from master.calibrate.tree_files import provenance
 from master.estimator.laser_plane import in_image, laser_points
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 TOOL = "calibrate wrist extrinsics"
 MOTION = (

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
 from master.calibrate.extrinsics.problem import Problem
 from master.calibrate.extrinsics.seen import Fit, StrobeCycles

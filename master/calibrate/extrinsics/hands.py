@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix, skew
-from common.hand_model import Chains, HandModel
+from common.geometry.transforms import rotation_vector_to_matrix, skew
+from common.hand.model import Chains, HandModel
 from master.estimator.body_points import BodyPoints
 from master.estimator.priors import PosturePrior
 

@@ -3,7 +3,7 @@
 Also their derivatives by the unknowns.
 
 The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_intersection`,
-`common.fingertips`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
+`common.hand.fingertips`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
 numbers of each finger are unknown, which a mounting must not take for its own: how thick its skin is, and where on the
 pulp its tip is seen.
 """
@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float
-from common.fingertips import Fingertips
-from common.geometry import rotation_vector_to_matrix
-from common.palmar_surface import PalmarSurface
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.fingertips import Fingertips
+from common.hand.palmar_surface import PalmarSurface
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.laser_plane import PlaneAxes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 FINGERS = slice(1, 5)
 SEEN = 4  # numbers of a finger: laser point across and along [m], tip [px]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.calibrate.extrinsics.extrinsics import Extrinsics
 from master.calibrate.wrist.picture import BLUE, FINGER_COLOURS, GREY, ORANGE, figure_of, framed, saved
 

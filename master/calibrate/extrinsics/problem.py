@@ -13,7 +13,7 @@ share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
   however the wrist is bent, and its joint stays where it is;
 - **the wrist**, which bends and does not twist:
   R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
-  (`common.wrist_joint`);
+  (`common.hand.wrist_joint`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
 The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.model import HandModel
 from master.calibrate.extrinsics.hands import HandProblem, Hands
 from master.calibrate.extrinsics.lines_of_sight import FINGERS, SEEN, LinesOfSight
 from master.calibrate.extrinsics.normal import Normal

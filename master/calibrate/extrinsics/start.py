@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import cross, matrix_to_quaternion, quaternion_to_matrix
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import cross, matrix_to_quaternion, quaternion_to_matrix
 from master.calibrate.extrinsics.seen import StrobeCycles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 from master.calibrate.extrinsics.unknown import Unknown

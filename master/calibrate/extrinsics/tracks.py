@@ -13,8 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
-from common.hand_model import WRIST, HandModel
+from common.geometry.transforms import (
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+from common.hand.model import WRIST, HandModel
 from common.messages import HandPose, ImuSample
 
 _NEAR_S = 0.08  # of an epoch: fingers move smoothly for twice as long

@@ -6,8 +6,8 @@ from typing import Self
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.palmar_surface import SPREAD
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.palmar_surface import SPREAD
 
 UNKNOWN = 34
 CAMERA_IMU, SHIFT, FOREARM_IMU, RIG_WORLD, ZERO = (slice(3 * k, 3 * k + 3) for k in range(5))

@@ -6,8 +6,8 @@ Also how they change with a rotation.
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix
-from common.wrist_joint import wrist_angles_of
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.wrist_joint import wrist_angles_of
 
 _DIFFERENCE_STEP = 1e-5
 

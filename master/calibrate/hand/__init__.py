@@ -1,1 +1,1 @@
-"""Bone lengths and marker places of a hand, from a guided routine."""
+"""A hand of its own: a guided routine enters, bone lengths and markers leave."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import FitError
-from common.geometry import fit_rigid, transform
-from common.hand_model import TIPS, HandModel
-from common.hand_routine import MOVES, ROUTINE_S, STEPS, posture_at
+from common.geometry.transforms import fit_rigid, transform
+from common.hand.model import TIPS, HandModel
+from common.hand.routine import MOVES, ROUTINE_S, STEPS, posture_at
 from master.calibrate.hand.observed import Observed
 
 GRID_S = 0.1

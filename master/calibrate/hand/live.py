@@ -2,12 +2,12 @@
 
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose
 from common.terminal import echo
 from master.calibrate.hand.observed import Observed, marker_rows
 from master.calibrate.hand.session import guide
-from master.master_bus import join_bus
+from master.run.master_bus import join_bus
 
 _DEPTH = 256  # poses that may wait while a line is printed
 

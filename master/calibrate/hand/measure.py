@@ -15,8 +15,8 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.calibration import HandProfile
 from common.errors import FitError
-from common.hand_model import FINGERS, TIPS, WRIST, HandModel
-from common.hand_profiles import mirrored_profile, scaled_profile
+from common.hand.model import FINGERS, TIPS, WRIST, HandModel
+from common.hand.profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
 from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.fit import ShapeFit, fit_shape

@@ -3,7 +3,7 @@
 Bones and hinges from its joints, couplings where it is long enough.
 
 Bones are the mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
-(`common/hand_fitting.py`). What no motion capture gives is taken from the generated profile of the same length: radii,
+(`common/hand/fitting.py`). What no motion capture gives is taken from the generated profile of the same length: radii,
 where the marker sits on the tips, where the marker on the back is.
 """
 
@@ -17,11 +17,11 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float
 from common.calibration import HandProfile, Provenance, RestJoint
 from common.errors import FitError
-from common.geometry import matrix_to_quaternion
-from common.hand_fitting import profile_from_joints
-from common.hand_model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
-from common.hand_posture import joint_angles
-from common.hand_profiles import generated_profile, joint_frame
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.fitting import profile_from_joints
+from common.hand.model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
+from common.hand.posture import joint_angles
+from common.hand.profiles import generated_profile, joint_frame
 from master.calibrate.hand.measure import hand_length_of
 from master.calibrate.hand.motion_couplings import MotionCouplings, motion_couplings
 from master.calibrate.hand.palm import Palm, find_palm

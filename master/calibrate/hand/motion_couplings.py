@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from common.arrays import Float, Int
 from common.calibration import Couplings
-from common.hand_presets import preset_couplings
+from common.calibration.hand_presets import preset_couplings
 
 MOVED_S = 20.0  # of movement, at least
 _MOVES_RAD_S = np.radians(10.0)
@@ -69,7 +69,7 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
     """Couplings from a motion.
 
     Args:
-        angles_rad: (T, 5, 4) [rad] of `common.hand_posture.joint_angles`.
+        angles_rad: (T, 5, 4) [rad] of `common.hand.posture.joint_angles`.
         chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is estimated from bones that change.
         t_ns: (T,) [ns] times.
     """

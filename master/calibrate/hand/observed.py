@@ -11,9 +11,9 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import CalibrationError, FitError, RecordingError
-from common.hand_model import JOINTS, TIPS, HandModel
-from common.hand_routine import ROUTINE_S
-from common.npz import read_npz
+from common.hand.model import JOINTS, TIPS, HandModel
+from common.hand.routine import ROUTINE_S
+from common.recording.npz import read_npz
 
 FEWEST_HZ = 15.0
 _SHORTEST = 0.6  # of the routine

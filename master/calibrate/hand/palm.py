@@ -14,9 +14,9 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.errors import FitError
-from common.geometry import fit_rigid
-from common.hand_model import CHAINS, METACARPALS, WRIST, HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import fit_rigid
+from common.hand.model import CHAINS, METACARPALS, WRIST, HandModel
+from common.hand.profiles import generated_profile
 from master.mocap.joint_motion import Side
 from master.mocap.track import known
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.replacing import replacing
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 
 _BLUE, _GREY = "#2b6cb0", "#9a9a9a"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.hand_routine import move_at, posture_at
+from common.hand.routine import move_at, posture_at
 
 _COARSE_S = 0.1
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix, skew, transform
-from common.hand_model import HandModel
+from common.geometry.transforms import rotation_vector_to_matrix, skew, transform
+from common.hand.model import HandModel
 from master.calibrate.hand.curves import BorderedNormal, Knots
 from master.calibrate.hand.priors import Priors, RoutineTargets
 from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, ROTATION, Shape, caps_of

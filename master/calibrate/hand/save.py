@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, Provenance, RestJoint, Vector3
-from common.hand_model import CHAINS, FINGERS, JOINTS, HandModel, couplings_of
+from common.hand.model import CHAINS, FINGERS, JOINTS, HandModel, couplings_of
 from master.calibrate.hand.measure import CERTAIN, HandMeasurement, hand_length_of
 from master.calibrate.tree_files import provenance
 

@@ -13,7 +13,7 @@ import numpy as np
 from common.arrays import Float, Int
 from common.clock import Clock
 from common.errors import FitError
-from common.hand_routine import MOVES, STEPS, Step
+from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
 
 SEEN = 0.6  # of a step's poses each tip must be in

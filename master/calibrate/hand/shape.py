@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import cross, rotation_vector_to_matrix, skew
-from common.hand_model import CHAINS, HandModel
+from common.geometry.transforms import cross, rotation_vector_to_matrix, skew
+from common.hand.model import CHAINS, HandModel
 
 PER_FINGER = 11
 LENGTH, ROOT, ROTATION, RATIO, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10

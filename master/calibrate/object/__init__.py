@@ -1,1 +1,1 @@
-"""Objects that are tracked: what is printed for them, and their files."""
+"""Tracked objects: pictures or measures enter, printed sheets and files leave."""

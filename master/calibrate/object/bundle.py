@@ -18,7 +18,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
-from common.geometry import fit_rigid, rotation_vector_to_matrix, skew, transform
+from common.geometry.transforms import fit_rigid, rotation_vector_to_matrix, skew, transform
 from master.calibrate.object.seen import Seen
 
 _MOST = 1500  # epochs: more of the same motion adds time, not information

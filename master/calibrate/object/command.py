@@ -7,10 +7,10 @@ from argparse import Namespace
 from pathlib import Path
 
 from common.calibration import RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, FitError
-from common.frame_recording import open_recording
-from common.object_profile import ObjectProfile
+from common.geometry.camera_model import CameraModel
+from common.recording.frame_recording import open_recording
 from common.terminal import echo
 from master.calibrate.object.measure import measure_object
 from master.calibrate.object.save import (
@@ -23,8 +23,8 @@ from master.calibrate.object.save import (
 from master.calibrate.object.seen import Seen, rows_of, seen_by
 from master.calibrate.time.commands import geometry_of
 from master.calibrate.tree_files import load_marker_rig
-from master.recorded import recorded_detections
-from master.summary import write_summary
+from master.commands.summary import write_summary
+from master.replay.recorded import recorded_detections
 
 
 def object_command(options: Namespace) -> None:

@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from common.arrays import Float
-from common.calibration_parts import Matrix4
+from common.calibration.object_profile import BoxShape, ObjectProfile, Tag, TagFamily, Tags
+from common.calibration.parts import Matrix4
+from common.calibration.replacing import replacing
 from common.errors import CalibrationError
-from common.geometry import rigid
-from common.object_profile import BoxShape, ObjectProfile, Tag, TagFamily, Tags
-from common.replacing import replacing
-from common.tag_family import GRIDS, tag_image
+from common.geometry.tag_family import GRIDS, tag_image
+from common.geometry.transforms import rigid
 
 _A4_MM = (210.0, 297.0)
 _EDGE_MM, _RULER_MM = 8.0, 100.0

@@ -6,9 +6,9 @@ The object's own, by the beads, or that of an existing file.
 import numpy as np
 
 from common.arrays import Float
+from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError
-from common.geometry import fit_rigid, rigid, transform
-from common.object_profile import ObjectProfile
+from common.geometry.transforms import fit_rigid, rigid, transform
 
 LINE_M = 5e-3  # from the line through the first two beads; nearer, they do not determine how it is turned about that
 _LIKE_M = 0.015  # by which beads may lie elsewhere than in the file that the frame is taken from

@@ -7,7 +7,7 @@ from common.clock import SystemClock
 from common.messages import HandPose
 from master.calibrate.object.seen import Seen
 from master.calibrate.object.session import guide
-from master.master_bus import join_bus
+from master.run.master_bus import join_bus
 
 _DEPTH = 512  # poses that may wait while a line is printed
 

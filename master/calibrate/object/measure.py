@@ -11,7 +11,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import FitError
-from common.geometry import matrix_to_rotation_vector
+from common.geometry.transforms import matrix_to_rotation_vector
 from master.calibrate.object.bundle import Bundle, fit_bundle, usable
 from master.calibrate.object.frame import own_frame
 from master.calibrate.object.seen import Seen

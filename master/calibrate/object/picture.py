@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common.geometry import fit_rigid
-from common.object_profile import ObjectProfile
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.transforms import fit_rigid
 from master.calibrate.object.measure import Measurement
 from master.calibrate.wrist.picture import FINGER_COLOURS, GREY, figure_of, saved
 

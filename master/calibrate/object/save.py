@@ -11,9 +11,9 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import RigCalibration, save
+from common.calibration.object_profile import Bead, ObjectProfile, check_object
 from common.errors import CalibrationError
-from common.geometry import transform
-from common.object_profile import Bead, ObjectProfile, check_object
+from common.geometry.transforms import transform
 from master.calibrate.object.frame import OWN, frame_of
 from master.calibrate.object.measure import ENOUGH_LOOKS, Measurement
 from master.calibrate.tree_files import provenance, rig_in_tree, write_rig

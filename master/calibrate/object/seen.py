@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
 from common.messages import HandPose, MarkerDetections
 from master.estimator.cameras import CameraArrays
 from master.fabrik.blob_bias import LensShift

@@ -1,1 +1,1 @@
-"""How late the frames of a camera are, from the tracks of a moving hand."""
+"""Latency of cameras: tracks of a moving hand enter, delays leave."""

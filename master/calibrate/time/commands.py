@@ -10,14 +10,14 @@ from pathlib import Path
 import msgspec
 
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.frame_recording import FrameRecording, open_recording
+from common.geometry.camera_model import CameraModel
+from common.recording.frame_recording import FrameRecording, open_recording
 from common.terminal import echo
 from master.calibrate.time.fit import SIGNIFICANT, CameraTime, measure_times
 from master.calibrate.tree_files import load_marker_rig, provenance, rig_in_tree, write_rig
-from master.recorded import recorded_detections
-from master.summary import write_summary
+from master.commands.summary import write_summary
+from master.replay.recorded import recorded_detections
 
 
 def time_command(options: Namespace) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from master.monitor.timing import ResidualTiming
 from master.monitor.timing_fit import TimeOffset

@@ -1,4 +1,1 @@
-"""Registration of a tracking system to the rig and of its device to an object.
-
-The cameras see the object, too.
-"""
+"""Registration of a tracker: its poses and the markers enter, two poses leave."""

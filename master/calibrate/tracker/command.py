@@ -9,13 +9,13 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from common.calibration import load
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, FitError
-from common.object_profile import ObjectProfile
 from common.terminal import echo
 from master.calibrate.tracker.registration import Registration, register
 from master.calibrate.tracker.save import read_motion, write_motion, write_registration
 from master.calibrate.tree_files import load_marker_rig
-from master.summary import write_summary
+from master.commands.summary import write_summary
 
 
 def tracker(options: Namespace) -> None:

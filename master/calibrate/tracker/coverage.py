@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector
+from common.geometry.transforms import matrix_to_rotation_vector
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 LEAST_S, LEAST_ROTATION_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10

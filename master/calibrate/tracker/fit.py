@@ -18,7 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
+from common.geometry.transforms import (
+    invert,
+    matrix_to_rotation_vector,
+    rigid,
+    rotation_vector_to_matrix,
+    skew,
+)
 from master.calibrate.tracker.start import Placed, predicted
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 

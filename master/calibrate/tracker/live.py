@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
+from common.calibration.object_profile import ObjectProfile
 from common.clock import SystemClock
 from common.messages import ObjectPose, TrackerPose
-from common.object_profile import ObjectProfile
 from master.calibrate.tracker.session import Session, guide
-from master.master_bus import join_bus
+from master.run.master_bus import join_bus
 
 _DEPTH = 1024  # poses that may wait while a line is printed
 

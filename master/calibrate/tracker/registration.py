@@ -15,10 +15,10 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import Provenance, RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError
-from common.geometry import rotation_vector_to_matrix
+from common.geometry.transforms import rotation_vector_to_matrix
 from common.messages import ObjectPose, TrackerPose
-from common.object_profile import ObjectProfile
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tracker.coverage import Coverage, coverage_of
 from master.calibrate.tracker.fit import Fit, fit_registration, late_sigma_s, sigma_at

@@ -8,10 +8,10 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import RigCalibration, load, save
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from common.npz import read_npz, write_npz
-from common.object_profile import ObjectProfile
+from common.recording.npz import read_npz, write_npz
 from master.calibrate.tracker.registration import Registration, documented
 from master.calibrate.tree_files import rig_in_tree, write_rig
 

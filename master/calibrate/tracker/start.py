@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import matrix_to_rotation_vector, rigid
+from common.geometry.transforms import matrix_to_rotation_vector, rigid
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST_LAG_S = 0.5

@@ -9,7 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
+from common.geometry.transforms import (
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 
 GAP_S = 0.06  # between poses: farther apart, what was between them is not known

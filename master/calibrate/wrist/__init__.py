@@ -1,4 +1,1 @@
-"""Calibration of a wrist device.
-
-Laser plane, light of the LEDs, the palm before it, how each finger curls.
-"""
+"""Wrist device: lit pictures of boards enter, laser plane and flat field leave."""

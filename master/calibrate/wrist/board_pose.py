@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
 from common.errors import FitError
-from common.frame_recording import Illumination
-from common.geometry import cross, transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import cross, transform
+from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_corners
 from master.calibrate.cameras.detect import find_board
 from master.calibrate.cameras.first_guess import place_board

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.calibration.wrist import FingerLine
 from common.errors import FitError
-from common.hand_model import FINGERS
-from common.wrist_calibration import FingerLine
+from common.hand.model import FINGERS
 from master.estimator.finger_lines import principal_line
 
 MIN_POINTS = 20  # two thirds of a second of strobe cycles

@@ -8,14 +8,14 @@ from argparse import Namespace
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration
+from common.calibration.wrist import FingerLine
 from common.errors import FitError
 from common.terminal import echo
-from common.wrist_calibration import FingerLine
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.curl import FingerCurl, fit_curls
 from master.calibrate.wrist.curled import read_curled
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
-from master.summary import write_summary
+from master.commands.summary import write_summary
 
 
 def curl(options: Namespace) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import intersect_plane
-from common.wrist_device import laser_plane_of
+from common.geometry.transforms import intersect_plane
+from common.hand.wrist_device import laser_plane_of
 from master.calibrate.wrist.device import Device
-from master.recorded import recorded_cycles
+from master.replay.recorded import recorded_cycles
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import MANIFEST, open_recording
+from common.geometry.camera_model import CameraModel
+from common.recording.frame_recording import MANIFEST, open_recording
 from common.terminal import echo
 from master.calibrate.tree_files import rig_in_tree, write_rig
 

@@ -21,11 +21,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
-from common.camera_model import CameraModel
+from common.calibration.flat_field import terms_of
+from common.calibration.wrist import FlatField
 from common.errors import FitError
-from common.flat_field import terms_of
-from common.geometry import transform
-from common.wrist_calibration import FlatField
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import transform
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.board_pose import BoardPose
 

@@ -11,9 +11,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration
-from common.camera_model import CameraModel
 from common.errors import FitError
-from common.frame_recording import Illumination
+from common.geometry.camera_model import CameraModel
+from common.recording.frame_recording import Illumination
 from common.terminal import echo
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.options import board_of
@@ -23,7 +23,7 @@ from master.calibrate.wrist.device import Device, device_of, print_line, write_d
 from master.calibrate.wrist.line import line_on_board
 from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
-from master.summary import write_summary
+from master.commands.summary import write_summary
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.camera_model import CameraModel
 from common.errors import FitError
-from common.geometry import transform
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import transform
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.board_pose import BoardPose
 

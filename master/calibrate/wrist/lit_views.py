@@ -13,8 +13,8 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import PictureError, RecordingError
-from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.pictures import decode_file, read_picture
+from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+from common.recording.pictures import decode_file, read_picture
 
 MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

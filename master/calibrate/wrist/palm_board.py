@@ -19,7 +19,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import FitError
-from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.geometry.transforms import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.board_pose import BoardPose
 

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
 from common.errors import FitError
-from common.frame_recording import Illumination
-from common.geometry import invert
-from common.hand_model import HandModel
+from common.geometry.transforms import invert
+from common.hand.model import HandModel
+from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.options import board_of
@@ -23,7 +23,7 @@ from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.lit_views import grouped_by_reason, lit_views
 from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
-from master.summary import write_summary
+from master.commands.summary import write_summary
 
 
 def palm(options: Namespace) -> None:

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from common.camera_model import CameraModel
+from common.calibration.flat_field import field_at
+from common.calibration.replacing import replacing
 from common.errors import RecordingError
-from common.flat_field import field_at
-from common.replacing import replacing
+from common.geometry.camera_model import CameraModel
 from master.calibrate.wrist.curl import FingerCurl
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
 from master.calibrate.wrist.plane import PlaneFit, ViewLine

@@ -16,9 +16,9 @@ from itertools import combinations
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.calibration.wrist import LaserPlane
 from common.errors import FitError
-from common.geometry import cross
-from common.wrist_calibration import LaserPlane
+from common.geometry.transforms import cross
 from master.calibrate.wrist.board_pose import BoardPose
 from master.calibrate.wrist.line import BoardLine
 

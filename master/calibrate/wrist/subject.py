@@ -16,14 +16,14 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.errors import FitError
-from common.hand_model import CHAINS, FINGERS, HandModel
+from common.hand.model import CHAINS, FINGERS, HandModel
 from common.messages import WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
 from master.calibrate.wrist.subject_fit import Fit, ImageObservations, fit_subject, prior_sigma
 from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 
 TOOL = "calibrate wrist subject"
 _NAMES = FINGERS[1:]

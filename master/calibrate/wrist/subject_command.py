@@ -12,14 +12,14 @@ from msgspec.structs import replace
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.terminal import echo
 from master.calibrate.tree_files import write_hand
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_model import Unknown
-from master.recorded import recorded_cycles
-from master.summary import write_summary
+from master.commands.summary import write_summary
+from master.replay.recorded import recorded_cycles
 
 
 def subject(options: Namespace) -> None:

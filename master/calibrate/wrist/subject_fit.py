@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.palmar_surface import SPREAD
+from common.hand.palmar_surface import SPREAD
 from master.calibrate.wrist.guided import FLAT
 from master.calibrate.wrist.subject_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, SubjectModel
 

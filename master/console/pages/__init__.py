@@ -1,4 +1,1 @@
-"""Pages of the console, one file each.
-
-`build(state)` fills the shell of `master.console.app`.
-"""
+"""Pages of the console, one file each: its state enters, elements leave."""

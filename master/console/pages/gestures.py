@@ -10,8 +10,8 @@ from html import escape
 from nicegui import background_tasks, ui
 
 from common.calibration import load
+from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.errors import CalibrationError, PhalanxError
-from common.gesture_settings import GestureSettings, default_gestures
 from common.messages import Gesture
 from master.console.labels import gesture_line, readable
 from master.console.state import ConsoleState

@@ -1,4 +1,1 @@
-"""Set-up by a page, from an empty calibration folder to a tracked hand.
-
-Each calibration is a wizard.
-"""
+"""Set-up in the browser: an empty folder enters, a calibrated rig leaves."""

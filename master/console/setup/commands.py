@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from common.bus.keys import ENVIRONMENT, RIG_KEY, keys_folder, rig_key
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
-from common.keys import ENVIRONMENT, RIG_KEY, keys_folder, rig_key
 from master.cli.table import CALIBRATIONS
+from master.commands.keys_folder import AUTHORITY_KEY, files_of_device, make
 from master.console.setup.fields import Value, arguments_of, fields_of
 from master.console.setup.files import KEY_FILE, CameraPlan, Plan, key_of
 from master.console.state import ConsoleSettings
-from master.keys_folder import AUTHORITY_KEY, files_of_device, make
 
 # What simulated cameras can look at: scene -> text. "still" is the hand before its motion begins.
 VIEWS = {

@@ -14,14 +14,14 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from common.back_markers import with_three_back_markers
+from common.bus.keys import new_key, rig_key
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
-from common.calibration_parts import Part
+from common.calibration.parts import Part
+from common.calibration.replacing import replacing
 from common.errors import CalibrationError
-from common.hand_profiles import generated_profile
-from common.keys import new_key, rig_key
+from common.hand.back_markers import with_three_back_markers
+from common.hand.profiles import generated_profile
 from common.messages import Name
-from common.replacing import replacing
 from master.console.setup.modes import Kind, new_file
 
 OLD = "old"

@@ -11,8 +11,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, parse
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, PhalanxError
-from common.object_profile import ObjectProfile
 from master.console.local import LocalProcess, LocalProcesses
 from master.console.setup.files import replace_file
 from master.console.setup.progress import fault, progress

@@ -10,15 +10,15 @@ from argparse import ArgumentParser
 from collections.abc import Sequence
 from contextlib import ExitStack
 
+from common.bus.keys import link_key
 from common.clock import SystemClock
 from common.errors import PhalanxError
-from common.keys import link_key
 from common.terminal import echo
 from master.calibrate.cameras.capture_command import cameras_of
-from master.ingest import Ingest
-from master.master_bus import host_bus
-from master.options import add_bus, add_calibration, add_link, add_rig, address
-from master.stopping import stop_on_signals
+from master.commands.options import add_bus, add_calibration, add_link, add_rig, address
+from master.run.ingest import Ingest
+from master.run.master_bus import host_bus
+from master.run.stopping import stop_on_signals
 
 _START_S = 5.0
 _POLL_S = 0.2

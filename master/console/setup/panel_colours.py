@@ -10,7 +10,7 @@ from nicegui import events, ui
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Command, Preview
-from common.picture_size import jpeg_size
+from common.recording.picture_size import jpeg_size
 from master.console.setup.colour_sampling import keep_colours, pick, pixel_of, ranges_of
 from master.console.setup.parts import Desk, heading, jpeg_url
 

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from common.errors import CalibrationError, PhalanxError
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from master.console.local import LocalProcess
 from master.console.setup.commands import Commands, epoch_of
 from master.console.setup.fields import Value

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import pytest
 from msgspec.structs import replace
 
-from common.datagram import Address, Kind, Refusal, Sealer, parse
+from common.link.datagram import Address, Kind, Refusal, Sealer, parse
 from common.link.handshake import RULES, Event, Key, Role, Rule, State, state_pages
-from common.session import (
+from common.link.session import (
     Beacon,
     EchoAnswer,
     EchoAsk,
@@ -20,7 +20,7 @@ from common.session import (
     Welcome,
     seal,
 )
-from master.link import MasterLink
+from master.run.link import MasterLink
 from slave.link import SlaveLink
 from tests.network_helpers import ManualClock, seeded
 

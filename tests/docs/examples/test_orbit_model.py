@@ -14,9 +14,9 @@ import rerun as rr
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.messages import Gesture
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from tests.docs.examples.loading import example, wait_for
 
 STEP_NS = 16_666_667

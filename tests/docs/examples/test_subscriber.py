@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.hand_model import JOINTS
-from common.keys import access_of
-from common.zenoh_bus import ZenohBus
-from master.keys_folder import make
+from common.bus.keys import access_of
+from common.bus.zenoh_bus import ZenohBus
+from common.hand.model import JOINTS
+from master.commands.keys_folder import make
 from tests.master.send.hands import hand_pose
 from tests.network_helpers import free_endpoint
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
+from common.bus.zenoh_bus import ZenohBus
 from common.errors import PhalanxError
 from common.messages import Gesture
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from common.messages.streams import MASTER
 from tests.docs.examples.loading import example, wait_for
 from tests.network_helpers import until
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.bus import LoopbackBus
-from common.geometry import matrix_to_quaternion
-from common.gesture_settings import default_gestures
-from common.hand_model import HandModel
+from common.bus.bus import LoopbackBus
+from common.calibration.gesture_settings import default_gestures
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
 from common.messages import Gesture, HandPose, Source
 from common.sim.gesture_postures import pinch_posture
 from common.sim.gestures import Gestures
@@ -18,8 +18,8 @@ from common.sim.motion import REST, HandState, angles_of, smooth_step
 from common.sim.scene import view_centre
 from master.gestures.recogniser import GestureRecogniser
 from master.outputs.bus import BusSink
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 from tests.docs.examples.loading import example
 
 HZ = 60.0

@@ -9,13 +9,13 @@ import cv2
 import msgspec
 import numpy as np
 
-from common.bus import Bus
+from common.bus.bus import Bus
 from common.calibration import CameraCalibration, HsvRange, load, save
-from common.camera_settings import figures
+from common.calibration.camera_settings import figures
 from common.clock import now_ns
 from common.errors import CalibrationError
-from common.geometry import matrix_to_quaternion
-from common.hand_model import TIPS
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import TIPS
 from common.messages import CheckItem, Checklist, Command, Gesture, HandPose, Health, Preview, Source
 from tests.hand_helpers import RIGHT
 from tests.synthetic_run import hand_at

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import CameraCalibration, RigCalibration, load, save
+from common.calibration.output_settings import OutputSettings
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Gesture, Health
-from common.output_settings import OutputSettings
 from master.console.elements import full_frame_uv
 from master.console.filter_trial import save_filter, try_filter
 from master.console.history import History

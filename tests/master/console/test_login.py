@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from starlette.routing import BaseRoute, Mount, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.errors import PhalanxError
 from master.console.app import PAGES, LoginPage, console_app, login_of, register
 from master.console.login import HASH_FILE, PasswordHash, kept_password, new_password, password_from

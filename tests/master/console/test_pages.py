@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.output_settings import OutputSettings
 from common.messages import CheckItem
-from common.output_settings import OutputSettings
-from common.zenoh_bus import ZenohBus
 from tests.browser import WAIT_MS, browsers_own, chromium
 from tests.master.console.fakes import HEIGHT, WIDTH, FakeMaster, FakeSlave, tree
 from tests.network_helpers import PATIENCE_S, free_endpoint, until

@@ -13,7 +13,7 @@ from fastapi import FastAPI, Request
 
 from master.console import serving
 from master.console.serving import MOST_CONNECTIONS, MOST_HEAD_BYTES, MOST_OF_ONE, console_server
-from master.listening import page_certificate
+from master.outputs.web.listening import page_certificate
 from tests.network_helpers import until
 
 OPEN_S, WAIT_S = 0.4, 30.0

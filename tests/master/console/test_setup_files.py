@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from common.bus.keys import rig_key
 from common.calibration import (
     CameraCalibration,
     HandProfile,
@@ -16,8 +17,7 @@ from common.calibration import (
     save,
 )
 from common.errors import CalibrationError, PhalanxError
-from common.hand_model import HandModel
-from common.keys import rig_key
+from common.hand.model import HandModel
 from common.messages import Health
 from master.calibrate.tree_files import provenance
 from master.console.setup.colour_sampling import keep_colours, pixel_of, ranges_of

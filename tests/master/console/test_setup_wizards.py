@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from common.bus.keys import rig_key
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
-from common.keys import rig_key
 from master.cli.table import CALIBRATIONS
+from master.commands.keys_folder import make
 from master.console.local import LocalProcesses
 from master.console.setup.commands import VIEWS, Commands, epoch_of
 from master.console.setup.fields import arguments_of, fields_of
@@ -21,7 +22,6 @@ from master.console.setup.panel_lens import judged
 from master.console.setup.progress import fault, progress, share_of
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
-from master.keys_folder import make
 from tests.cli import invoke
 
 WAIT_S = 60.0

@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_rotation_vector
-from common.hand_model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector
+from common.hand.model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
 from master.estimator.epoch import Epoch, Fitted, FittedHand, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.back_markers import with_three_back_markers
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.back_markers import with_three_back_markers
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from tests.hand_helpers import MARKERS, natural_angles, palm
 from tests.master.estimator.fitted import fit, forgetful, orientation_of, palm_deg
 

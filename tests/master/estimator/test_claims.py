@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from bench.joint_covariance import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
-from common.geometry import rigid
-from common.hand_model import CHAINS, PALM, TIPS, HandModel
-from common.records import boxed
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, PALM, TIPS, HandModel
+from common.messages.records import boxed
 from common.sim.motion import HandMotion, ScriptedMotion
 from common.sim.poses import StudyPoses
 from master.estimator.joint_covariance import CovarianceScratch

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.hand_model import FINGERS
-from common.wrist_calibration import FingerLine
+from common.calibration.wrist import FingerLine
+from common.hand.model import FINGERS
 from master.estimator.cubic import ROOT_MM, CubicLaw, cubic_pip, simulated_lines
 from master.estimator.finger_lines import on_line
 from tests.master.estimator.wrist_case import WristCase, natural

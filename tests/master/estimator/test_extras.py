@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.records import boxed
+from common.messages.records import boxed
 from master.estimator.extras import ExtrasScratch, stationary_of
 from master.estimator.problem import EpochPrior
 from master.estimator.settings import DEFAULT

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.messages import HandPose
 from master.estimator.settings import DEFAULT
 from master.estimator.wrist_pipeline import WristPipeline

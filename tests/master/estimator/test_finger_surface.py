@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand_model import CHAINS
-from common.wrist_joint import STRAIGHT
+from common.hand.model import CHAINS
+from common.hand.wrist_joint import STRAIGHT
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.laser_plane import PlaneAxes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.master.estimator.wrist_case import NO_TWIST, PIP, WristCase, bent, natural
 from tests.wrist_run import mirrored_setup
 

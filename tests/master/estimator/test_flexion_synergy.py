@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 
 from common.calibration import Couplings
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from master.estimator.flexion_synergy import FlexionSynergy
 
 

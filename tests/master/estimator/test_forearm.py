@@ -12,7 +12,7 @@ import pytest
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import (
+from common.geometry.transforms import (
     axis_rotation,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
@@ -20,7 +20,7 @@ from common.geometry import (
     rigid,
     rotation_vector_to_matrix,
 )
-from common.wrist_joint import forearm_palm
+from common.hand.wrist_joint import forearm_palm
 from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator

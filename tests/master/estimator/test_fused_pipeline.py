@@ -10,12 +10,12 @@ from bench.fusion_shown import shown
 from bench.fusion_solved import Solved, solve
 from bench.played import START_NS
 from common.arrays import Bool
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.messages import HandPose, ImuSample, MarkerDetections, SolverMode, Source, WristDetections
 from master.estimator.fused import FusedPipeline
 from master.estimator.settings import DEFAULT
-from master.rig_pipeline import pipeline_of
-from master.stages import StageTimes
+from master.rig.pipeline import pipeline_of
+from master.run.stages import StageTimes
 
 SECONDS, GONE_S, BACK_S = 3.2, 1.8, 2.5
 Seen = tuple[Both, list[Observed]]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from master.estimator.cameras import CameraArrays
 from master.estimator.gate import SETTINGS, Association, Prior, among, associate
-from master.rig_pipeline import line_of
-from master.stages import StageTimes
+from master.rig.pipeline import line_of
+from master.run.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

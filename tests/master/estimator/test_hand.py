@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import CHAINS, TIPS, HandModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import CHAINS, TIPS, HandModel
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.records import boxed
+from common.messages.records import boxed
 from master.estimator.hand_tables import HandTables
 from master.estimator.settings import DEFAULT
 from master.estimator.state import NEVER_NS, HandState, Hidden

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand_model import TIPS
+from common.hand.model import TIPS
 from master.estimator.epoch import FittedHand
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import RIGHT, palm, small_cov

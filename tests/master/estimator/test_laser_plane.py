@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.geometry import axis_rotation
+from common.geometry.transforms import axis_rotation
 from master.estimator.laser_plane import PlaneAxes, laser_points
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.wrist_run import wrist_setup
 
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.records import boxed
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.messages.records import boxed
 from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
 from master.estimator.kinematics import Scratch

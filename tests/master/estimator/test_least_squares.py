@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from master.estimator.epoch import Epoch, FittedHand
 from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT

@@ -5,7 +5,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT

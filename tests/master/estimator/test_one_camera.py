@@ -3,7 +3,7 @@
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import CHAINS, PALM, TIPS
+from common.hand.model import CHAINS, PALM, TIPS
 from common.messages import Source
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import palm

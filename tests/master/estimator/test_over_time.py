@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.hand_model import CHAINS, METACARPALS, PALM, TIPS
+from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
 from common.messages import Source
-from common.records import boxed
+from common.messages.records import boxed
 from master.estimator.epoch import Fitted
 from master.estimator.pose import pose_of
 from master.estimator.settings import DEFAULT

@@ -8,13 +8,13 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import AffineDisparityCalibration, PowerLawCalibration
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from common.messages import HandPose, MarkerDetections, Source
 from master.estimator.pipeline import MarkerPipeline
 from master.estimator.settings import DEFAULT
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.calibration import Couplings
-from common.geometry import rotation_vector_to_matrix
-from common.hand_model import PALM, HandModel
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.model import PALM, HandModel
 from common.messages import Source
 from master.estimator.epoch import FittedHand, OrientationMeasurement
 from master.estimator.estimator import Estimator

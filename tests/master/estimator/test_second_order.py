@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import rotation_vector_to_matrix
-from common.hand_model import CHAINS, TIPS, WRIST, HandModel
-from common.records import boxed
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.model import CHAINS, TIPS, WRIST, HandModel
+from common.messages.records import boxed
 from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import FittedHand

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
 from common.calibration import FilterCalibration
-from common.geometry import rigid
-from common.hand_model import CHAINS, TIPS
+from common.geometry.transforms import rigid
+from common.hand.model import CHAINS, TIPS
 from master.estimator.epoch import Epoch, Fitted, FittedHand
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT

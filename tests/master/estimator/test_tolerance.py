@@ -4,8 +4,8 @@ import numpy as np
 
 from bench.solved_hand import PointHand
 from common.arrays import Float
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from master.estimator.parameters import REACH, HandParameters
 from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, palm
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
 from common.arrays import Float
-from common.records import boxed
+from common.messages.records import boxed
 from master.estimator.hand_tables import HandTables
 from master.estimator.truncated import Cut
 from tests.hand_helpers import RIGHT

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, Volume, load
 from common.errors import CalibrationError
-from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
+from common.hand.model import CHAINS, FINGERS, METACARPALS, HandModel
+from common.hand.palmar_surface import SPREAD, PalmarSurface
 from common.messages import HandPose, SolverMode, Source, WristDetections
-from common.palmar_surface import SPREAD, PalmarSurface
 from master.estimator.settings import DEFAULT
 from master.estimator.wrist_device import LED_SCALE
 from master.estimator.wrist_pipeline import WristPipeline
-from master.rig_setup import RigSetup
-from master.wrist_setup import WristSetup
+from master.rig.setup import RigSetup
+from master.rig.wrist import WristSetup
 from tests.master.estimator.wrist_case import (
     CYCLE_NS,
     DIP,

@@ -7,12 +7,12 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Couplings
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
-from common.hand_presets import preset_couplings
-from common.hand_profiles import generated_profile
+from common.calibration.hand_presets import preset_couplings
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from common.kernels import constant
-from common.records import boxed
+from common.messages.records import boxed
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.parameters import HandParameters

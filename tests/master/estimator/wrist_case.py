@@ -7,17 +7,17 @@ from typing import Literal
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
+from common.hand.wrist_joint import STRAIGHT
 from common.messages import HandPose, WristDetections
-from common.records import boxed
-from common.wrist_joint import STRAIGHT
+from common.messages.records import boxed
 from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables
 from master.estimator.parameters import HandParameters
 from master.estimator.wrist_device import Device
 from master.estimator.wrist_model import WristModel, loosened
 from master.estimator.wrist_pipeline import WristPipeline
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.master.estimator.kernels import laser_centroid_at, look_at
 from tests.wrist_run import wrist_setup
 

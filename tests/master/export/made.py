@@ -6,12 +6,12 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration import save
-from common.geometry import matrix_to_quaternion, rigid
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rigid
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, ResultMessage, Source
-from master.export.skeleton import Skeleton
 from master.outputs.poses import Poses
+from master.recording.export.skeleton import Skeleton
 from tests.hand_helpers import any_rotation, natural_angles
 
 RIGHT = HandModel.of(generated_profile("made-right", "right"))

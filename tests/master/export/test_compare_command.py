@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.errors import CalibrationError, FitError, PhalanxError, RecordingError
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from master.mocap.joint_motion import MARKERS
 from tests.cli import invoke
 from tests.master.export.test_export_command import recording_of

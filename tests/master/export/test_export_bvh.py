@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.geometry import quaternion_to_matrix
-from common.hand_model import CHAINS, JOINTS
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import CHAINS, JOINTS
 from common.messages import HandPose
-from master.export.bvh import PER_METRE, Axes, Unit, Up, euler_zxy_deg, write_bvh
-from master.export.motion import complete, resample
-from master.export.skeleton import Skeleton
+from master.recording.export.bvh import PER_METRE, Axes, Unit, Up, euler_zxy_deg, write_bvh
+from master.recording.export.motion import complete, resample
+from master.recording.export.skeleton import Skeleton
 from tests.hand_helpers import any_rotation
 from tests.master.export.made import LEFT, NEAR_M, REST, STEP_NS, poses_of, positions, stacked
 

@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from common.messages import HandPose
-from master.export.gltf import write_gltf
-from master.export.hand_mesh import skin_of
-from master.export.motion import complete
+from master.recording.export.gltf import write_gltf
+from master.recording.export.hand_mesh import skin_of
+from master.recording.export.motion import complete
 from tests.browser import WAIT_MS, chromium
 from tests.master.export.made import NEAR_M, REST, STEP_NS, poses_of, positions, stacked
 

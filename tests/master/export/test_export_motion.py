@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.hand_model import TIPS, WRIST
-from master.export.motion import (
+from common.hand.model import TIPS, WRIST
+from master.recording.export.motion import (
     FRAMES_OF_POSE,
     FREE_FRAMES,
     Motion,
@@ -18,7 +18,7 @@ from master.export.motion import (
     slerp,
     world,
 )
-from master.export.skeleton import ORDER, PARENT
+from master.recording.export.skeleton import ORDER, PARENT
 from tests.master.export.made import BEGIN_NS, REST, STEP_NS, poses_of, positions, stacked
 
 

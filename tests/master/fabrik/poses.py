@@ -6,8 +6,8 @@ from inspect import isfunction
 
 import numpy as np
 
-from common.hand_model import FINGERS, HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import FINGERS, HandModel
+from common.hand.profiles import generated_profile
 from master.fabrik.chain import Chain, Link
 from master.fabrik.fabrik import Fabrik, solve_chain
 from master.fabrik.finger import Finger

@@ -12,15 +12,15 @@ import pytest
 import master.estimator
 import master.fabrik
 from common.calibration import PowerLawCalibration
-from common.hand_calibration import Couplings
-from common.hand_model import HandModel
-from common.message_parts import MAX_PICTURE
+from common.calibration.hand import Couplings
+from common.hand.model import HandModel
 from common.messages import HandPose, MarkerDetections, Source, decode, encode
+from common.messages.parts import MAX_PICTURE
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import PowerLaw
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
-from master.rig_pipeline import build_pipeline, line_of
-from master.stages import StageTimes
+from master.rig.pipeline import build_pipeline, line_of
+from master.run.stages import StageTimes
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.frame_recording import open_recording
-from common.hand_model import HandJoints
+from common.geometry.camera_model import CameraModel
+from common.hand.model import HandJoints
+from common.recording.frame_recording import open_recording
 from master.estimator.cameras import CameraArrays
 from master.fabrik.cap_views import TILTED, hidden_part, tilted
 from master.fabrik.caps import CapTables, cap_surface

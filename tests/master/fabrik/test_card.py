@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.geometry import axis_rotation
+from common.geometry.transforms import axis_rotation
 from common.messages import HandPose, MarkerDetections
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import OneEuro
 from master.fabrik.triangulate import DepthTriangulator
-from master.rig import load_setup
-from master.rig_pipeline import build_pipeline
-from master.rig_setup import RigSetup
-from master.stages import StageTimes
+from master.rig.files import load_setup
+from master.rig.pipeline import build_pipeline
+from master.rig.setup import RigSetup
+from master.run.stages import StageTimes
 from tests.hand_helpers import cap_views, detections, natural_angles, palm
 from tests.synthetic_run import SyntheticRun, synthetic_run
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.hand_model import FINGERS, HandModel
-from common.hand_presets import preset_couplings, preset_limits
-from common.hand_profiles import generated_profile
+from common.calibration.hand_presets import preset_couplings, preset_limits
+from common.hand.model import FINGERS, HandModel
+from common.hand.profiles import generated_profile
 from master.fabrik.chain import Chain, Coupling, Link, least_root_to_end
 from master.fabrik.fabrik import ChainResult, Fabrik, Reach
 from master.fabrik.finger import FingerSolver, finger_chain

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import axis_rotation, rigid
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, rigid
 from master.estimator.cameras import CameraArrays
 from master.fabrik.caps import CapTables
 from master.fabrik.intersection import RAYS, Triangulation, limits_of, triangulate

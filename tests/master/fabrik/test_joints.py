@@ -8,9 +8,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from common.hand_model import HandModel
-from common.hand_presets import preset_limits
-from common.hand_profiles import generated_profile
+from common.calibration.hand_presets import preset_limits
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from master.fabrik.finger import finger_chain
 from master.fabrik.joints import Angles, Hinge, Joint, Rotor
 from master.fabrik.limits import swing_and_flex

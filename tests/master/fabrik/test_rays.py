@@ -13,9 +13,9 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import Provenance
-from common.camera_model import CameraModel
-from common.geometry import rigid
-from common.hand_model import TIPS, HandJoints
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rigid
+from common.hand.model import TIPS, HandJoints
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.estimate import MarkerPositions, SolvedHand

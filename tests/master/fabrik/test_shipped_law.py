@@ -11,8 +11,8 @@ from master.fabrik.caps import CapTables
 from master.fabrik.depth import CalibrationResidual, depth_law, law_residual
 from master.fabrik.intersection import RAYS, limits_of, triangulate
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
-from master.rig import load_setup
-from master.rig_setup import RigSetup
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
 
 SHIPPED = ("desk", "desk-fabrik", "desk-back3", "desk-cube", "desk-tracker", "desk-wand")
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import axis_rotation, rigid
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, rigid
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import SolvedHand

@@ -3,8 +3,8 @@
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import matrix_to_quaternion
-from common.hand_model import HandModel
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
 from common.messages import HandPose
 from common.sim.motion import POSES, angles_of
 from tests.hand_helpers import RIGHT, palm

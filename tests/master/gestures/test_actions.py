@@ -10,11 +10,11 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
+from common.calibration.gesture_actions import DialSettings, PinchSettings, check_actions
+from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, matrix_to_quaternion, rigid
-from common.gesture_actions import DialSettings, PinchSettings, check_actions
-from common.gesture_settings import GestureSettings, default_gestures
-from common.hand_model import TIPS, HandModel
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigid
+from common.hand.model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, REST, angles_of, smooth_step

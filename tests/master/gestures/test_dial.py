@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.geometry import axis_rotation, matrix_to_quaternion, rigid, rotation_vector_to_matrix
-from common.gesture_settings import default_gestures
-from common.hand_model import TIPS, HandModel
+from common.calibration.gesture_settings import default_gestures
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigid, rotation_vector_to_matrix
+from common.hand.model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step

@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.geometry import rigid, transform
-from common.hand_model import WRIST, HandModel
+from common.geometry.transforms import rigid, transform
+from common.hand.model import WRIST, HandModel
 from common.messages import HandPose
 from master.gestures.features import KNOWN_SIGMA_M, FeatureExtractor, HandFeatures
 from master.gestures.quantities import QUANTITIES, Quantities

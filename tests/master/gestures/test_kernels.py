@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import master.gestures
-from common.capsule_gaps import TaperedCapsules, gaps_between
-from common.geometry import axis_rotation, rigid
-from common.gesture_settings import default_gestures
-from common.hand_model import CHAINS
+from common.calibration.gesture_settings import default_gestures
+from common.geometry.transforms import axis_rotation, rigid
+from common.hand.capsule_gaps import TaperedCapsules, gaps_between
+from common.hand.model import CHAINS
 from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from common.gesture_settings import default_gestures
+from common.calibration.gesture_settings import default_gestures
 from master.gestures.features import FeatureExtractor
 from master.gestures.pinch import PinchMonitor
 from master.gestures.touch import ThumbTouch, thumb_touch

@@ -3,8 +3,8 @@
 import msgspec
 import numpy as np
 
-from common.gesture_settings import default_gestures
-from common.hand_model import CHAINS
+from common.calibration.gesture_settings import default_gestures
+from common.hand.model import CHAINS
 from common.messages import Gesture
 from master.gestures.features import FeatureExtractor
 from master.gestures.point import PointMonitor

@@ -9,8 +9,8 @@ import pytest
 
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration, load
-from common.gesture_settings import GestureSettings, HoldSettings, default_gestures
-from common.hand_model import HandModel
+from common.calibration.gesture_settings import GestureSettings, HoldSettings, default_gestures
+from common.hand.model import HandModel
 from common.messages import Gesture, HandPose
 from common.sim.motion import POSES, REST, angles_of, smooth_step
 from master.gestures.features import FeatureExtractor, HandFeatures

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion
-from common.gesture_actions import TapSettings
-from common.gesture_settings import default_gestures
-from common.hand_model import CHAINS
+from common.calibration.gesture_actions import TapSettings
+from common.calibration.gesture_settings import default_gestures
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import CHAINS
 from common.messages import Gesture, HandPose
 from common.sim.motion import angles_of
 from master.gestures.features import FeatureExtractor

@@ -8,9 +8,9 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, load, save
+from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.errors import FitError, PhalanxError
-from common.gesture_settings import GestureSettings, default_gestures
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from common.messages import HandPose
 from master.gestures.command import seconds_of, with_pose
 from master.gestures.features import FeatureExtractor, HandFeatures

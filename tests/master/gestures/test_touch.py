@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.hand_model import CHAINS
+from common.hand.model import CHAINS
 from master.gestures.features import FeatureExtractor
 from master.gestures.touch import ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float, Int
-from common.geometry import matrix_to_quaternion, rotation_vector_to_matrix
-from common.hand_model import JOINTS, HandJoints, HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
+from common.hand.model import JOINTS, HandJoints, HandModel
+from common.hand.profiles import generated_profile
 from common.messages import HandPose, Source
 from master.mocap.joint_motion import JointMotion, Side
 from master.mocap.track import Track

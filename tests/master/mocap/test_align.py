@@ -5,7 +5,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import FitError
-from common.geometry import matrix_to_rotation_vector, rigid
+from common.geometry.transforms import matrix_to_rotation_vector, rigid
 from master.mocap.align import align
 from master.mocap.track import Track
 from tests.master.mocap.moved import ROTATION, SHIFT, hand_at, ns, track_of

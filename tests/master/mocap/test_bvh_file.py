@@ -8,10 +8,10 @@ import pytest
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.hand_model import JOINTS
-from master.export.bvh import Axes
+from common.hand.model import JOINTS
 from master.mocap.bvh_file import read_bvh
 from master.mocap.read import Reading, read_motion
+from master.recording.export.bvh import Axes
 from tests.master.export.made import poses_of, positions
 from tests.master.export.test_export_bvh import written
 

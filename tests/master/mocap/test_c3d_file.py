@@ -9,7 +9,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from master.mocap.read import read_motion
 from tests.master.mocap.moved import hand_at
 

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from master.mocap.align import Alignment
 from master.mocap.compare import compare, figures
 from master.mocap.joint_motion import MARKERS, JointMotion

@@ -3,7 +3,7 @@
 import pytest
 
 from common.errors import RecordingError
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from master.mocap.joint_motion import Side
 from master.mocap.joint_names import choose_names
 

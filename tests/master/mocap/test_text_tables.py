@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from master.mocap.csv_file import read_csv
 from master.mocap.read import Reading, read_motion
 from tests.master.export.made import poses_of
@@ -86,7 +86,7 @@ def test_a_plain_table_in_any_order_is_the_motion(tmp_path: Path) -> None:
 
 
 def test_our_own_tables_are_read(tmp_path: Path) -> None:
-    from master.export.run import Wanted
+    from master.recording.export.run import Wanted
 
     poses = poses_of(3, 5)
     exported(run_of(tmp_path, poses), Wanted("csv"))

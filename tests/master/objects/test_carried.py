@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.geometry import rigid, rotation_vector_to_matrix, transform
+from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
 from master.objects.carried import Carried
 
 STEP_NS = 16_666_667

@@ -8,10 +8,10 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.geometry import matrix_to_quaternion, rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.calibration.object_profile import CylinderShape, ObjectProfile
+from common.geometry.transforms import matrix_to_quaternion, rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, HandPose, ObjectPose
-from common.object_profile import CylinderShape, ObjectProfile
 from common.sim.grip import bar_in_palm, closed_round, gaps_m
 from common.sim.motion import REST, angles_of
 from master.objects.contact import ContactMonitor

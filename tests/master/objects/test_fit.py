@@ -5,8 +5,8 @@ import pytest
 
 from bench.object_views import Where, wander
 from common.arrays import Float
-from common.camera_model import CameraModel
-from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.objects.fit import PoseFit
 from master.objects.motion import Motion
 from master.objects.sums import Observations

@@ -11,9 +11,10 @@ import pytest
 from bench.object_views import HIDES, Noise, Where, detections, wander
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry import (
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import (
     axis_rotation,
     invert,
     matrix_to_rotation_vector,
@@ -22,7 +23,6 @@ from common.geometry import (
     rotation_vector_to_matrix,
 )
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
-from common.object_profile import ObjectProfile
 from master.objects.line import ObjectLine
 from master.objects.start import two_poses
 from master.objects.trajectory import HELD_S

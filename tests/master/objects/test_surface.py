@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from common.geometry import rigid, rotation_vector_to_matrix
-from common.object_profile import BoxShape, CylinderShape, Shape, SphereShape
-from common.tapered_capsules import Capsules
+from common.calibration.object_profile import BoxShape, CylinderShape, Shape, SphereShape
+from common.geometry.tapered_capsules import Capsules
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from master.objects.surface import Surface
 
 BOX = BoxShape(size_m=(0.2, 0.1, 0.04))

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from common.calibration import Provenance, RigCalibration
+from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from common.object_profile import ObjectProfile
 from master.calibrate.tracker.registration import documented, register
 from master.objects.tracker import TrackerLine, covariance_of, registered
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion

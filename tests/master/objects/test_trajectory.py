@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from common.geometry import rigid
+from common.geometry.transforms import rigid
 from master.objects.fit import Fitted
 from master.objects.motion import ORDERS, Motion
 from master.objects.trajectory import HELD_S, Trajectory

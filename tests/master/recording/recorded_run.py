@@ -6,17 +6,17 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
-from common.recording import MessageWriter
-from master.link_senders import SensorMessage
-from master.load_shedding import LoadShedding
-from master.message_queue import MessageQueue
+from common.recording.messages import MessageWriter
 from master.recording.digest import ResultDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
 from master.recording.probe import Probe, Tapped, came_ns
-from master.rig import RigFiles
+from master.rig.files import RigFiles
+from master.run.link_senders import SensorMessage
+from master.run.load_shedding import LoadShedding
+from master.run.message_queue import MessageQueue
 from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
 

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
-from common.message_parts import MAX_TIME_NS
 from common.messages import Health, MarkerDetections, Message, encode
-from common.streams import sender_of
+from common.messages.parts import MAX_TIME_NS
+from common.messages.streams import sender_of
+from common.recording.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
 from master.recording.files import carried_files
-from master.rig import RigFiles
+from master.rig.files import RigFiles
 from tests.commands import command
 from tests.common.hostile_mcap import (
     HostileMcap,

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from mcap.records import Channel
 
 from common.errors import PhalanxError
-from common.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
-from common.message_parts import MAX_TIME_NS
 from common.messages import MAX_STILL_BYTES, Backlog, MarkerDetections, Message, Still, encode
-from common.recording import MessageWriter, open_messages
-from common.streams import STREAMS, sender_of
-from master.export.run import Wanted, export
+from common.messages.parts import MAX_TIME_NS
+from common.messages.streams import STREAMS, sender_of
+from common.recording.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
+from common.recording.messages import MessageWriter, open_messages
+from master.recording.export.run import Wanted, export
 from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.player import Player

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, ResultMessage
-from common.recording import open_messages
-from common.streams import MASTER
-from master.load_shedding import MOST
+from common.messages.streams import MASTER
+from common.recording.messages import open_messages
 from master.outputs.files import load_poses
 from master.recording.clock import ReplayClock
 from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.play import PlaySettings, run_play
 from master.recording.player import Passed, Player
+from master.run.load_shedding import MOST
 from tests.master.recording.recorded_run import MOST_FRAMES, RecordedRun, overloaded_run, recorded_run
 from tests.network_helpers import until
 

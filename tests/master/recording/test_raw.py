@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.errors import RecordingError
 from common.messages import Command, Health
-from common.raw_wish import RawWish
-from common.recording import open_messages
+from common.messages.raw_wish import RawWish
+from common.recording.messages import open_messages
 from master.recording import process, raw
 from master.recording.lines import raw_lines
 from master.recording.process import RecordSettings, run_recorder
 from master.recording.raw import RawAsker
 from master.recording.recorder import Progress
-from master.rig import RigFiles
+from master.rig.files import RigFiles
 from tests.master.recording.test_recorder import FakeMaster, recording
 from tests.network_helpers import until
 

@@ -10,21 +10,21 @@ from typing import cast
 
 import pytest
 
-from common.bus import Bus, LoopbackBus
+from common.bus.bus import Bus, LoopbackBus
+from common.bus.zenoh_bus import ZenohBus
 from common.clock import now_ns
 from common.errors import BusError, CalibrationError, RecordingError
 from common.messages import Backlog, Command, Health, MarkerDetections, Message, Preview, Still
-from common.recording import MessageWriter, open_messages
-from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
-from master.load_shedding import LoadShedding
+from common.messages.streams import MASTER
+from common.recording.messages import MessageWriter, open_messages
 from master.recording import process, subscriber
 from master.recording.lines import ProgressLine, events_of, progress_text
 from master.recording.probe import LEASE_NS, Probe, Tapped, came_ns
 from master.recording.process import NAME, RecordSettings, run_recorder
 from master.recording.recorder import MessageRecorder, Progress
 from master.recording.subscriber import MasterClock
-from master.rig import RigFiles
+from master.rig.files import RigFiles
+from master.run.load_shedding import LoadShedding
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 from tests.picture_helpers import TINY
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_quaternion, rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from common.messages import HandPose
 
 FLAT = np.zeros((5, 4))

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from common.calibration.output_settings import LslOutput
 from common.clock import now_ns
 from common.errors import PhalanxError
-from common.hand_model import JOINTS
-from common.output_settings import LslOutput
-from master.send.here_only import keep_here, sockets
-from master.send.lsl import LslSink, channels, sample_of
-from master.send.lsl_library import PORTS
-from master.send.times import MasterTimes
+from common.hand.model import JOINTS
+from master.outputs.network.here_only import keep_here, sockets
+from master.outputs.network.lsl import LslSink, channels, sample_of
+from master.outputs.network.lsl_library import PORTS
+from master.outputs.network.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
 

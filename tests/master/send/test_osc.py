@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from common.calibration.output_settings import OscOutput
 from common.errors import PhalanxError
-from common.hand_model import FINGERS, JOINTS
+from common.hand.model import FINGERS, JOINTS
 from common.messages import Contact, Gesture, ObjectPose, ResultMessage
-from common.output_settings import OscOutput
-from master.send.osc import OscSink
-from master.send.osc_packets import Blank, BlankBundle, floats, ints
-from master.send.times import MasterTimes
+from master.outputs.network.osc import OscSink
+from master.outputs.network.osc_packets import Blank, BlankBundle, floats, ints
+from master.outputs.network.times import MasterTimes
 from tests.master.send.hands import hand_pose
 from tests.master.send.osc_reader import Received, packet_of
 

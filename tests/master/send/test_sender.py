@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import load, save
+from common.calibration.output_settings import OscOutput, OutputSettings, VmcOutput, default_outputs
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Health, ResultMessage
-from common.output_settings import OscOutput, OutputSettings, VmcOutput, default_outputs
-from common.streams import MASTER
+from common.messages.streams import MASTER
 from master.outputs.bus import BusSink
-from master.send import outputs as registry
-from master.send.line import DEPTH, Counters, OutputLine
-from master.send.outputs import OUTPUTS, Output
-from master.send.sender import NAME, Housekeeping, Sender, run_sender, settings_of
-from master.send.times import MasterTimes
+from master.outputs.network import outputs as registry
+from master.outputs.network.line import DEPTH, Counters, OutputLine
+from master.outputs.network.outputs import OUTPUTS, Output
+from master.outputs.network.sender import NAME, Housekeeping, Sender, run_sender, settings_of
+from master.outputs.network.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
 FILE = Path(__file__).parents[3] / "calib_json" / "outputs" / "default.json"
@@ -68,7 +68,7 @@ def sinks(monkeypatch: pytest.MonkeyPatch) -> dict[str, Kept]:
         return Output(old.takes, old.part, old.where, make)
 
     monkeypatch.setattr(registry, "OUTPUTS", {name: keeping(name) for name in ("osc", "vmc")}, raising=True)
-    monkeypatch.setattr("master.send.sender.OUTPUTS", registry.OUTPUTS)
+    monkeypatch.setattr("master.outputs.network.sender.OUTPUTS", registry.OUTPUTS)
     return made
 
 
@@ -151,7 +151,7 @@ def test_what_is_named_is_on_whatever_the_file_says(sinks: dict[str, Kept]) -> N
 def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on(
     sinks: dict[str, Kept], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("master.send.line.FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr("master.outputs.network.line.FIRST_RETRY_S", 0.01)
     one, output = sender(OSC_ON, "osc", "vmc")
     eventually(lambda: sinks.keys() == {"osc", "vmc"})
     eventually(lambda: all(one.health().metrics[f"open.{name}"] for name in sinks))

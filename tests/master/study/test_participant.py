@@ -7,7 +7,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
-from common.hand_model import FINGER_JOINTS, JOINTS, HandModel
+from common.hand.model import FINGER_JOINTS, JOINTS, HandModel
 from common.sim.motion import POSES
 from master.study.participant import Participant, participant, rotated, with_bones
 from master.study.session import orders

@@ -13,7 +13,7 @@ import pytest
 from bench import study
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError, PhalanxError, RecordingError
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.sim.motion import POSES
 from master.study.line import claim, detect
 from master.study.one import Condition, Task, run_participant

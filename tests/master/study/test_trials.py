@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
-from common.hand_model import FINGER_JOINTS
+from common.hand.model import FINGER_JOINTS
+from common.recording.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.sim.wrist.scene import WristTruth
 from master.outputs.poses import Poses
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 from master.study.session import COLUMNS, Held, write_trials
 from master.study.trials import read_trials, trials_of
 from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup

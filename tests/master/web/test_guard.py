@@ -16,11 +16,11 @@ from cryptography.hazmat.primitives import serialization
 from websockets.exceptions import InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
+from common.calibration.output_settings import LslOutput, OscOutput, OutputSettings, WebOutput
 from common.errors import PhalanxError
-from common.output_settings import LslOutput, OscOutput, OutputSettings, WebOutput
-from master.listening import is_loopback, page_certificate
-from master.send.outputs import who_reads
-from master.send.web import KEY_FILE, WebSink, address_of, request_filter_of
+from master.outputs.network.outputs import who_reads
+from master.outputs.network.web import KEY_FILE, WebSink, address_of, request_filter_of
+from master.outputs.web.listening import is_loopback, page_certificate
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0

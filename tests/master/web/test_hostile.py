@@ -10,8 +10,8 @@ import pytest
 from websockets.sync.client import connect
 
 from bench.faults_ports import assault
-from master.web import server as web_server
-from master.web.server import CLIENTS, WebServer
+from master.outputs.web import server as web_server
+from master.outputs.web.server import CLIENTS, WebServer
 
 WAIT_S = 60.0
 RATE_HZ = 50.0

@@ -15,12 +15,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
+from common.calibration.output_settings import WebOutput
 from common.errors import PhalanxError
 from common.messages import Gesture
-from common.output_settings import WebOutput
-from master.send.web import WebSink
-from master.web import static_dir, three_js_path
-from master.web.server import SEND_BUFFER_BYTES, WebServer, foreign
+from master.outputs.network.web import WebSink
+from master.outputs.web import static_dir, three_js_path
+from master.outputs.web.server import SEND_BUFFER_BYTES, WebServer, foreign
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0
@@ -220,6 +220,6 @@ def test_without_nicegui_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     def nowhere(name: str) -> None:
         return None
 
-    monkeypatch.setattr("master.web.find_spec", nowhere)
+    monkeypatch.setattr("master.outputs.web.find_spec", nowhere)
     with pytest.raises(PhalanxError, match="NiceGUI, which is not installed"):
         WebServer("127.0.0.1", 0)

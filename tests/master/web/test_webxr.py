@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.hand_model import JOINTS
+from common.hand.model import JOINTS
 from common.messages import HandPose, ObjectPose, Source
-from master.web import object_json, webxr_json
+from master.outputs.web import object_json, webxr_json
 from tests.master.send.hands import hand_pose, pose_of
 
 # WebXR Hand Input, "XRHandJoint": the order in which a hand's joints are iterated.

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from common.certificates import issue, new_authority
+from common.bus.certificates import issue, new_authority
+from common.bus.keys import new_key
 from common.clock import SystemClock
-from common.keys import new_key
 from common.machine import ROOT, Program
-from master.link import MasterLink
+from master.run.link import MasterLink
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
 from slave.doctor.clock import check_clock

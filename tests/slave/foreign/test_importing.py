@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from common.errors import PhalanxError, RecordingError
-from common.frame_pictures import FramePictures
-from common.frame_recording import FrameRecording, open_recording
+from common.recording.frame_pictures import FramePictures
+from common.recording.frame_recording import FrameRecording, open_recording
 from slave.foreign.importing import Wish, import_pictures
 from slave.foreign.times import read_times
 from tests.slave.foreign.foreign_videos import (

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.geometry import axis_rotation, matrix_to_quaternion
-from common.imu_csv import read_csv
-from common.imu_recording import read_imu
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion
+from common.imu.csv_table import read_csv
+from common.imu.recording import read_imu
 from slave.__main__ import main
 from slave.imu.importing import import_table
 

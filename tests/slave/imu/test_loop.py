@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import ImuError
-from common.imu_fusion import OrientationFilter
+from common.imu.fusion import OrientationFilter
 from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
 from slave.counters import imu_counters

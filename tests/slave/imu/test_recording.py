@@ -10,9 +10,9 @@ import pytest
 
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import ImuError, RecordingError
-from common.frame_recording import open_recording
-from common.imu_recording import IMU, read_imu
+from common.imu.recording import IMU, read_imu
 from common.messages import ImuSample
+from common.recording.frame_recording import open_recording
 from slave.__main__ import main
 from slave.imu.recording import ImuRecorder
 from tests.network_helpers import until

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from master.keys_folder import make
+from master.commands.keys_folder import make
 from slave.install import arguments, steps
 from slave.install.bundle import calibration_of, keys_of
 from slave.install.errors import InstallError

@@ -7,7 +7,7 @@ import numpy as np
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import LightsError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.clock import SystemClock
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.lights.controller import FAILED_NS, StrobeController, Strober
 from slave.lights.interlock import WINDOW_NS, Interlock
 from slave.lights.schedule import CYCLE, LEAST, StrobeSchedule

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from common.errors import LightsError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.lights.interlock import WINDOW_NS, Interlock
 from tests.slave.lights.stage import AMBIENT, LASER, LED, MS, ROOT, STROBE, NotedLights, SetClock
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.errors import CameraError
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.wrist.scene import WristScene
 from slave.__main__ import main
 from slave.cameras.synthetic import SyntheticCamera
@@ -140,7 +140,7 @@ def test_the_lights_follow_the_exposure_and_refuse_one_that_is_too_long(scene: W
 
 
 def test_recorded_frames_say_what_lit_them(tmp_path: Path) -> None:
-    from common.frame_recording import open_recording
+    from common.recording.frame_recording import open_recording
 
     command = ["record", "--name", "wrist", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]
     sensor = ["--camera", "synthetic", "--scene", "curl", "--frames", "30", "-o", str(tmp_path / "rec")]

@@ -9,11 +9,11 @@ import pytest
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration, load, save
+from common.calibration.object_profile import ObjectProfile
 from common.clock import SkewedClock, SystemClock
 from common.errors import CalibrationError, TrackerError
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import Message, TrackerPose
-from common.object_profile import ObjectProfile
 from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
 from slave.counters import pose_counters

@@ -9,7 +9,7 @@ import pytest
 
 from common.clock import SystemClock
 from common.errors import TrackerChoiceError, TrackerError
-from common.geometry import axis_rotation, rigid
+from common.geometry.transforms import axis_rotation, rigid
 from common.messages import TrackerPose
 from slave.objects import openvr_library
 from slave.objects.openvr_library import connect, load_library

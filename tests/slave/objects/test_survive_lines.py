@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import TrackerChoiceError
-from common.geometry import quaternion_to_matrix
+from common.geometry.transforms import quaternion_to_matrix
 from slave.objects.survive_lines import (
     LONGEST,
     Fault,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float, Image
-from common.srgb import to_srgb
+from common.geometry.srgb import to_srgb
 from slave.tags.corners import normal_law, refine
 
 

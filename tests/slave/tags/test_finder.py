@@ -9,9 +9,9 @@ import pytest
 from bench.tag_images import Look, tag_picture
 from bench.tags import clutter
 from common.calibration import CameraCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile, Tag, TagFamily, Tags
 from common.errors import CalibrationError
-from common.object_profile import ObjectProfile, Tag, TagFamily, Tags
+from common.geometry.camera_model import CameraModel
 from slave.tags.finder import HOLD_NS, TagFinder
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,11 +11,11 @@ import pytest
 from bench.tag_images import Look, tag_picture
 from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import ObjectProfile, Tag, Tags
 from common.errors import CalibrationError
-from common.frame_recording import FrameRow, Illumination
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, Message, TagDetections
-from common.object_profile import ObjectProfile, Tag, Tags
+from common.recording.frame_recording import FrameRow, Illumination
 from slave.counters import DetectionCounters
 from slave.markers.null_detector import NullDetector
 from slave.sender import MarkerPipeline, run
@@ -83,7 +83,8 @@ def test_without_tags_nothing_is_sent_counted_or_loaded() -> None:
     assert tags.counts() == {}
     code = (
         "import sys, slave.live, slave.offline, slave.__main__;"
-        "sys.exit(any(n in sys.modules for n in ('slave.tags.finder', 'slave.tags.reading', 'common.tag_family')))"
+        "heavy = 'slave.tags.finder', 'slave.tags.reading', 'common.geometry.tag_family';"
+        "sys.exit(any(n in sys.modules for n in heavy))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 

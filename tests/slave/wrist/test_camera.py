@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector, WristFound, prepared
 from tests.slave.wrist.wrist_frames import CAMERA, FIRST_NS, PERIOD_NS, VIEW, scene, spoiled, strobed

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from bench.fusion_scene import Both
-from common.geometry import rotation_vector_to_matrix
+from common.geometry.transforms import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit

@@ -9,9 +9,9 @@ from msgspec.structs import replace
 
 from common.arrays import Image
 from common.errors import CalibrationError
-from common.frame_recording import Illumination
-from common.geometry import axis_rotation
-from common.hand_profiles import mirrored_profile
+from common.geometry.transforms import axis_rotation
+from common.hand.profiles import mirrored_profile
+from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from slave.wrist.background import lit
 from slave.wrist.fingers import NONE, separate

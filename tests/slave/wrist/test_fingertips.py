@@ -12,9 +12,9 @@ from msgspec.structs import replace
 
 from common.arrays import Bool, Float, Image
 from common.calibration import HandProfile, load
-from common.frame_recording import Illumination, open_recording
-from common.hand_model import CHAINS
-from common.hand_profiles import generated_profile, mirrored_profile
+from common.hand.model import CHAINS
+from common.hand.profiles import generated_profile, mirrored_profile
+from common.recording.frame_recording import Illumination, open_recording
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float, Image
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit

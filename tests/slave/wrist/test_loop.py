@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.hand_model import FINGERS
+from common.hand.model import FINGERS
 from common.messages import Message, WristDetections
 from slave.__main__ import main
 from slave.counters import DetectionCounters

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from common.arrays import Float, Image
+from common.hand.wrist_joint import STRAIGHT
 from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene, WristTruth
-from common.wrist_joint import STRAIGHT
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
 from slave.wrist.background import lit

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from common.calibration import load, save
 from common.clock import SystemClock
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import Illumination, Manifest, open_recording
-from common.frame_writing import RecordingWriter, encode_png
+from common.recording.frame_recording import Illumination, Manifest, open_recording
+from common.recording.frame_writing import RecordingWriter, encode_png
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera
 from slave.sources import Frame

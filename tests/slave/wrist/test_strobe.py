@@ -9,7 +9,7 @@ import pytest
 
 from bench.wrist_strobe import RATE_HZ, Delivered, Score, Shown, deliver, recorded, rendered, score
 from common.arrays import Image
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from slave.sources import Frame
 from slave.wrist.illumination import coarse, evidence
 from slave.wrist.strobe import Strobe, StrobeCycle

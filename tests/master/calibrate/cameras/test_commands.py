@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, PowerLawCalibration, RigCalibration, load, save
-from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError, RecordingError
-from common.geometry import invert
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert
 from master.calibrate.cameras.boards import Checkerboard, grid_edges
 from master.calibrate.cameras.detect import find_board
 from master.calibrate.cameras.files import without_wrong_law, write_files

@@ -8,8 +8,8 @@ import pytest
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.frame_recording import FRAMES, MANIFEST
-from common.geometry import axis_rotation, rigid
+from common.geometry.transforms import axis_rotation, rigid
+from common.recording.frame_recording import FRAMES, MANIFEST
 from master.calibrate.cameras.coverage import advice, advice_so_far, coverage
 from master.calibrate.cameras.image_sets import MOST_VIEWS, image_sets
 from tests.master.calibrate.cameras.board_scenes import SIZE, scene

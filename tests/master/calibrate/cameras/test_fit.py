@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.errors import FitError
-from common.geometry import invert
+from common.geometry.transforms import invert
 from master.calibrate.cameras.boards import Charuco, Checkerboard, board_corners, orderings
 from master.calibrate.cameras.detect import ImageObservation
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.geometry.camera_model import CameraModel
 from common.sim.board import HELD_S, MOVED_S, BoardRenderer
 from common.sim.card import DISTANCES_M, MARKER, CardScene
 from master.calibrate.depth.fit import FITS

@@ -15,9 +15,9 @@ from common.calibration import (
     load,
     save,
 )
-from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError, PhalanxError
-from common.geometry import axis_rotation, rigid
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import axis_rotation, rigid
 from master.calibrate.depth.source import load_pair
 from master.fabrik.depth import AffineDisparity
 from tests.cli import calibrate

@@ -11,8 +11,8 @@ import pytest
 
 from common.arrays import Float
 from common.errors import CalibrationError, RecordingError
-from common.frame_recording import FrameRecording, open_recording
-from common.npz import write_npz
+from common.recording.frame_recording import FrameRecording, open_recording
+from common.recording.npz import write_npz
 from master.calibrate.depth.recording import (
     Pairs,
     by_file,

@@ -18,7 +18,7 @@ from master.calibrate.depth.session import Meter, Reading, measure, run_session
 from master.calibrate.depth.sweep import Sweep, checked
 from master.calibrate.depth.tables import read_table, write_table
 from master.fabrik.depth import AffineDisparity
-from master.ingest import Ingest
+from master.run.ingest import Ingest
 from slave.uplink import Uplink
 from tests.network_helpers import ManualClock, free_udp_port
 

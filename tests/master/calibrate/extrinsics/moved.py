@@ -8,8 +8,8 @@ from msgspec.structs import replace
 
 from bench.wrist_extrinsics import Both, both_of
 from common.calibration import RigCalibration
-from common.geometry import matrix_to_quaternion, rotation_vector_to_matrix
-from common.imu_fusion import OrientationFilter
+from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
+from common.imu.fusion import OrientationFilter
 from common.messages import HandPose, ImuSample, WristDetections
 from common.sim.imu import InertialPart, SimulatedImu
 from master.calibrate.cameras.lens_files import matrix_of

@@ -9,16 +9,16 @@ from msgspec.structs import replace as replaced
 from bench.wrist_extrinsics import errors
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
-from common.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
-from common.geometry import quaternion_to_matrix
-from common.imu_recording import write_imu
+from common.geometry.transforms import quaternion_to_matrix
+from common.imu.recording import write_imu
 from common.messages import HandPose
+from common.recording.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
 from master.calibrate.extrinsics import command, extrinsics, fit
 from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
 from master.calibrate.extrinsics.report import refuse
 from master.calibrate.extrinsics.seen import Fit
 from master.calibrate.extrinsics.unknown import UNKNOWN
-from master.rig_setup import RigSetup
+from master.rig.setup import RigSetup
 from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.test_solve_both import write_detections

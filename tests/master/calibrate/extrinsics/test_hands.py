@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix
+from common.geometry.transforms import rotation_vector_to_matrix
 from master.calibrate.extrinsics.hands import HandProblem, Hands
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters

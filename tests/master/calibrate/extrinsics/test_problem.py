@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
-from common.wrist_joint import forearm_palm
+from common.geometry.transforms import quaternion_to_matrix, rotation_vector_to_matrix
+from common.hand.wrist_joint import forearm_palm
 from master.calibrate.extrinsics.extrinsics import _cycles
 from master.calibrate.extrinsics.hands import Hands
 from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
@@ -15,7 +15,7 @@ from master.calibrate.extrinsics.problem import Problem
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, prior_sigma
 from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
 EYE = np.eye(3)

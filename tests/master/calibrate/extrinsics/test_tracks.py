@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from common.geometry import axis_rotation, matrix_to_quaternion, rotation_vector_to_matrix
+from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rotation_vector_to_matrix
 from common.messages import ImuSample
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 

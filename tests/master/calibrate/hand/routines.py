@@ -8,9 +8,9 @@ from msgspec import structs
 
 from common.arrays import Float, Int
 from common.calibration import HandProfile, MarkerMount, RestJoint
-from common.geometry import matrix_to_quaternion, rotation_vector_to_matrix
-from common.hand_model import CHAINS, JOINTS, HandModel
-from common.hand_profiles import generated_profile
+from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
+from common.hand.model import CHAINS, JOINTS, HandModel
+from common.hand.profiles import generated_profile
 from common.sim.routine import PERIOD_S, REST, HandRoutine
 
 TIPS = ("thumb", "index", "middle", "ring", "little")

@@ -8,9 +8,9 @@ import pytest
 
 from common.calibration import HandProfile, load, save
 from common.errors import CalibrationError, PhalanxError, RecordingError
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
-from common.npz import write_npz
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
+from common.recording.npz import write_npz
 from tests.cli import calibrate
 from tests.master.calibrate.hand.routines import routine
 

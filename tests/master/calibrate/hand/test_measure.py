@@ -11,9 +11,9 @@ import pytest
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile
 from common.errors import FitError
-from common.hand_model import CHAINS, FINGERS, HandModel
-from common.hand_profiles import generated_profile
-from common.hand_routine import ROUTINE_S
+from common.hand.model import CHAINS, FINGERS, HandModel
+from common.hand.profiles import generated_profile
+from common.hand.routine import ROUTINE_S
 from master.calibrate.hand.measure import HandMeasurement, measure_hand
 from master.calibrate.hand.observed import Observed
 from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines

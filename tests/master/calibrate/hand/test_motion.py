@@ -9,8 +9,8 @@ import pytest
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError, RecordingError
-from common.hand_model import CHAINS, JOINTS, HandModel, couplings_of
-from common.hand_posture import joint_angles
+from common.hand.model import CHAINS, JOINTS, HandModel, couplings_of
+from common.hand.posture import joint_angles
 from master.calibrate.hand.motion import hand_from_motion, motion_lines
 from master.calibrate.hand.motion_couplings import Ratio, motion_couplings
 from master.calibrate.hand.palm import find_palm

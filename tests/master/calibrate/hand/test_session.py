@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.errors import FitError
-from common.hand_routine import STEPS
+from common.hand.routine import STEPS
 from common.messages import HandPose, Source
 from master.calibrate.hand.session import Track, guide, unseen
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from common.hand_model import HandModel
-from common.hand_profiles import generated_profile
+from common.hand.model import HandModel
+from common.hand.profiles import generated_profile
 from master.calibrate.hand.shape import PER_FINGER, Shape, caps_of
 
 NAMES = ("thumb", "index", "middle", "ring", "little")

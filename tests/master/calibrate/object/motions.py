@@ -6,9 +6,9 @@ import numpy as np
 
 from bench.object_views import Noise, detections, wander
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.camera_model import CameraModel
+from common.calibration.object_profile import Bead, ObjectProfile
+from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from common.object_profile import Bead, ObjectProfile
 from master.calibrate.object.seen import Seen, seen_by
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"

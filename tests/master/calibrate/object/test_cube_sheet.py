@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from common.calibration import parse, save
+from common.calibration.object_profile import ObjectProfile, tag_corners
 from common.errors import CalibrationError
-from common.object_profile import ObjectProfile, tag_corners
-from common.tag_family import tag_image
+from common.geometry.tag_family import tag_image
 from master.calibrate.object.cube_sheet import TagBox, dark_squares, print_box
 
 BOX = TagBox("box", "aruco_5x5_100", 3, 0.04, 0.03)

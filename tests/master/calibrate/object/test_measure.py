@@ -7,7 +7,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
-from common.geometry import fit_rigid, rigid, rotation_vector_to_matrix, transform
+from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix, transform
 from master.calibrate.object.bundle import fit_bundle
 from master.calibrate.object.frame import frame_of, own_frame
 from master.calibrate.object.measure import Measurement, changes, measure_object

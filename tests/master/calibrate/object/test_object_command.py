@@ -11,16 +11,16 @@ from msgspec.structs import replace
 
 from bench.played import START_NS
 from common.calibration import HandProfile, RigCalibration, load, save
-from common.geometry import fit_rigid, transform
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.transforms import fit_rigid, transform
 from common.messages import HandPose
-from common.object_profile import ObjectProfile
 from common.sim.record import record_scene
 from common.sim.scenes import scene_by_name
 from master.__main__ import main
 from master.calibrate.object.session import guide, progress
 from master.objects.line import ObjectLine
-from master.recorded import recorded_detections
-from master.rig import load_setup
+from master.replay.recorded import recorded_detections
+from master.rig.files import load_setup
 from slave.offline import detect_recording, save_detections
 from tests.master.calibrate.object.motions import BEADS, CALIB, CAMERAS, RIG, seen
 
@@ -62,10 +62,9 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
     def command(*arguments: object) -> int:
         monkeypatch.setattr(sys, "argv", ["phalanx-master", "calibrate", "object", *map(str, arguments)])
         try:
-            main()
+            return main()
         except SystemExit as end:
             return int(end.code or 0)
-        return 0
 
     return command
 

@@ -9,8 +9,8 @@ import pytest
 
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, PhalanxError
-from common.frame_recording import Manifest
 from common.messages import MarkerDetections
+from common.recording.frame_recording import Manifest
 from master.calibrate.time.fit import measure_times, shifted
 from tests import timing_scenes as scenes
 from tests.cli import invoke

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import (
+from common.geometry.transforms import (
     matrix_to_quaternion,
     matrix_to_rotation_vector,
     rigid,

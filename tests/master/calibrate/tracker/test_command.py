@@ -10,12 +10,12 @@ import numpy.typing as npt
 import pytest
 from msgspec.structs import replace
 
-from common.bus import LoopbackBus
+from common.bus.bus import LoopbackBus
 from common.calibration import RigCalibration, load, save
+from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from common.npz import write_npz
-from common.object_profile import ObjectProfile
+from common.recording.npz import write_npz
 from master.__main__ import main
 from master.calibrate.tracker.coverage import coverage_of
 from master.calibrate.tracker.save import read_motion, write_motion

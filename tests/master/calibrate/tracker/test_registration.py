@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from common.errors import FitError
-from common.geometry import rigid, rotation_vector_to_matrix
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.messages import ObjectSource
 from master.calibrate.tracker.registration import register
 from master.calibrate.tracker.start import Placed, closed_form, first_lag

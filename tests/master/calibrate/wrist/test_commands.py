@@ -11,15 +11,15 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
 from common.errors import CalibrationError, FitError, PhalanxError, RecordingError
-from common.frame_recording import FRAMES, Illumination, Manifest
-from common.frame_writing import RecordingWriter
-from common.hand_model import HandModel
-from common.npz import write_npz
+from common.hand.model import HandModel
+from common.recording.frame_recording import FRAMES, Illumination, Manifest
+from common.recording.frame_writing import RecordingWriter
+from common.recording.npz import write_npz
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.palm_board import BoardOffset
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.cli import calibrate
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
+from common.calibration.flat_field import field_at, terms_of
+from common.calibration.wrist import FLAT_FIELD_TERMS
 from common.errors import FitError
-from common.flat_field import field_at, terms_of
-from common.frame_recording import Illumination
+from common.recording.frame_recording import Illumination
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer
-from common.wrist_calibration import FLAT_FIELD_TERMS
 from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.flat_field import (
     WhiteSamples,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.hand_model import HandModel
+from common.hand.model import HandModel
 from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.flexion_synergy import FlexionSynergy
 from master.estimator.laser_plane import PlaneAxes
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.wrist_run import mirrored_setup, wrist_setup
 
 

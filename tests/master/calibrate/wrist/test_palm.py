@@ -5,7 +5,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import FitError
-from common.geometry import (
+from common.geometry.transforms import (
     matrix_to_rotation_vector,
     rigid,
     transform,

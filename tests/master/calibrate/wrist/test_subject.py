@@ -12,18 +12,18 @@ from bench.wrist_subjects import CALIB, Person, knuckles
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
-from common.geometry import rotation_vector_to_matrix, transform
-from common.hand_model import CHAINS, HandModel
+from common.geometry.transforms import rotation_vector_to_matrix, transform
+from common.hand.model import CHAINS, HandModel
+from common.hand.palmar_surface import PalmarSurface
 from common.messages import WristDetections
-from common.npz import write_npz
-from common.palmar_surface import PalmarSurface
+from common.recording.npz import write_npz
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, guided
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_fit import fists_of
 from master.calibrate.wrist.subject_model import UNKNOWN, SubjectModel, Unknown, fitted_profile
-from master.wrist_setup import WristSetup
+from master.rig.wrist import WristSetup
 from tests.cli import calibrate
 
 ANGLES = np.radians(

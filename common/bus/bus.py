@@ -1,0 +1,325 @@
+"""Message bus: messages and commands over reliable links.
+
+One interface with two implementations.
+
+`LoopbackBus` joins the parts of one process, `common.bus.zenoh_bus.ZenohBus` joins processes; the
+same tests run against both. Streams with the path DATAGRAM never come here.
+
+A subscription holds at most `depth` messages and drops the oldest: who reads too slowly sees
+what is new, and how much was dropped. A message is encoded and decoded by either bus, so
+receivers never share objects and never see one that `common.messages` would refuse.
+Of what devices send, so much is accepted of each per second (`common.messages.streams`), before it is
+decoded: a sender of more
+costs nobody's time.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from common.errors import BusError, MessageError, PhalanxError
+from common.link.token_bucket import TokenBucket
+from common.messages import AnyMessage, Command, Health, Message, decode, encode
+from common.messages.streams import STREAMS, Path, key_of, sender_of
+
+Handler = Callable[[Command], Health]
+ANY = "*"
+MOST_SENDERS = 256  # whose rates are tracked separately; on an open bus names can be invented
+
+
+class Subscription(Protocol):
+    """A bounded queue of messages of one stream.
+
+    Attributes:
+        dropped: Messages that were pushed out by newer ones before they were read, or were too many of one sender.
+        refused: Payloads that were not a message of the stream, or of another than who sent them.
+    """
+
+    dropped: int
+    refused: int
+
+    def get(self, timeout_s: float) -> Message | None:
+        """Return the oldest waiting message, or None after `timeout_s` or once closed."""
+        ...
+
+    def close(self) -> None:
+        """Receive no more. Safe to call twice."""
+        ...
+
+
+class Bus(Protocol):
+    """Publish and subscribe, ask and serve, and who is alive."""
+
+    def publish(self, stream: str, name: str, message: Message) -> None:
+        """Publish `message` of `stream` under the sender's `name`.
+
+        Never waits for a receiver.
+
+        Raises:
+            ValueError: Unknown stream, a datagram stream, a message of another type.
+            BusError: The bus is closed.
+        """
+        ...
+
+    def subscribe(self, stream: str, name: str = ANY, depth: int = 16) -> Subscription:
+        """Receive `stream` of the sender `name`, by default of all.
+
+        Raises:
+            ValueError: Unknown stream, a datagram stream, `depth` below 1.
+            BusError: The bus is closed.
+        """
+        ...
+
+    def serve(self, name: str, handler: Handler) -> None:
+        """Answer every `Command` for `name` with `handler`, on a thread of the bus.
+
+        A `PhalanxError` or `ValueError` of the handler becomes the asker's `BusError`.
+        """
+        ...
+
+    def ask(self, command: Command, timeout_s: float) -> Health:
+        """Send `command` to its target and return the answer.
+
+        Raises:
+            BusError: Nobody answered in time, or the target refused; the message states which.
+        """
+        ...
+
+    def announce(self, name: str) -> None:
+        """List this process as `name` in everybody's `alive`.
+
+        The entry lasts until this bus closes or the process dies.
+        """
+        ...
+
+    def alive(self) -> frozenset[str]:
+        """Return the names announced by the reachable processes, this one included."""
+        ...
+
+    def close(self) -> None:
+        """Leave the bus. Safe to call twice."""
+        ...
+
+
+class Inbox:
+    """Bounded queue behind every subscription.
+
+    It drops the oldest message when full, and decodes on reading.
+
+    Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
+    under which name is up to the bus, so no message can be another's. Besides, how many of each name
+    may come now.
+    """
+
+    def __init__(self, stream: str, depth: int, on_close: Callable[["Inbox"], None]) -> None:
+        """Create the queue for `stream`; `on_close` is called once, by `close`.
+
+        Raises:
+            ValueError: `depth` is below 1.
+        """
+        if depth < 1:
+            raise ValueError(f"depth={depth}: must be at least 1")
+        self._kind, self._most_hz = STREAMS[stream].message, STREAMS[stream].most_hz
+        self._buckets: dict[str, TokenBucket] = {}
+        self._waiting: deque[tuple[str, bytes]] = deque(maxlen=depth)
+        self._changed = threading.Condition()
+        self._on_close: Callable[[Inbox], None] | None = on_close
+        self.dropped = 0
+        self.refused = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is received any more."""
+        return self._on_close is None
+
+    def put(self, name: str, payload: bytes) -> None:
+        """Append one encoded message that came under `name`; the oldest makes room."""
+        with self._changed:
+            if self._on_close is None:
+                return
+            if not self._within_rate(name):
+                self.dropped += 1
+                return
+            if len(self._waiting) == self._waiting.maxlen:
+                self.dropped += 1
+            self._waiting.append((name, payload))
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> Message | None:
+        """Return the oldest waiting message, or None after `timeout_s` or once closed.
+
+        None also where as many as the queue holds were no message: who sends such keeps nobody waiting.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        for _ in range(self._waiting.maxlen or 1):
+            with self._changed:
+                left_s = max(deadline_s - time.monotonic(), 0.0)
+                self._changed.wait_for(lambda: self._waiting or self._on_close is None, left_s)
+                if not self._waiting:
+                    return None
+                name, payload = self._waiting.popleft()
+            message = decoded(payload, self._kind)
+            if message is not None and sender_of(message) == name:
+                return message
+            self.refused += 1
+        return None
+
+    def _within_rate(self, name: str) -> bool:
+        """Whether one more that came under `name` is within the rate of the stream."""
+        if self._most_hz is None:
+            return True
+        if name not in self._buckets and len(self._buckets) >= MOST_SENDERS:
+            name = ""
+        bucket = self._buckets.setdefault(name, TokenBucket(self._most_hz, self._most_hz))
+        return bucket.take(time.monotonic_ns())
+
+    def close(self) -> None:
+        """Receive no more and wake a waiting reader. Safe to call twice."""
+        with self._changed:
+            on_close, self._on_close = self._on_close, None
+            self._waiting.clear()
+            self._changed.notify_all()
+        if on_close is not None:
+            on_close(self)
+
+
+def decoded(payload: bytes, kind: type[Message]) -> AnyMessage | None:
+    """Return the message of type `kind` in `payload`, or None if it is anything else."""
+    try:
+        message = decode(payload)
+    except MessageError:
+        return None
+    return message if isinstance(message, kind) else None
+
+
+def stream_key(stream: str, name: str) -> str:
+    """Return the key of `stream` for `name`.
+
+    Raises:
+        ValueError: Unknown stream, or one that travels as datagrams. The text lists the others.
+    """
+    if stream not in STREAMS or STREAMS[stream].path is not Path.ZENOH:
+        allowed = sorted(row for row, entry in STREAMS.items() if entry.path is Path.ZENOH)
+        raise ValueError(f"stream {stream!r} is not on the bus; streams on it: {', '.join(allowed)}")
+    return key_of(stream, name)
+
+
+def payload_of(stream: str, message: Message) -> bytes:
+    """Return `message` encoded.
+
+    Raises:
+        ValueError: `message` is not of the stream's type.
+    """
+    kind = STREAMS[stream].message
+    if not isinstance(message, kind):
+        raise ValueError(f"stream {stream!r} carries {kind.__name__}, not {type(message).__name__}")
+    return encode(message)
+
+
+class _Hub:
+    """Shared state of the ends of one loopback bus.
+
+    Subscriptions by key, handlers and names.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.inboxes: dict[Inbox, tuple[str, str]] = {}
+        self.handlers: dict[str, Handler] = {}
+        self.names: dict[LoopbackBus, set[str]] = {}
+
+
+class LoopbackBus:
+    """The bus inside one process, for tests and for parts that live together.
+
+    Holds one end; `join` gives another end of the same bus, which can close by itself.
+    """
+
+    def __init__(self, hub: _Hub | None = None) -> None:
+        """Open a new bus, or (by `join`) another end of an open one."""
+        self._hub = _Hub() if hub is None else hub
+        self._closed = False
+        self._inboxes: list[Inbox] = []
+        self._served: list[str] = []
+
+    def join(self) -> "LoopbackBus":
+        """Return another end of this bus."""
+        return LoopbackBus(self._hub)
+
+    def publish(self, stream: str, name: str, message: Message) -> None:
+        """Send to every matching subscription (see `Bus.publish`)."""
+        self._check_open()
+        stream_key(stream, name)
+        payload = payload_of(stream, message)
+        with self._hub.lock:
+            for inbox, (wanted_stream, wanted) in self._hub.inboxes.items():
+                if wanted_stream == stream and wanted in (ANY, name):
+                    inbox.put(name, payload)
+
+    def subscribe(self, stream: str, name: str = ANY, depth: int = 16) -> Subscription:
+        """Receive a stream (see `Bus.subscribe`)."""
+        self._check_open()
+        stream_key(stream, name)
+        inbox = Inbox(stream, depth, self._forget)
+        with self._hub.lock:
+            self._hub.inboxes[inbox] = (stream, name)
+        self._inboxes.append(inbox)
+        return inbox
+
+    def serve(self, name: str, handler: Handler) -> None:
+        """Answer commands for `name`; here the handler runs on the asker's thread."""
+        self._check_open()
+        with self._hub.lock:
+            self._hub.handlers[name] = handler
+        self._served.append(name)
+
+    def ask(self, command: Command, timeout_s: float) -> Health:
+        """Ask (see `Bus.ask`); `timeout_s` has no meaning inside one process."""
+        self._check_open()
+        with self._hub.lock:
+            handler = self._hub.handlers.get(command.target)
+            names = ", ".join(sorted(self._hub.handlers)) or "nobody"
+        if handler is None:
+            raise BusError(
+                f"no answer from {command.target!r} to {command.verb!r}: it is not on the bus ({names} is)"
+            )
+        request = decoded(encode(command), Command)
+        assert isinstance(request, Command)  # we encoded it ourselves
+        try:
+            return handler(request)
+        except (PhalanxError, ValueError) as error:
+            raise BusError(f"{command.target!r} refused {command.verb!r}: {error}") from error
+
+    def announce(self, name: str) -> None:
+        """Be listed in `alive` until this end closes."""
+        self._check_open()
+        with self._hub.lock:
+            self._hub.names.setdefault(self, set()).add(name)
+
+    def alive(self) -> frozenset[str]:
+        """Return the announced names of all open ends."""
+        with self._hub.lock:
+            return frozenset(name for names in self._hub.names.values() for name in names)
+
+    def close(self) -> None:
+        """Leave: subscriptions, handlers and names of this end go. Safe to call twice."""
+        self._closed = True
+        for inbox in list(self._inboxes):
+            inbox.close()
+        with self._hub.lock:
+            self._hub.names.pop(self, None)
+            for name in self._served:
+                self._hub.handlers.pop(name, None)
+        self._served.clear()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusError("the bus is closed")
+
+    def _forget(self, inbox: Inbox) -> None:
+        with self._hub.lock:
+            self._hub.inboxes.pop(inbox, None)
+        if inbox in self._inboxes:
+            self._inboxes.remove(inbox)

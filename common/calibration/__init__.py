@@ -1,0 +1,179 @@
+"""Typed files of calib_json: JSON enters, checked values leave, or an error.
+
+Typed files of calib_json: load, validate, save atomically.
+An unknown key is refused with file and key.
+
+A rig is a JSON file, not a class: cameras, markers, depth model and hand are data. Units stand in the key
+names where they are not SI. The JSON schema of each file is exported to docs/ from these types.
+"""
+
+import inspect
+import re
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from common.calibration.camera import CameraCalibration, HsvRange, Intrinsics, RoiMargin, check_camera
+from common.calibration.gesture_settings import GestureSettings, check_gestures
+from common.calibration.hand import (
+    Couplings,
+    Finger,
+    FingerLimits,
+    HandProfile,
+    Limits,
+    MarkerMount,
+    PalmarScale,
+    Posture,
+    Preset,
+    RestJoint,
+    check_hand,
+)
+from common.calibration.json_file import decode_json, read_bytes
+from common.calibration.object_profile import ObjectProfile, check_object
+from common.calibration.output_settings import OutputSettings, check_outputs
+from common.calibration.parts import Matrix4, Positive, Provenance, Quaternion, Vector3
+from common.calibration.replacing import replacing
+from common.calibration.rig import (
+    UNIT_WITHIN,
+    AffineDisparityCalibration,
+    FilterCalibration,
+    ImuCalibration,
+    PowerLawCalibration,
+    RigCalibration,
+    Volume,
+    check_rig,
+)
+from common.calibration.wrist import Laser
+from common.errors import CalibrationError
+
+__all__ = [
+    "UNIT_WITHIN",
+    "AffineDisparityCalibration",
+    "CameraCalibration",
+    "Couplings",
+    "FilterCalibration",
+    "Finger",
+    "FingerLimits",
+    "HandProfile",
+    "HsvRange",
+    "ImuCalibration",
+    "Intrinsics",
+    "Laser",
+    "Limits",
+    "MarkerMount",
+    "Matrix4",
+    "PalmarScale",
+    "Positive",
+    "Posture",
+    "PowerLawCalibration",
+    "Preset",
+    "Provenance",
+    "Quaternion",
+    "RestJoint",
+    "RigCalibration",
+    "RoiMargin",
+    "Vector3",
+    "Volume",
+    "check",
+    "compact_numbers",
+    "load",
+    "parse",
+    "save",
+    "schema",
+]
+
+StructT = TypeVar("StructT", bound=Struct)
+
+
+def load(path: Path, kind: type[StructT]) -> StructT:
+    """Read one calibration file.
+
+    Raises:
+        CalibrationError: Missing, too large, not JSON, a key unknown, missing, there twice or out of range, or parts
+            that contradict each other. The text names the file and the key.
+    """
+    return parse(read_bytes(path), kind, str(path))
+
+
+def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
+    """Decode JSON bytes as `kind`; `where` names the source in errors.
+
+    Raises:
+        CalibrationError: As `load`.
+    """
+    value = decode_json(raw, kind, where)
+    check(value, where)
+    return value
+
+
+def check(value: Struct, where: str) -> None:
+    """Refuse parts of one file that contradict each other.
+
+    The types alone cannot detect this.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    if isinstance(value, RigCalibration):
+        check_rig(value, where)
+    elif isinstance(value, ObjectProfile):
+        check_object(value, where)
+    elif isinstance(value, GestureSettings):
+        check_gestures(value, where)
+    elif isinstance(value, OutputSettings):
+        check_outputs(value, where)
+    elif isinstance(value, CameraCalibration):
+        check_camera(value, where)
+    elif isinstance(value, HandProfile):
+        check_hand(value, where)
+
+
+def save(path: Path, value: Struct) -> None:
+    """Write a calibration file atomically.
+
+    A reader sees the old file or the new one, never half of one.
+
+    Raises:
+        CalibrationError: The folder is missing, read-only or full, or the value would not come back
+            as it is (a NaN, a number out of range); the old file is untouched.
+    """
+    text = (
+        compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()).encode() + b"\n"
+    )
+    if parse(text, type(value), str(path)) != value:
+        raise CalibrationError(f"{path}: a NaN, or a list in place of a tuple, would not come back as it is")
+    try:
+        with replacing(path) as file:
+            file.write(text)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot write: {error.strerror}") from error
+
+
+_STRING_OR_NUMBERS = re.compile(r'"(?:[^"\\]|\\.)*"|\[[\s\d.,eE+-]+\]')
+
+
+def compact_numbers(text: str) -> str:
+    """Put arrays of plain numbers on one line; strings are unchanged.
+
+    This keeps a calibration file readable.
+    """
+
+    def compact(found: re.Match[str]) -> str:
+        part = found[0]
+        return part if part[0] == '"' else "[" + ", ".join(part[1:-1].replace(",", " ").split()) + "]"
+
+    return _STRING_OR_NUMBERS.sub(compact, text)
+
+
+def schema(kind: type[Struct]) -> bytes:
+    """Return the formatted JSON schema of one file type.
+
+    The bytes are the same on every Python version.
+    """
+    content = msgspec.json.schema(kind)
+    for part in content["$defs"].values():
+        # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.
+        part["description"] = inspect.cleandoc(part["description"])
+    return msgspec.json.format(msgspec.json.encode(content), indent=1)

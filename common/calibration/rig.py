@@ -1,0 +1,257 @@
+"""Typed files of rigs.
+
+Which cameras, where, which markers, which depth model, whose hand, and what else observes it.
+"""
+
+import math
+from itertools import combinations
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from common.arrays import Float
+from common.calibration.object_profile import check_pose
+from common.calibration.parts import (
+    Angle,
+    Frequency,
+    Length,
+    Matrix4,
+    NonNegative,
+    Part,
+    Provenance,
+    Quaternion,
+    Rate,
+    StampOffset,
+    Vector3,
+)
+from common.calibration.strobe import StrobeCalibration, check_strobe
+from common.calibration.wrist import FingerLine, FlatField, Laser, LaserPlane, check_flat_field, check_wrist
+from common.errors import CalibrationError
+from common.messages import MAX_MARKERS, Name
+
+Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
+
+# [m px] Baseline times focal length, from 0.1 mm and 10 px to 100 m and 1e7 px.
+DepthFactor = Annotated[float, Meta(ge=1e-3, le=1e9)]
+Drift = Annotated[float, Meta(ge=0.0, le=10.0)]  # [rad/s] far more than the bias of any gyroscope
+MIN_BASELINE_M = (
+    1e-3  # of two cameras: nothing can be triangulated from one place, and no two lenses fit into less
+)
+
+UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
+
+
+class PowerLawCalibration(Part, frozen=True):
+    """Depth D = k x^z with x = u_left - u_right [px] (Kalbfleisch's corrected depth)."""
+
+    k_m: DepthFactor
+    z: Annotated[float, Meta(ge=-3.0, le=-0.1)]
+
+
+class AffineDisparityCalibration(Part, frozen=True):
+    """Disparity x = a / D + x0 [px]."""
+
+    a_m_px: DepthFactor
+    x0_px: Annotated[float, Meta(ge=-32768.0, le=32768.0)]
+
+
+class FilterCalibration(Part, frozen=True):
+    """1 € filter of the hand and its markers.
+
+    Cut-off at rest, its rise per speed [Hz per m/s], and the cut-off of the speed.
+
+    `jitter_m`: what may be left of the noise of each signal at rest; noisier ones are filtered more.
+    """
+
+    min_cutoff_hz: Frequency = 10.0
+    beta: NonNegative = 3000.0
+    d_cutoff_hz: Frequency = 2.5
+    jitter_m: Length = 3e-4
+
+
+class Volume(Part, frozen=True):
+    """A box in the rig frame, sides along its axes: where the rig was tested."""
+
+    low_m: Vector3
+    high_m: Vector3
+
+
+class ImuCalibration(Part, frozen=True):
+    """IMU fixed to the palm, as far as known.
+
+    Its orientation is used where mounting and world are known.
+
+    `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
+    frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
+    the vertical, which drifts by `heading_drift_rad_s`; null: not known at all, as without a magnetometer.
+    `stamp_offset_us`: how much later its samples were taken than their stamps state.
+    """
+
+    name: Name = "imu"
+    rate_hz: Rate = 120.0
+    q_palm_imu: Quaternion | None = None
+    q_rig_world: Quaternion | None = None
+    orientation_sigma_rad: Angle = math.radians(2.0)
+    heading_sigma_rad: Angle | None = None
+    heading_drift_rad_s: Drift = 0.0
+    stamp_offset_us: StampOffset = 0.0
+
+    @property
+    def placed(self) -> bool:
+        """Return whether its orientation determines that of the palm in the rig."""
+        return self.q_palm_imu is not None and self.q_rig_world is not None
+
+
+class RigCalibration(Part, frozen=True):
+    """Contents of rigs/<name>.json.
+
+    Which cameras, where, which markers, which depth model, whose hand.
+
+    `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
+    `objects`: files of the objects that are tracked; their markers are free ones. `T_rig_tracking`: where the frame of
+    a system whose devices track themselves (Lighthouse) lies in the rig. `gestures`: file of what counts as a gesture;
+    null: as calib_json/gestures/default.json has it.
+    `solver`: whose hand is published: that of the card's line (fabrik), or that which the estimator makes from there.
+    `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
+    `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
+    `stamp_offset_us`: how much later the frames of a camera were taken than their stamps state.
+    From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
+    finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
+    -> the line along which its laser point moves. `solver_mode`: fingers from the laser alone, by joint coupling (fk),
+    from laser and fingertip, without a tip not at all (ik), or from what there is (auto). `strobe`: laser and LEDs as
+    lights, and how long they may shine.
+    """
+
+    version: Literal[1]
+    name: Name
+    kind: Literal["markers", "wrist"]
+    cameras: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=32)]
+    hand: Name
+    markers: Markers = ("thumb", "index", "middle", "ring", "little", "back")
+    free_markers: tuple[Name, ...] = ()
+    objects: tuple[Name, ...] = ()
+    other_hands: tuple[Name, ...] = ()
+    T_rig_camera: dict[Name, Matrix4] = {}
+    T_world_rig: Matrix4 | None = None
+    T_rig_tracking: Matrix4 | None = None
+    gestures: Name | None = None
+    depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
+    power_law: PowerLawCalibration | None = None
+    affine_disparity: AffineDisparityCalibration | None = None
+    solver: Literal["estimator", "fabrik"] = "estimator"
+    frame_sync: Literal["interpolate", "predict"] = "interpolate"
+    filter: FilterCalibration = FilterCalibration()
+    volume: Volume | None = None
+    stamp_offset_us: dict[Name, StampOffset] = {}
+    provenance: dict[str, Provenance] = {}
+    laser_plane: LaserPlane | None = None
+    laser: Laser | None = None
+    T_camera_palm: Matrix4 | None = None
+    led: Annotated[tuple[Vector3, ...], Meta(max_length=64)] | None = None
+    flat_field: FlatField | None = None
+    finger_lines: dict[Name, FingerLine] = {}
+    forward: Literal["table", "cubic"] = "table"
+    solver_mode: Literal["fk", "ik", "auto"] = "auto"
+    imu: ImuCalibration | None = None
+    strobe: StrobeCalibration | None = None
+
+    def camera_pose(self, camera: str) -> Float:
+        """Return `T_rig_camera` (4, 4) [m] of one camera.
+
+        The frame of a wrist rig is that of its camera.
+
+        Raises:
+            CalibrationError: The rig's places are not measured yet.
+        """
+        if self.kind == "wrist":
+            return np.eye(4)
+        if camera not in self.T_rig_camera:
+            raise CalibrationError(
+                f"rig {self.name!r}: T_rig_camera: camera {camera!r} has no place yet, which"
+                " `phalanx calibrate cameras stereo` measures"
+            )
+        return np.array(self.T_rig_camera[camera], dtype=np.float64)
+
+
+def check_rig(rig: RigCalibration, where: str) -> None:
+    """Refuse what the types alone cannot: keys that contradict each other.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    if len(set(rig.cameras)) != len(rig.cameras):
+        raise CalibrationError(f"{where}: cameras: a name stands twice")
+    if len(set(rig.markers)) != len(rig.markers):
+        raise CalibrationError(f"{where}: markers: a name stands twice")
+    for name in rig.free_markers:
+        if name not in rig.markers:
+            raise CalibrationError(f"{where}: free_markers: {name!r} is not one of markers")
+    for name in rig.stamp_offset_us:
+        if name not in rig.cameras:
+            raise CalibrationError(f"{where}: stamp_offset_us: {name!r} is not one of cameras")
+    if rig.volume is not None and any(
+        a >= b for a, b in zip(rig.volume.low_m, rig.volume.high_m, strict=True)
+    ):
+        raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
+    if rig.imu is not None:
+        _check_imu(rig.imu, rig.cameras, where)
+    check_wrist(rig.laser_plane, rig.laser, rig.finger_lines, where)
+    check_flat_field(rig.flat_field, where)
+    check_strobe(rig.strobe, None if rig.laser is None else rig.laser.fan_rad, where)
+    if rig.kind == "wrist":
+        if len(rig.cameras) != 1:
+            raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")
+        if rig.T_camera_palm is not None:
+            check_pose(np.array(rig.T_camera_palm), f"{where}: T_camera_palm")
+        for key in ("other_hands", "T_world_rig", "objects", "T_rig_tracking"):
+            if getattr(rig, key):
+                raise CalibrationError(f"{where}: {key}: of marker rigs; a wrist device is worn by one hand")
+        return
+    if len({rig.hand, *rig.other_hands}) != 1 + len(rig.other_hands):
+        raise CalibrationError(f"{where}: other_hands: a hand stands twice")
+    if len(set(rig.objects)) != len(rig.objects):
+        raise CalibrationError(f"{where}: objects: a name stands twice")
+    for key, pose in (("T_world_rig", rig.T_world_rig), ("T_rig_tracking", rig.T_rig_tracking)):
+        if pose is not None:
+            check_pose(np.array(pose), f"{where}: {key}")
+    # None at all: a rig that is still to be measured.
+    for camera in rig.cameras if rig.T_rig_camera else ():
+        if camera not in rig.T_rig_camera:
+            raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
+        check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
+    check_places(rig, where)
+    if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
+        raise CalibrationError(
+            f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing: set depth_model"
+            f" to 'stereo' until `phalanx calibrate depth --use {rig.depth_model}` has fitted it"
+        )
+
+
+def check_places(rig: RigCalibration, where: str) -> None:
+    """Refuse two cameras in one place.
+
+    Rays from one point have no intersection that determines a depth.
+
+    Raises:
+        CalibrationError: With `where` and both cameras.
+    """
+    centres = [(name, rig.camera_pose(name)[:3, 3]) for name in rig.cameras if name in rig.T_rig_camera]
+    for (one, a), (other, b) in combinations(centres, 2):
+        if (apart := math.dist(a, b)) < MIN_BASELINE_M:
+            raise CalibrationError(
+                f"{where}: T_rig_camera.{other}: {1e3 * apart:.2g} mm from camera {one!r}; two cameras are at least"
+                f" {1e3 * MIN_BASELINE_M:g} mm apart"
+            )
+
+
+def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> None:
+    if imu.name in cameras:
+        raise CalibrationError(
+            f"{where}: imu.name: {imu.name!r} is a camera; every sender has a name of its own"
+        )
+    for key, value in (("q_palm_imu", imu.q_palm_imu), ("q_rig_world", imu.q_rig_world)):
+        if value is not None and abs(math.hypot(*value) - 1.0) > UNIT_WITHIN:
+            raise CalibrationError(
+                f"{where}: imu.{key}: length {math.hypot(*value):.4g}, a rotation is a quaternion wxyz of length 1"
+            )

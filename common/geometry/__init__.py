@@ -1,0 +1,1 @@
+"""Geometry of no hand: points and rotations enter, transformed ones leave."""

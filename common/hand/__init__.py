@@ -1,0 +1,1 @@
+"""Kinematic model of the hand: file and angles enter, joints and surfaces leave."""

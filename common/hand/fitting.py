@@ -1,0 +1,241 @@
+"""Fit of a hand profile to joints recorded by another tracker (Leap, WebXR).
+
+The hand can then be tracked by this project.
+
+Two ways. A tracker that reports joint *frames* (WebXR) shows the rest pose itself in one flat hand. One that reports
+joint *places* shows it in a motion: bones are the mean distances, the palm the median places of the roots, and the
+hinges follow from the planes in which fingers bend. With n the normal of that plane, from a finger's bones,
+
+    finger   n = R_y(abduction) n_rest: its height in the palm is the same in every frame and gives the hinge's roll
+    thumb    n = R_rest R_y(abduction) x: all n lie in one plane, whose normal is the abduction's axis
+
+A finger's rest heading is the median of where its first bone points in the palm's plane, less what the roll of its
+hinge turns it by at its flexion: so abduction is zero in the middle of the motion. At rest all bones of a finger are in
+one line. What is left is how far our joints (`docs/frames.md`) differ from the recorded ones:
+abduction turns about the palm's y for every finger, and other hands lean that axis by 10 to 20 degrees.
+"""
+
+import logging
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float, Int
+from common.calibration import Couplings, HandProfile, Limits, MarkerMount, Quaternion, RestJoint, Vector3
+from common.calibration.hand_presets import preset_limits
+from common.errors import CalibrationError
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import CHAINS, METACARPALS, PALM_FRAME, TIPS, WEBXR_JOINTS, HandModel
+from common.hand.posture import fit_posture, joint_angles, reached_limits
+from common.hand.profiles import THUMB_DORSAL, joint_frame
+
+_LOG = logging.getLogger(__name__)
+
+_BENT = np.radians(5.0)  # a finger that never bends further has no plane
+_EXTENDED = 0.1  # share of the frames that counts as most extended, of a thumb
+_LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not observable
+_LEAST_SPREAD = np.radians(2.0)  # of a DIP about its share of the PIP: no hand is a gear
+_FOLLOWED_M = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
+_ASIDE_DEG = 15.0  # of a rest heading, from the median of the motion
+_BASE = 0.3  # metacarpal joints lie about there on the way from the wrist to the knuckles
+_BACK_M = 0.012  # the skin of the back above the bones
+_MARKERS = ("thumb", "index", "middle", "ring", "little")
+
+
+def profile_from_rest(
+    name: str,
+    side: str,
+    position_m: Float,
+    rotation: Float,
+    limits: Limits | None = None,
+    couplings: Couplings | None = None,
+) -> HandProfile:
+    """The profile of a hand whose flat pose is known with all joint frames.
+
+    Args:
+        name: Of the profile.
+        side: "left" or "right".
+        position_m: (25, 3) [m] WebXR joints, in the frame of the wrist joint (OpenXR: -z to the fingers, +y dorsal).
+        rotation: (25, 3, 3) their frames in that one.
+        limits: Of the angles; None: the default.
+        couplings: None: the default.
+
+    Raises:
+        CalibrationError: The side is neither.
+    """
+    if side not in ("left", "right"):
+        raise CalibrationError(f"hand {name!r}: side {side!r}: left or right")
+    to_palm = np.diag([-1.0, 1.0, -1.0])  # our palm frame has its z to the fingers
+    place, rotated = position_m @ to_palm, to_palm @ rotation
+    joints: dict[str, RestJoint] = {}
+    for k, joint in enumerate(WEBXR_JOINTS):
+        joints[joint] = RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(rotated[k]))
+    knuckle, base = place[CHAINS[2, 0] - 1], place[METACARPALS[1] - 1]
+    back = 0.5 * (knuckle + base) + [0.0, _BACK_M, 0.0]
+    ends: list[int] = TIPS.tolist()
+    tips: dict[str, MarkerMount] = {}
+    for marker, tip in zip(_MARKERS, ends, strict=True):
+        tips[marker] = MarkerMount(joint=WEBXR_JOINTS[tip - 1], offset_m=(0.0, 0.0, 0.0))
+    return HandProfile(
+        version=1,
+        name=name,
+        side="right" if side == "right" else "left",
+        rest_joints=joints,
+        markers={**tips, "back": MarkerMount(joint=PALM_FRAME, offset_m=_vector(back))},
+        limits_rad=limits,
+        couplings=couplings,
+    )
+
+
+def profile_from_joints(
+    name: str,
+    side: str,
+    fingers_m: Float,
+    limits: Limits | None = None,
+    couplings: Couplings | None = None,
+) -> HandProfile:
+    """The profile of a hand whose joints were recorded in motion.
+
+    Args:
+        name: Of the profile.
+        side: "left" or "right".
+        fingers_m: (T, 5, 4, 3) [m] joints of the fingers' chains (`CHAINS`) in the palm frame, origin at the wrist.
+        limits: Of the angles; None: those of preset K, moved out to where the motion went.
+        couplings: None: couplings and posture prior are fitted to the motion.
+
+    Raises:
+        CalibrationError: The side is neither, or a finger never bends by 5 degrees: its hinge is not known.
+    """
+    roots = np.median(fingers_m[:, :, 0], axis=0)
+    steps = np.diff(fingers_m, axis=2)
+    lengths = np.linalg.norm(steps, axis=3)
+    bones = steps / lengths[..., None]
+    normals = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=2)  # (T, 5, 3), as long as it is bent
+    position, rotation = np.zeros((26, 3)), np.tile(np.eye(3), (26, 1, 1))
+    rotation[:] = joint_frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    for f, chain in enumerate(CHAINS):
+        if np.linalg.norm(normals[:, f], axis=1).max() < 2.0 * np.sin(_BENT):
+            raise CalibrationError(
+                f"hand {name!r}: the {_MARKERS[f]} never bends by 5 degrees, so its hinge is not known: record a fist"
+            )
+        rest = (
+            _finger_rest(bones[:, f], normals[:, f])
+            if f
+            else _thumb_rest(bones[:, 0], normals[:, 0], side == "right")
+        )
+        ends = np.concatenate([[0.0], np.cumsum(lengths[:, f].mean(axis=0))])
+        position[chain] = roots[f] - ends[:, None] * rest[:, 2]
+        rotation[chain] = rest
+    for base, knuckle in zip(METACARPALS, CHAINS[1:, 0], strict=True):
+        position[base] = _BASE * position[knuckle]
+        rotation[base] = joint_frame(position[knuckle], np.array([0.0, 1.0, 0.0]))
+    from_palm = np.diag([-1.0, 1.0, -1.0])
+    profile = profile_from_rest(
+        name, side, position[1:] @ from_palm, from_palm @ rotation[1:], limits, couplings
+    )
+    model = HandModel.of(profile)
+    angles = joint_angles(model, fingers_m)
+    _warn(model, fingers_m, angles)
+    if limits is None:
+        profile = replace(profile, limits_rad=reached_limits(preset_limits("K"), angles))
+    return profile if couplings is not None else _with_posture(profile, angles)
+
+
+def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
+    """Warn about fingers that the profile does not follow.
+
+    Also about those whose rest heading is not that of the motion.
+    """
+    off = np.linalg.norm(model.chains(angles).position_m - fingers_m, axis=3).mean(axis=(0, 2))
+    steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
+    flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)
+    azimuth = np.where(flat, np.arctan2(steps[..., 0], steps[..., 2]), np.nan)
+    rest = -model.rest_rotation[CHAINS[1:, 0], :, 2]
+    opened = flat.any(axis=0)
+    aside = np.zeros(4)
+    aside[opened] = np.nanmedian(azimuth[:, opened], axis=0) - np.arctan2(rest[:, 0], rest[:, 2])[opened]
+    aside = np.degrees((aside + np.pi) % (2.0 * np.pi) - np.pi)
+    for f, finger in enumerate(_MARKERS):
+        if off[f] > _FOLLOWED_M:
+            _LOG.warning(
+                "hand %r: the %s of the profile is %.0f mm off the recorded joints: its hinges differ from ours",
+                model.profile.name,
+                finger,
+                1e3 * off[f],
+            )
+        if f and abs(aside[f - 1]) > _ASIDE_DEG:
+            _LOG.warning(
+                "hand %r: the rest heading of the %s is %.0f degrees off the median of the motion: record it open, too",
+                model.profile.name,
+                finger,
+                aside[f - 1],
+            )
+
+
+def _with_posture(profile: HandProfile, angles: Float) -> HandProfile:
+    """The profile with couplings and posture prior fitted to angles (T, 5, 4) [rad]."""
+    flexion, pip, dip = angles[:, 1:, 1].ravel(), angles[:, 1:, 2].ravel(), angles[:, 1:, 3].ravel()
+    power = float(pip @ pip)
+    ratio = max(float(pip @ dip) / power, 0.0)
+    spread = max(float((dip - ratio * pip).std()), _LEAST_SPREAD)
+    couplings = Couplings(
+        dip_per_pip=round(ratio, 4),
+        dip_spread_rad=round(spread, 4),
+        mcp_per_pip=round(max(float(pip @ flexion) / power, 0.0), 4),
+    )
+    return replace(profile, couplings=couplings, posture=fit_posture(angles))
+
+
+def _finger_rest(bones: Float, normals: Float) -> Float:
+    """Return the rest frame (3, 3) of a finger in the palm frame.
+
+    From its unit bones (T, 3, 3) and flexion normals (T, 3).
+    """
+    height = normals[:, 1].sum() / np.linalg.norm(normals, axis=1).sum()
+    level = np.sqrt(1.0 - height * height)  # cosine of the roll of the hinge, `height` its sine
+    # The proximal bone at flexion a: -level sin a above the palm, and ahead and aside of the rest heading in it.
+    sine = np.clip(-bones[:, 0, 1] / level, -1.0, 1.0)
+    ahead = np.sqrt(1.0 - sine * sine)
+    rotated = np.arctan2(bones[:, 0, 0], bones[:, 0, 2]) - np.arctan2(height * sine, ahead)
+    shows = ahead > _LEVEL
+    if not shows.any():  # a finger that is never opened: across the hinge
+        shows = np.linalg.norm(normals, axis=1) > 2.0 * np.sin(_BENT)
+        rotated = np.arctan2(-normals[:, 2], normals[:, 0])
+    rotated = rotated[shows]
+    middle = np.arctan2(np.sin(rotated).mean(), np.cos(rotated).mean())
+    middle += np.median((rotated - middle + np.pi) % (2.0 * np.pi) - np.pi)
+    heading = np.array([np.sin(middle), 0.0, np.cos(middle)])
+    across = np.cross([0.0, 1.0, 0.0], heading)
+    hinge = -(level * across + height * np.array([0.0, 1.0, 0.0]))
+    return np.stack([hinge, np.cross(-heading, hinge), -heading], axis=1)
+
+
+def _thumb_rest(bones: Float, normals: Float, right: bool) -> Float:
+    """Rest frame (3, 3) of the thumb's CMC; its y is what abduction turns about."""
+    _, spread, axes = np.linalg.svd(normals)
+    heading = bones[_extended(bones), 0].mean(axis=0)
+    # Without a motion of the CMC, any axis across the one hinge would do: that across the rest direction.
+    dorsal = axes[2] if spread[1] > 5.0 * spread[2] else np.cross(axes[0], heading)
+    dorsal = dorsal * np.sign(dorsal @ (np.array(THUMB_DORSAL) * [1.0 if right else -1.0, 1.0, 1.0]))
+    dorsal /= np.linalg.norm(dorsal)
+    return joint_frame(heading - (heading @ dorsal) * dorsal, dorsal)
+
+
+def _extended(bones: Float) -> Int:
+    """Return the tenth of the frames in which a finger (T, 3, 3) is most extended.
+
+    That is, straightest and nearest the palm's plane.
+    """
+    straight = (bones[:, 0] * bones[:, 1]).sum(axis=1)
+    level = 1.0 - np.abs(bones[:, 0, 1])
+    return np.argsort(-(straight + level))[: max(1, round(_EXTENDED * len(bones)))]
+
+
+def _vector(value: Float) -> Vector3:
+    x, y, z = (float(number) for number in value)
+    return x, y, z
+
+
+def _quaternion(rotation: Float) -> Quaternion:
+    w, x, y, z = (float(number) for number in matrix_to_quaternion(rotation))
+    return w, x, y, z

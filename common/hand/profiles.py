@@ -1,0 +1,190 @@
+"""Hand profiles generated from one number, the length of the hand.
+
+A quick start before a hand is measured.
+
+Bone lengths are the shares of hand length published by Buchholz, Armstrong & Goldstein (1992); the layout of
+the palm is a plain fan. Left profiles are the exact mirror image of right ones.
+"""
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import HandProfile, MarkerMount, RestJoint, Vector3
+from common.geometry.transforms import matrix_to_quaternion
+
+# Share of hand length. Fingers: MCP place (x, y, z), heading in the palm plane [deg, positive to the thumb],
+# then proximal, middle and distal bone; the tip joint lies one tip radius before the end of the finger.
+_FINGER_LAYOUT = {
+    "index": ((0.120, -0.030, 0.470), 1.0, (0.245, 0.143, 0.060)),
+    "middle": ((0.005, -0.010, 0.480), -1.0, (0.266, 0.170, 0.070)),
+    "ring": ((-0.095, -0.030, 0.445), -5.0, (0.244, 0.165, 0.068)),
+    "pinky": ((-0.185, -0.065, 0.390), -10.0, (0.204, 0.117, 0.055)),
+}
+_METACARPAL_BASE = {
+    "index": (0.055, -0.035, 0.155),
+    "middle": (0.015, -0.030, 0.155),
+    "ring": (-0.040, -0.030, 0.145),
+    "pinky": (-0.115, -0.045, 0.175),
+}
+_THUMB_BASE = (0.145, -0.100, 0.190)
+_THUMB_HEADING = (0.55, -0.42, 0.72)
+THUMB_DORSAL = (0.62, 0.62, -0.10)  # right hand, palm frame: the way the back of a resting thumb faces
+_THUMB_BONES = (0.180, 0.165, 0.075)
+_TIP_RADIUS = {"thumb": 0.044, "index": 0.038, "middle": 0.038, "ring": 0.036, "pinky": 0.033}
+_CAP_AHEAD = 0.15  # cap centroid ahead of the tip joint, share of the tip radius
+_BACK_MARKER = (0.000, 0.068, 0.290)
+_MARKER_JOINT = {
+    "thumb": "thumb-tip",
+    "index": "index-finger-tip",
+    "middle": "middle-finger-tip",
+    "ring": "ring-finger-tip",
+    "little": "pinky-finger-tip",
+}
+
+
+def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> HandProfile:
+    """Return a right or left profile scaled from the length of the hand.
+
+    The length is from wrist crease to middle finger end [m].
+
+    Raises:
+        ValueError: The side is neither "left" nor "right", or the length is no hand's (0.1 to 0.25 m).
+    """
+    if side not in ("left", "right"):
+        raise ValueError(f"side {side!r}: left or right")
+    if not 0.1 <= hand_length_m <= 0.25:
+        raise ValueError(f"hand length {hand_length_m} m: expected 0.1 to 0.25 m")
+    joints: dict[str, tuple[Float, Float]] = {
+        "wrist": (np.zeros(3), joint_frame(np.array([0, 0, 1.0]), np.array([0, 1.0, 0])))
+    }
+    joints |= _thumb() | _fingers()
+    mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
+
+    def rest(position: Float, rotation: Float) -> RestJoint:
+        # Mirroring in x turns a rotation R into M R M, and the joint's own x axis back with the second M.
+        rotated = np.diag(mirror) @ rotation @ np.diag(mirror)
+        w, i, j, k = (float(value) for value in np.round(matrix_to_quaternion(rotated), 8))
+        return RestJoint(position_m=_vector(position * mirror * hand_length_m), orientation_wxyz=(w, i, j, k))
+
+    radius = {joint: round(share * hand_length_m, 6) for joint, share in _radii().items()}
+    back = _vector(np.array(_BACK_MARKER) * mirror * hand_length_m)
+    markers = {
+        marker: MarkerMount(
+            joint=joint,
+            offset_m=(0.0, 0.0, -round(_CAP_AHEAD * radius[joint], 7)),
+            # Half a sphere and the cylinder that puts the centroid there, see `master.fabrik.caps`.
+            painted_m=round((2.0 - 2.0 * _CAP_AHEAD) * radius[joint], 7),
+        )
+        for marker, joint in _MARKER_JOINT.items()
+    }
+    markers["back"] = MarkerMount(joint="palm_frame", offset_m=back)
+    return HandProfile(
+        version=1,
+        name=name,
+        side="right" if side == "right" else "left",
+        rest_joints={joint: rest(*pose) for joint, pose in joints.items()},
+        markers=markers,
+        radius_m=radius,
+    )
+
+
+def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
+    """Return the hand profile scaled by `factor`.
+
+    Positions, offsets, radii and painted lengths are multiplied by `factor`.
+    """
+
+    def scaled(vector: Vector3) -> Vector3:
+        return _vector(factor * np.array(vector))
+
+    return replace(
+        profile,
+        rest_joints={
+            name: replace(joint, position_m=scaled(joint.position_m))
+            for name, joint in profile.rest_joints.items()
+        },
+        markers={
+            name: replace(mount, offset_m=scaled(mount.offset_m), painted_m=factor * mount.painted_m)
+            for name, mount in profile.markers.items()
+        },
+        radius_m=None
+        if profile.radius_m is None
+        else {name: factor * radius for name, radius in profile.radius_m.items()},
+    )
+
+
+def mirrored_profile(profile: HandProfile) -> HandProfile:
+    """Return the other hand of the same person, under the same name.
+
+    Mirrored in the palm's x.
+    """
+
+    def mirrored(vector: Vector3) -> Vector3:
+        x, y, z = vector
+        return -x + 0.0, y, z
+
+    def rotated(joint: RestJoint) -> RestJoint:
+        # M R M of a rotation keeps w and x of its quaternion and flips y and z.
+        w, x, y, z = joint.orientation_wxyz
+        return RestJoint(position_m=mirrored(joint.position_m), orientation_wxyz=(w, x, -y, -z))
+
+    return replace(
+        profile,
+        side="left" if profile.side == "right" else "right",
+        rest_joints={name: rotated(joint) for name, joint in profile.rest_joints.items()},
+        markers={
+            name: replace(mount, offset_m=mirrored(mount.offset_m)) for name, mount in profile.markers.items()
+        },
+    )
+
+
+def _vector(value: Float) -> Vector3:
+    x, y, z = (round(float(number), 7) + 0.0 for number in value)
+    return x, y, z
+
+
+def joint_frame(heading: Float, dorsal: Float) -> Float:
+    """Return the joint frame (3, 3) in the frame of its arguments.
+
+    -z is along heading (3,), +y as near to dorsal (3,) as possible.
+    """
+    z = -heading / np.linalg.norm(heading)
+    y = dorsal - (dorsal @ z) * z
+    y = y / np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def _thumb() -> dict[str, tuple[Float, Float]]:
+    heading = np.array(_THUMB_HEADING) / np.linalg.norm(_THUMB_HEADING)
+    frame = joint_frame(heading, np.array(THUMB_DORSAL))
+    ends = np.array(_THUMB_BASE) + np.cumsum([0.0, *_THUMB_BONES])[:, None] * heading
+    names = ("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal", "thumb-tip")
+    return {name: (end, frame) for name, end in zip(names, ends, strict=True)}
+
+
+def _fingers() -> dict[str, tuple[Float, Float]]:
+    joints: dict[str, tuple[Float, Float]] = {}
+    for finger, (mcp, degrees, bones) in _FINGER_LAYOUT.items():
+        a = np.radians(degrees)
+        heading = np.array([np.sin(a), 0.0, np.cos(a)])
+        frame = joint_frame(heading, np.array([0.0, 1.0, 0.0]))
+        base, knuckle = np.array(_METACARPAL_BASE[finger]), np.array(mcp)
+        joints[f"{finger}-finger-metacarpal"] = (base, joint_frame(knuckle - base, np.array([0.0, 1.0, 0.0])))
+        ends = knuckle + np.cumsum([0.0, *bones])[:, None] * heading
+        for part, end in zip(
+            ("phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"), ends, strict=True
+        ):
+            joints[f"{finger}-finger-{part}"] = (end, frame)
+    return joints
+
+
+def _radii() -> dict[str, float]:
+    radius = {"palm": 0.075, "wrist": 0.13}
+    for finger, tip in _TIP_RADIUS.items():
+        stem = "thumb" if finger == "thumb" else f"{finger}-finger"
+        radius |= {f"{stem}-metacarpal": 2.0 * tip, f"{stem}-phalanx-proximal": 1.3 * tip}
+        if finger != "thumb":
+            radius[f"{stem}-phalanx-intermediate"] = 1.2 * tip
+        radius |= {f"{stem}-phalanx-distal": 1.1 * tip, f"{stem}-tip": tip}
+    return radius

@@ -1,0 +1,1 @@
+"""Inertial data: rates and forces enter, orientations with covariance leave."""

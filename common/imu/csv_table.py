@@ -1,0 +1,274 @@
+"""Third-party IMU recording: a CSV with a header.
+
+Read by the names of its columns.
+
+Columns in any order between commas, semicolons or tabs, others beside them (`imu_csv_columns`); comments before the
+header are skipped, a header of two lines (group, then axis) is joined, and between semicolons a decimal comma is one. A
+unit that the header lacks can be given. Where it is not, that of time is the one by which the recording has
+4 to 4000 samples a second, of forces the one that gives gravity, rates are in rad/s: `Table.units` states all
+of it. A value that is empty or NaN was not measured.
+"""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from math import nan
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import RecordingError
+from common.imu.csv_columns import ACCEL, AXES, GYRO, MAG, QUATERNION, TIME, UNITS, Columns, find_columns
+from common.recording.recorded_files import read_table
+
+_PREAMBLE = 30  # lines in which the header must stand
+_RATES_HZ = (4.0, 4000.0)  # a factor of a thousand: one unit of time fits, no other
+_GRAVITY_M_S2 = (6.0, 15.0)  # median size of the force
+_RATE_RAD_S = 70.0  # 4000 deg/s, beyond any gyroscope: then it is in degrees
+_MOST_NS = 10**18  # what imu.csv can hold
+_UNIT_WITHIN = 0.05
+_EMPTY = frozenset({"", "nan", "na", "null", "none"})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """A recording of T samples by time.
+
+    Attributes:
+        t_ns: (T,), each after the last.
+        gyro_rad_s, accel_m_s2, mag_ut: (T, 3) in the sensor's axes; NaN: not measured.
+        truth_wxyz: (T, 4) of the quaternion in it, whose z axis is up; NaN: none.
+        columns: Quantity -> names of its columns.
+        units: Quantity -> the unit, and where it is from.
+        late: Rows that were rejected because they are not after the one before.
+        incomplete: Rows with a value that was not measured, of rate or force.
+    """
+
+    t_ns: Int
+    gyro_rad_s: Float
+    accel_m_s2: Float
+    mag_ut: Float
+    truth_wxyz: Float
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+    late: int
+    incomplete: int
+
+
+def read_csv(path: Path, units: Mapping[str, str] | None = None, rate_hz: float | None = None) -> Table:
+    """Read a recording.
+
+    Args:
+        path: The file.
+        units: Quantity (`time`, `gyro`, `accel`, `mag`) -> its unit, where the header does not state it.
+        rate_hz: Samples per second of a table without a column of time.
+
+    Raises:
+        RecordingError: It cannot be read; the text names file, line, and the column that is missing.
+    """
+    try:
+        text = read_table(path.parent, path.name)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: there is no such file") from error
+    try:
+        return _read(text.removeprefix("\ufeff").splitlines(), units or {}, rate_hz)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    except csv.Error as error:
+        raise RecordingError(f"{path}: not a table of text: {error}") from error
+
+
+def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None) -> Table:
+    first, delimiter, columns = _header(lines, timed=rate_hz is None)
+    times, values, late = _rows(lines, first, delimiter, columns)
+    if len(values) < 2:
+        raise RecordingError(f"{len(values)} rows below the header of line {first}: at least 2 are needed")
+    scaled, units = _scaled(values, columns, given)
+    if rate_hz is None:
+        unit, units[TIME] = _time_unit(times, columns[TIME, ""].unit, given.get(TIME))
+        ns = [int((one * unit).to_integral_value()) for one in times]
+    else:
+        ns, units[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
+    if max(abs(ns[0]), abs(ns[-1])) >= _MOST_NS:
+        raise RecordingError(f"time: {times[-1]} {units[TIME]} is beyond any clock: say --time-unit")
+    measured = np.isfinite(np.column_stack((scaled[GYRO], scaled[ACCEL]))).all(axis=1)
+    names = {
+        what: ", ".join(columns[what, axis].name for axis in axes)
+        for what, axes in AXES.items()
+        if all((what, axis) in columns for axis in axes)
+    }
+    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < _UNIT_WITHIN)] = (
+        nan  # no rotation
+    )
+    t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
+    return Table(
+        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[QUATERNION], names, units, late, incomplete
+    )  # fmt: skip
+
+
+def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
+    """How many lines stand before the rows, the delimiter and the columns."""
+    best: tuple[int, list[str], dict[tuple[str, str], object]] | None = None
+    for k, line in enumerate(lines[:_PREAMBLE]):
+        delimiter = max(",;\t", key=line.count)
+        if not line.count(delimiter):
+            continue
+        names = next(csv.reader([line], delimiter=delimiter))
+        options = [(k + 1, names)]
+        if k + 1 < len(lines):
+            below = next(csv.reader([lines[k + 1]], delimiter=delimiter))
+            options.append((k + 2, _joined(names, below)))
+        for first, header in options:
+            columns = find_columns(header)
+            missing = _missing(columns, timed=timed)
+            if not missing:
+                return first, delimiter, columns
+            if best is None or len(columns) > len(best[2]):
+                best = first, header, dict(columns)
+    if best is None:
+        raise RecordingError(
+            f"line 1: no header: none of the first {_PREAMBLE} lines has a comma, semicolon or tab"
+        )
+    first, header, found = best
+    missing = ", ".join(_missing(found, timed=timed))
+    raise RecordingError(
+        f"line {first}: no column for {missing}; the header has {', '.join(header)}. Names like t_s, gyro_x_dps, "
+        "acc_x_g, gx, ax are understood; a table without time needs --rate-hz"
+    )
+
+
+def _joined(groups: Sequence[str], names: Sequence[str]) -> list[str]:
+    """A header of two lines as one: the upper line's name holds until the next."""
+    out: list[str] = []
+    group = ""
+    for k, name in enumerate(names):
+        group = (groups[k].strip() if k < len(groups) else "") or group
+        out.append(f"{name} {group}".strip())
+    return out
+
+
+def _missing(columns: Mapping[tuple[str, str], object], *, timed: bool) -> list[str]:
+    needed = [(what, axis) for what in ((TIME,) if timed else ()) + (GYRO, ACCEL) for axis in AXES[what]]
+    return [f"{what} {axis}".strip() for what, axis in needed if (what, axis) not in columns]
+
+
+def _rows(
+    lines: Sequence[str], first: int, delimiter: str, columns: Columns
+) -> tuple[list[Decimal], Float, int]:
+    """Return the times as written, values (T, columns) and the number of late rows.
+
+    The values are in the order of `columns`.
+    """
+    times: list[Decimal] = []
+    values: list[list[float]] = []
+    late, last = 0, len(lines)
+    time = columns.get((TIME, ""))
+    width = 1 + max(column.index for column in columns.values())
+    for number, cells in enumerate(csv.reader(lines[first:], delimiter=delimiter), first + 1):
+        if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#"):
+            continue
+        if len(cells) < width:
+            if number == last:  # cut by whatever ended the recording
+                break
+            raise RecordingError(f"line {number}: {len(cells)} columns, the header has at least {width}")
+        row = [
+            float(_number(number, column.name, cells[column.index], delimiter)) for column in columns.values()
+        ]
+        if time is not None:
+            t = _number(number, time.name, cells[time.index], delimiter)
+            if not t.is_finite() or (times and t <= times[-1]):
+                late += 1
+                continue
+            times.append(t)
+        values.append(row)
+    return times, np.array(values).reshape(-1, len(columns)), late
+
+
+def _number(line: int, name: str, text: str, delimiter: str) -> Decimal:
+    text = text.strip()
+    if text.lower() in _EMPTY:
+        return Decimal("nan")
+    try:
+        return Decimal(text.replace(",", ".") if delimiter != "," else text)
+    except InvalidOperation as error:
+        raise RecordingError(f"line {line}: column {name!r}: {text!r} is not a number") from error
+
+
+def _scaled(
+    values: Float, columns: Columns, given: Mapping[str, str]
+) -> tuple[dict[str, Float], dict[str, str]]:
+    """Return the quantities (T, axes) in SI units (field: uT), and their units.
+
+    Both by quantity; each unit comes with its source.
+    """
+    places = {key: k for k, key in enumerate(columns)}
+    scaled: dict[str, Float] = {}
+    units: dict[str, str] = {}
+    for what in (GYRO, ACCEL, MAG, QUATERNION):
+        keys = [(what, axis) for axis in AXES[what]]
+        if not all(key in places for key in keys):
+            scaled[what] = np.full((len(values), len(keys)), nan)
+            continue
+        raw = values[:, [places[key] for key in keys]]
+        named = {columns[key].unit for key in keys} - {""}
+        if len(named) > 1:
+            raise RecordingError(f"{what}: its columns say {' and '.join(sorted(named))}: they need one unit")
+        unit, who = next(
+            (
+                (one, who)
+                for one, who in ((next(iter(named), ""), "header"), (given.get(what, ""), "given"))
+                if one
+            ),
+            ("", ""),
+        )
+        if not unit and what != QUATERNION:
+            unit, who = _likely(what, raw), "not stated"
+        scaled[what] = raw * UNITS[what].get(unit, 1.0)
+        if unit:
+            units[what] = f"{unit} ({who})"
+    _refuse_impossible(scaled, units)
+    return scaled, units
+
+
+def _likely(what: str, raw: Float) -> str:
+    """Return the likely unit of a quantity where none is stated."""
+    if what != ACCEL:
+        return next(iter(UNITS[what]))
+    size = _size(raw)
+    low, high = _GRAVITY_M_S2
+    return next((unit for unit, scale in UNITS[ACCEL].items() if low < size * scale < high), "m/s^2")
+
+
+def _refuse_impossible(scaled: Mapping[str, Float], units: Mapping[str, str]) -> None:
+    force, fastest = _size(scaled[ACCEL]), float(np.nanmax(np.abs(scaled[GYRO]), initial=0.0))
+    low, high = _GRAVITY_M_S2
+    if not low < force < high:
+        raise RecordingError(
+            f"accel: the median force is {force:.3g} m/s^2 in {units[ACCEL]}, gravity is 9.81: another unit "
+            f"(--accel-unit {'|'.join(UNITS[ACCEL])}), or gravity was taken away"
+        )
+    if fastest > _RATE_RAD_S:
+        raise RecordingError(
+            f"gyro: up to {fastest:.3g} rad/s in {units[GYRO]}, no gyroscope has as much: --gyro-unit deg/s?"
+        )
+
+
+def _size(vectors: Float) -> float:
+    """Median length of those that were measured (T, 3); NaN: none was."""
+    size = np.sqrt(np.square(vectors).sum(axis=1))
+    return float(np.median(size[np.isfinite(size)])) if np.isfinite(size).any() else nan
+
+
+def _time_unit(times: Sequence[Decimal], named: str, given: str | None) -> tuple[Decimal, str]:
+    """Nanoseconds in one of the unit of time, and what that is."""
+    step = float(np.median(np.array([float(b - a) for a, b in pairwise(times)])))
+    low, high = _RATES_HZ
+    fits = [unit for unit, scale in UNITS[TIME].items() if low < 1e9 / (step * scale) <= high]
+    if not (unit := named or given or next(iter(fits), "")):
+        raise RecordingError(
+            f"time: a step of {step:g} fits no unit: say --time-unit {'|'.join(UNITS[TIME])}"
+        )
+    return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not stated'})"

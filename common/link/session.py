@@ -1,0 +1,254 @@
+"""Handshake of master and slave: its keys and its messages.
+
+docs/wire.md draws it.
+
+From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
+- the rig tag, by which a datagram of another rig is recognised at once,
+- one key for every process that sends beacon, hello or welcome, named by its random process id, so
+  that two processes never seal under one key with the same nonce.
+
+From the rig key and the secret of one device (`common.link.link_key`), which only that device and the master know,
+- the proof in its hello: nobody else of the rig begins a session in its name,
+- for every session two keys, one per direction, and the session's id, from random numbers of both
+  sides: what was captured in one session opens in no other, whoever restarted, and in no other device,
+- the proof in the welcome: nobody else of the rig ends the session that it has.
+"""
+
+from collections.abc import Callable, Mapping
+from hmac import compare_digest
+from typing import Annotated, NamedTuple, TypeVar
+
+import msgspec
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from msgspec import Meta, Struct
+
+from common.link.datagram import KEY_BYTES, Header, Kind, Refusal, Sealer, unseal
+from common.link.link_key import LinkKey, derive
+from common.messages import Count, Name, TimeNs
+
+NONCE_BYTES = PROOF_BYTES = 16
+MAX_CAMERAS = 32
+Random = Callable[[int], bytes]  # so many random bytes, as `os.urandom` gives them
+Nonce = Annotated[bytes, Meta(min_length=NONCE_BYTES, max_length=NONCE_BYTES)]
+Proof = Annotated[bytes, Meta(min_length=PROOF_BYTES, max_length=PROOF_BYTES)]
+
+
+class Handshake(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of what travels in a datagram besides data; unknown fields are refused."""
+
+
+HandshakeT = TypeVar("HandshakeT", bound=Handshake)
+
+
+class Beacon(Handshake, frozen=True):
+    """Announcement of the master's presence, broadcast for ever.
+
+    Its source address is where hello goes.
+
+    Attributes:
+        master_nonce: Drawn when the master started: another one is another life of it.
+        zenoh_endpoint: Where the master's bus listens; empty if it has none.
+        sessions: Camera -> id of its session, for those that are acknowledged.
+    """
+
+    master_nonce: Nonce
+    zenoh_endpoint: Annotated[str, Meta(max_length=256, pattern=r"^[!-~]*(?!\n)$")]
+    sessions: Annotated[dict[Name, Count], Meta(max_length=MAX_CAMERAS)]
+
+
+class Hello(Handshake, frozen=True):
+    """A slave answers a beacon. `RigKeys.hello` makes it.
+
+    Attributes:
+        name: Camera.
+        process: Random id of the slave's process, the `session` of its messages.
+        slave_nonce: Drawn for this one attempt to get a session.
+        master_nonce: That of the beacon: a hello to an earlier master is a replay.
+        proof: That the sender has the secret of `name`, and vouches for all the fields above.
+    """
+
+    name: Name
+    process: Count
+    slave_nonce: Nonce
+    master_nonce: Nonce
+    proof: Proof
+
+
+class _AnyHello(Struct, frozen=True):
+    """What a hello of any wire version has; unknown fields are left."""
+
+    name: Name
+
+
+class Welcome(Handshake, frozen=True):
+    """Master's share of the session's keys, for the hello with this `slave_nonce`.
+
+    `proof`, of `SessionKeys`: that the master has the secret of that name.
+    """
+
+    master_nonce: Nonce
+    slave_nonce: Nonce
+    session_nonce: Nonce
+    proof: Proof
+
+
+class Unproven(Handshake, frozen=True):
+    """Refusal of the hello with this `slave_nonce`, which was not proven.
+
+    The master has another secret for its name. No session.
+
+    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It states only why: it is not
+    proven itself, and whoever has the rig key can claim it.
+    """
+
+    master_nonce: Nonce
+    slave_nonce: Nonce
+    has_secrets: bool
+
+
+class Start(Handshake, frozen=True):
+    """Command to begin at `start_t_ns` [ns] on the clock of the receiving slave.
+
+    A past time: now.
+    """
+
+    start_t_ns: TimeNs
+
+
+class Started(Handshake, frozen=True):
+    """The start was understood. Data acknowledges it as well."""
+
+    start_t_ns: TimeNs
+
+
+class EchoAsk(Handshake, frozen=True):
+    """First time stamp of an echo: `t1_ns` on the master's clock."""
+
+    t1_ns: TimeNs
+
+
+class EchoAnswer(Handshake, frozen=True):
+    """`t1_ns` as it came; `t2_ns` received, `t3_ns` answered, on the slave's clock."""
+
+    t1_ns: TimeNs
+    t2_ns: TimeNs
+    t3_ns: TimeNs
+
+
+_BODIES: Mapping[Kind, type[Handshake]] = {
+    Kind.BEACON: Beacon,
+    Kind.HELLO: Hello,
+    Kind.WELCOME: Welcome,
+    Kind.START: Start,
+    Kind.STARTED: Started,
+    Kind.ECHO_ASK: EchoAsk,
+    Kind.ECHO_ANSWER: EchoAnswer,
+    Kind.UNPROVEN: Unproven,
+}
+_DECODERS = {kind: msgspec.msgpack.Decoder(body) for kind, body in _BODIES.items()}
+_KINDS: Mapping[type[Handshake], Kind] = {body: kind for kind, body in _BODIES.items()}
+_ANY_HELLO = msgspec.msgpack.Decoder(_AnyHello)
+_ENCODER = msgspec.msgpack.Encoder()
+
+
+def seal(sealer: Sealer, message: Handshake) -> bytes:
+    """Return the datagram that carries `message`."""
+    return sealer.seal(_KINDS[type(message)], _ENCODER.encode(message))
+
+
+def read(kind: Kind, body: bytes) -> Handshake | None:
+    """Return the message of `kind` in `body`, or None if it is none."""
+    try:
+        return _DECODERS[kind].decode(body)
+    except (msgspec.MsgspecError, ValueError, RecursionError, KeyError):
+        return None
+
+
+class SessionKeys(NamedTuple):
+    """Keys of one session.
+
+    32 bytes for each direction, the id that datagrams name, the proof of the welcome.
+    """
+
+    key_id: int
+    to_master: bytes
+    to_slave: bytes
+    proof: bytes
+
+
+class RigKeys:
+    """All keys derived from the rig key and the secrets of devices."""
+
+    def __init__(self, key: LinkKey | bytes) -> None:
+        """Derive from the rig key, alone or with what there is of secrets.
+
+        Raises:
+            ValueError: One is not 32 bytes.
+        """
+        self._key = key if isinstance(key, LinkKey) else LinkKey(key)
+        self.has_secrets = self._key.has_secrets
+        self.rig_tag = int.from_bytes(derive(self._key.rig, 4, b"", b"phalanx rig tag"), "big")
+
+    def sealer(self, process: int) -> Sealer:
+        """Return the sealer for the handshakes of `process`, to be made once in its life."""
+        return Sealer(self._process_key(process), self.rig_tag, process)
+
+    def open(self, header: Header, datagram: bytes) -> bytes | None:
+        """Return the body of a handshake datagram if its seal fits, else None."""
+        return unseal(ChaCha20Poly1305(self._process_key(header.key_id)), header, datagram)
+
+    def open_as(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
+        """Return the message of a handshake datagram, or why it is refused."""
+        body = self.open(header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        message = read(header.kind, body)
+        return message if isinstance(message, expected) else Refusal.UNDECODABLE
+
+    def name_in(self, header: Header, datagram: bytes) -> str | None:
+        """Return the sender of a hello of another wire version, if its seal is valid.
+
+        The header is alike in all versions.
+        """
+        body = self.open(header, datagram)
+        try:
+            return None if body is None else _ANY_HELLO.decode(body).name
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return None
+
+    def hello(self, name: str, process: int, slave_nonce: bytes, master_nonce: bytes) -> Hello:
+        """Return the hello of the device `name`.
+
+        It is proven by the secret that this side has for it.
+        """
+        info = b"phalanx hello " + process.to_bytes(8, "big") + name.encode()
+        proof = derive(self._of_device(name), PROOF_BYTES, master_nonce + slave_nonce, info)
+        return Hello(name, process, slave_nonce, master_nonce, proof)
+
+    def proves(self, hello: Hello) -> bool:
+        """Return whether the sender of `hello` has the secret of its name."""
+        wanted = self.hello(hello.name, hello.process, hello.slave_nonce, hello.master_nonce)
+        return compare_digest(hello.proof, wanted.proof)
+
+    def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
+        """Return the session keys from `hello` and the master's `session_nonce`."""
+        nonces = hello.master_nonce + session_nonce + hello.slave_nonce
+        size, info = 8 + 2 * KEY_BYTES + PROOF_BYTES, b"phalanx session " + hello.name.encode()
+        block = derive(self._of_device(hello.name), size, nonces, info)
+        key_id = int.from_bytes(block[:8], "big") >> 1  # 63 bits, as ids in messages have
+        return SessionKeys(key_id, block[8:40], block[40:72], block[72:])
+
+    def session_sealer(self, key: bytes, key_id: int) -> Sealer:
+        """Return the sealer of one direction of a session, to be made once."""
+        return Sealer(key, self.rig_tag, key_id)
+
+    def _process_key(self, process: int) -> bytes:
+        return derive(self._key.rig, KEY_BYTES, process.to_bytes(8, "big"), b"phalanx handshake")
+
+    def _of_device(self, name: str) -> bytes:
+        return self._key.rig + self._key.secret(name)
+
+
+def new_process_id(random: bytes) -> int:
+    """Return a 63 bit id from 8 random bytes."""
+    return int.from_bytes(random[:8], "big") >> 1

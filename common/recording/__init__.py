@@ -1,0 +1,1 @@
+"""Recordings on disk: messages and frames enter, and are read back exactly."""

@@ -1,0 +1,275 @@
+"""Recording of messages: one MCAP file that any MCAP tool opens.
+
+It contains the calibration it was made with.
+
+    header | metadata "phalanx" | a file of calibration per attachment | chunks of messages | index
+
+There is a channel for each stream, sender and type, topic phalanx/STREAM/SENDER; a message is what `encode` makes of
+it (msgpack), and the channel's schema states its fields. The log time is when a message came, on the master's
+clock; the order in the file is that of writing, whatever the times are. A chunk is closed at least every half second
+and given to the system at once: what is lost with the process is that half second. A file without its end is read up
+to the cut (`common.recording.mcap_file`).
+"""
+
+import io
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import cast
+
+from mcap.writer import Writer
+
+from common.errors import MessageError, RecordingError
+from common.messages import (
+    WIRE_VERSION,
+    AnyMessage,
+    Message,
+    decode,
+    encode,
+)
+from common.messages.schema import message_schema
+from common.messages.streams import sender_of
+from common.recording.disk import Disk, Output
+from common.recording.mcap_file import McapContent, messages_of, read_content
+from common.recording.parts import channel_names, check_files, refuse_misplaced
+
+PROFILE = "phalanx"
+_CHUNK_NS = 500_000_000
+_CHUNK_BYTES = 512 << 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """One message of a recording.
+
+    Attributes:
+        stream: Its stream, a key of `common.messages.streams.STREAMS`.
+        name: Its sender, or what it is about: a camera, a hand, a process.
+        t_ns: When it came [ns], master's clock.
+        message: The message.
+    """
+
+    stream: str
+    name: str
+    t_ns: int
+    message: AnyMessage
+
+
+class MessageWriter:
+    """Writer of one recording.
+
+    Holds the file, its channels, and when the chunk in progress began.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        files: Mapping[str, bytes],
+        about: Mapping[str, str] | None = None,
+        open_disk: Callable[[Path], Disk] = lambda path: io.FileIO(path, "xb"),
+    ) -> None:
+        """Begin a new file.
+
+        Args:
+            path: The file; nothing is ever recorded over something else.
+            files: Files of calibration by their relative path, for example "rigs/desk.json".
+            about: What else is to be known of the recording, beside wire, program and start.
+            open_disk: Makes the file.
+
+        Raises:
+            RecordingError: It is there already, or cannot be written; a file of calibration has no plain name.
+        """
+        check_files(path, files)
+        try:
+            self._disk = open_disk(path)
+        except FileExistsError as error:
+            raise RecordingError(
+                f"{path}: is there already; nothing is recorded over something else"
+            ) from error
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+        self._path, self._out = path, Output(self._disk)
+        self._writer = Writer(cast(io.BufferedWriter, self._out), _CHUNK_BYTES)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, str], int] = {}
+        self._chunk_ns: int | None = None
+        self._number = 0
+        self._ended = False
+        started = datetime.now(UTC).isoformat(timespec="milliseconds")
+        known = {"wire": str(WIRE_VERSION), "program": version("phalanx-hand"), "started": started}
+        self._do(lambda: self._begin(known | dict(about or {}), files))
+
+    @property
+    def bytes_written(self) -> int:
+        """What is on the disk so far."""
+        return self._out.tell()
+
+    def write(self, stream: str, message: Message, t_ns: int) -> None:
+        """Append one message that came at `t_ns`.
+
+        Raises:
+            RecordingError: The disk is full or gone; what was written before stays readable, nothing more is written.
+            ValueError: The file is closed.
+        """
+        if self._ended:
+            raise ValueError(f"{self._path}: is closed")
+        t_ns = max(t_ns, 0)
+        if self._chunk_ns is None:
+            self._chunk_ns = t_ns
+        data = encode(message)
+        self._do(lambda: self._add(stream, message, data, t_ns))
+        if not 0 <= t_ns - self._chunk_ns < _CHUNK_NS:
+            self.flush()
+
+    def flush(self) -> None:
+        """End the chunk in progress: all of it is with the system from here on.
+
+        Raises:
+            RecordingError: As of `write`.
+        """
+        self._chunk_ns = None
+        if not self._ended:
+            self._do(self._writer.flush)
+
+    def close(self) -> None:
+        """Write the index and end the file. Safe to call twice, and after a failure.
+
+        Raises:
+            RecordingError: As of `write`.
+        """
+        if not self._ended:
+            self._do(self._writer.finish)
+            self._end()
+
+    def _begin(self, about: dict[str, str], files: Mapping[str, bytes]) -> None:
+        self._writer.start(PROFILE)
+        self._writer.add_metadata(PROFILE, about)
+        for name, data in files.items():
+            self._writer.add_attachment(0, 0, name, "application/json", data)
+
+    def _add(self, stream: str, message: Message, data: bytes, t_ns: int) -> None:
+        key = stream, sender_of(message), type(message).__name__
+        if key not in self._channels:
+            self._channels[key] = self._channel(*key, type(message))
+        captured = getattr(message, "t_ns", t_ns)
+        self._number = self._number + 1 & 0xFFFFFFFF
+        self._writer.add_message(self._channels[key], t_ns, data, max(captured, 0), self._number)
+
+    def _channel(self, stream: str, name: str, kind: str, type_: type[Message]) -> int:
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(kind, "jsonschema", message_schema(type_))
+        about = {"stream": stream, "name": name}
+        return self._writer.register_channel(
+            f"phalanx/{stream}/{name}", "msgpack", self._schemas[kind], about
+        )
+
+    def _do(self, step: Callable[[], object]) -> None:
+        """Write something.
+
+        Raises:
+            RecordingError: It failed; a chunk that was begun is taken back, where the system lets us.
+        """
+        whole = self._out.tell()
+        try:
+            step()
+        except OSError as error:
+            with suppress(OSError):
+                os.truncate(self._path, whole)
+            self._end()
+            raise RecordingError(
+                f"{self._path}: cannot write any more: {error.strerror or error}; what was recorded before is readable"
+            ) from error
+
+    def _end(self) -> None:
+        self._ended = True
+        with suppress(OSError):
+            self._disk.close()
+
+
+class MessageRecording:
+    """An opened recording.
+
+    Attributes:
+        path: The file.
+        files: Files of calibration by their relative path.
+        about: Metadata from its writer: wire, program, started, and what else it gave.
+        begin_t_ns, end_t_ns: First and last log time [ns]; both 0 where there is no message.
+        counts: Stream -> messages.
+        senders: Stream -> sender -> messages.
+        cut: It has no end: it broke off, or its end is broken.
+        losses: Chunks, attachments and messages that cannot be read, as far as they were met.
+    """
+
+    def __init__(self, path: Path, content: McapContent) -> None:
+        """Of the content of a file.
+
+        Raises:
+            RecordingError: A name in it is not plain.
+        """
+        self.path, self.cut, self.losses = path, content.cut, content.losses
+        self.files = {one.name: one.data for one in content.attachments}
+        check_files(path, self.files)
+        self.about = content.metadata.get(PROFILE, {})
+        self._chunks = content.chunks
+        self._named = channel_names(path, content.channels.values())
+        self.begin_t_ns = min((one.first_ns for one in self._chunks), default=0)
+        self.end_t_ns = max((one.last_ns for one in self._chunks), default=0)
+        self.senders: dict[str, Counter[str]] = {}
+        for number, count in content.counts.items():
+            stream, name = self._named.get(number, ("", ""))
+            self.senders.setdefault(stream, Counter())[name] += count
+        self.counts = {stream: names.total() for stream, names in self.senders.items()}
+
+    @property
+    def broken(self) -> int:
+        """How many losses there are."""
+        return self.losses.count
+
+    def read(
+        self,
+        streams: Collection[str] | None = None,
+        from_t_ns: int | None = None,
+        to_t_ns: int | None = None,
+    ) -> Iterator[Recorded]:
+        """The messages in the order in which they were written.
+
+        Args:
+            streams: Those that are wanted; None: all.
+            from_t_ns: None before this [ns].
+            to_t_ns: And none after this [ns].
+
+        Raises:
+            RecordingError: The file cannot be read any more.
+        """
+        first = self.begin_t_ns if from_t_ns is None else from_t_ns
+        last = self.end_t_ns if to_t_ns is None else to_t_ns
+        places = [one for one in self._chunks if one.last_ns >= first and one.first_ns <= last]
+        for place, messages in messages_of(self.path, places, self.losses):
+            for one in messages:
+                stream, name = self._named.get(one.channel_id, ("", ""))
+                if not first <= one.log_time <= last or (streams is not None and stream not in streams):
+                    continue
+                try:
+                    message = decode(one.data)
+                    refuse_misplaced(stream, name, message)
+                except (MessageError, RecordingError) as error:
+                    self.losses.add(f"message in the chunk at byte {place.offset}: {error}")
+                    continue
+                yield Recorded(stream, name, one.log_time, message)
+
+
+def open_messages(path: Path) -> MessageRecording:
+    """Open a recording, whole or cut.
+
+    Raises:
+        RecordingError: It cannot be read, is no recording of ours, or has a name that is not plain.
+    """
+    content = read_content(path)
+    if content.profile != PROFILE:
+        raise RecordingError(f"{path}: an MCAP file of profile {content.profile!r}, not a recording of ours")
+    return MessageRecording(path, content)

@@ -1,0 +1,1 @@
+"""What commands of the PC do: parsed options enter, lines and exit codes leave."""

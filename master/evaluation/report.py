@@ -1,0 +1,213 @@
+"""Report of a simulated run against the scene's exact truth.
+
+Figures, a picture and a Rerun file of its poses.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Image
+from common.errors import PhalanxError
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+from common.sim.scenes import scene_by_name
+from common.sim.together import TOGETHER
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
+from master.evaluation.run_results import RunResults
+from master.evaluation.score import Truth, score, score_hidden
+from master.evaluation.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
+from master.evaluation.wrist_score import score_wrist
+from master.outputs.files import load_poses
+from master.outputs.picture import best_row, draw_summary
+from master.outputs.picture_results import ResultPicture
+from master.outputs.picture_wrist import WristPicture
+from master.outputs.poses import Poses
+from master.outputs.rerun import write_rrd
+from master.outputs.truth import PosesTruth
+from master.replay.solve import fingers_of
+from master.rig.setup import RigSetup
+
+_IMAGES_HZ = 2.0
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """What the synthetic sensors of one hand sensed.
+
+    Attributes:
+        shown: What cameras of markers saw, or None.
+        wrist_scene: What a wrist device saw, or None.
+        together: The scene is one for both kinds of rig, whether or not there are both.
+    """
+
+    shown: Scene | None = None
+    wrist_scene: WristScene | None = None
+    together: bool = False
+
+    @classmethod
+    def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
+        """The scene called `name`; with @LIGHT behind it that of a wrist device.
+
+        Raises:
+            PhalanxError: There is no such scene for this kind of rig, or it is not one motion for both kinds.
+        """
+        moves, hand = name.partition("@")[0], setup.hand.profile
+        watched = {one.name: one for one in setup.objects}
+        together = moves in TOGETHER
+        if setup.wrist_rig is None:
+            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, together)
+        wrist_scene = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
+        if not setup.has_markers:
+            return cls(None, wrist_scene, together)
+        if not together:
+            raise PhalanxError(
+                f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
+            )
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), wrist_scene, together)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """A run beside its truth.
+
+    Scores, the true hand, what the cameras saw, and how to draw a wrist device.
+    """
+
+    scores: dict[str, float]
+    truth: PosesTruth
+    images: Iterable[tuple[str, int, Image]]
+    wrist: WristPicture | None = None
+
+
+def report_scene(
+    poses_file: Path,
+    setup: RigSetup,
+    played: Played,
+    epoch_ns: int,
+    out: Path,
+    summary: dict[str, object],
+    progress: Progress,
+) -> dict[str, object]:
+    """Score poses of a simulated run; write hand.png and run.rrd into `out`.
+
+    Args:
+        poses_file: poses.npz of the run.
+        setup: Rigs, cameras, hand.
+        played: What their synthetic sensors sensed.
+        epoch_ns: Scene time 0 on the master's clock.
+        out: Existing folder.
+        summary: Figures of the run so far; drawn with the scores.
+        tell: Called with what is being done, and how much of how much.
+
+    Returns:
+        The summary with the scores added.
+
+    Raises:
+        RecordingError: The poses cannot be read or a result cannot be written.
+    """
+    poses = load_poses(poses_file)
+    poses = poses.rows(int(np.searchsorted(poses.t_ns, epoch_ns)), len(poses))
+    if len(poses) == 0:
+        return summary
+    results = RunResults.load(poses_file.parent, setup, epoch_ns)
+    shown = ResultPicture(setup.objects, results.objects, results.contacts, results.gestures)
+    row = best_row(poses, shown)
+    judged = _judge(poses, row, setup, played, epoch_ns, progress)
+    full = (
+        summary
+        | judged.scores
+        | results.figures(played.shown, epoch_ns, int(poses.t_ns[0]), int(poses.t_ns[-1]))
+    )
+    figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
+    progress("drawing the hand", 0, 1)
+    picture, truth = out / "hand.png", judged.truth
+    draw_summary(picture, poses, setup.rig, setup.hand, figures, truth, row, judged.wrist, shown)
+    write_rrd(out / "run.rrd", poses, setup, truth=truth, images=judged.images, results=results.messages())
+    return full
+
+
+def _judge(
+    poses: Poses, row: int | None, setup: RigSetup, played: Played, epoch_ns: int, progress: Progress
+) -> _Judged:
+    """Against what was truly there, whichever sensors there are."""
+    if played.shown is None:
+        assert played.wrist_scene is not None, "one of the two there is"
+        return _of_wrist(poses, row, setup, played.wrist_scene, epoch_ns, progress)
+    judged = _of_markers(poses, setup, played.shown, epoch_ns, progress, hidden=played.together)
+    if played.wrist_scene is None:
+        return judged
+    wrist_scene = laser_scores(poses, played.wrist_scene, epoch_ns, progress)
+    images = chain(judged.images, wrist_images(poses, played.wrist_scene, epoch_ns, progress))
+    return _Judged(judged.scores | wrist_scene, judged.truth, images, WristPicture.of(setup))
+
+
+def _of_markers(
+    poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, progress: Progress, *, hidden: bool
+) -> _Judged:
+    truth, fingers = truth_of(poses, scene, epoch_ns, progress), fingers_of(setup)
+    scores = score(poses, truth, fingers)
+    if hidden:
+        scores |= score_hidden(poses, truth, fingers)
+    return _Judged(
+        scores,
+        PosesTruth.of_webxr(truth.joints_m, truth.markers_m),
+        _images(poses, scene, epoch_ns, progress),
+    )
+
+
+def _of_wrist(
+    poses: Poses, row: int | None, setup: RigSetup, scene: WristScene, epoch_ns: int, progress: Progress
+) -> _Judged:
+    truth = wrist_truth_of(poses.t_ns, scene, epoch_ns, progress)
+    frame = None
+    if row is not None:
+        renderer = WristRenderer(scene, scene.rig.cameras[0])
+        frame = lit_view(renderer, (int(poses.t_ns[row]) - epoch_ns) * 1e-9)
+    return _Judged(
+        score_wrist(poses, truth) | forearm_tilt(poses, scene, epoch_ns),
+        PosesTruth.of_webxr(truth.joints_m, poses.markers_m, truth.laser_m[:, 1:6]),
+        wrist_images(poses, scene, epoch_ns, progress),
+        WristPicture.of(setup, frame),
+    )
+
+
+def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Truth:
+    """Return the scene at the times of the poses, with each camera's visibility.
+
+    The visibility is what each camera could see.
+    """
+    times = (poses.t_ns - epoch_ns) * 1e-9
+    renderers = [Renderer(scene, camera) for camera in scene.rig.cameras]
+    joints = np.empty((len(times), 25, 3))
+    pip = np.empty((len(times), 4))
+    markers = np.empty((len(times), len(scene.rig.markers), 3))
+    visible = np.empty((len(times), len(renderers), len(scene.rig.markers)))
+    for row, t in enumerate(times):
+        now = scene.truth(float(t))
+        joints[row], pip[row], markers[row] = now.joints.position_m[1:], now.angles_rad[1:, 2], now.markers_m
+        for c, renderer in enumerate(renderers):
+            visible[row, c] = _fraction(renderer, float(t))
+        if row % 20 == 0:
+            progress("comparing with the truth", row, len(times))
+    return Truth(poses.t_ns, joints, pip, markers, visible)
+
+
+def _fraction(renderer: Renderer, t_s: float) -> Float:
+    return np.nan_to_num(renderer.visible_fraction(t_s))
+
+
+def _images(
+    poses: Poses, scene: Scene, epoch_ns: int, progress: Progress
+) -> Iterator[tuple[str, int, Image]]:
+    first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
+    for camera in scene.rig.cameras:
+        renderer = Renderer(scene, camera)
+        for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
+            progress(f"rendering camera {camera}", t_ns - first, last - first)
+            yield camera, t_ns, renderer.render((t_ns - epoch_ns) * 1e-9)

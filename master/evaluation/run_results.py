@@ -1,0 +1,271 @@
+"""Results of a simulated run beside the hands.
+
+As messages again, and as figures that a person understands.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from common.arrays import Bool, Int
+from common.messages import Contact, Gesture, ObjectPose, ResultMessage
+from common.sim.scene import Scene
+from master.evaluation.object_score import ObjectTruth, score_object, score_objects
+from master.outputs.result_files import (
+    GESTURES,
+    Contacts,
+    ObjectPoses,
+    contact_path,
+    load_contact,
+    load_gesture_messages,
+    load_object,
+    object_path,
+)
+from master.rig.setup import RigSetup
+
+_LATE_S = 0.4  # a gesture that is reported so long after it was made is not that one
+_GAP_NS = 200_000_000  # between two rows of one contact
+_TRUTH_HZ = 60.0
+
+
+class Annotation(Protocol):
+    """One gesture of a simulated hand.
+
+    As in a Gesture message, with the times when it begins and is complete [s].
+    """
+
+    @property
+    def kind(self) -> str: ...  # noqa: D102
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def start_s(self) -> float: ...  # noqa: D102
+    @property
+    def stop_s(self) -> float: ...  # noqa: D102
+
+
+@runtime_checkable
+class Annotated(Protocol):
+    """A simulated hand with known gestures."""
+
+    @property
+    def annotations(self) -> Sequence[Annotation]:
+        """Return all gestures in a period, in order."""
+        ...
+
+    @property
+    def period_s(self) -> float:
+        """Return the time [s] after which the gestures repeat."""
+        ...
+
+    def dial_rad(self, t_s: float) -> float:
+        """By how much knobs have been turned up to a time [s]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResults:
+    """Results of a run for one hand and its objects.
+
+    Attributes:
+        objects: One for each object of the rig.
+        contacts: Of this hand and each object.
+        gestures: Of this hand, in the order of time.
+    """
+
+    objects: tuple[ObjectPoses, ...] = ()
+    contacts: tuple[Contacts, ...] = ()
+    gestures: tuple[Gesture, ...] = ()
+
+    @classmethod
+    def load(cls, folder: Path, setup: RigSetup, from_ns: int) -> "RunResults":
+        """Read the files beside poses.npz.
+
+        What a run did not write is not there. Gestures are read from a given time on.
+
+        Raises:
+            RecordingError: A file is broken.
+        """
+        names, hand = [one.name for one in setup.objects], setup.hand.profile.name
+        objects = [object_path(folder, name) for name in names]
+        contacts = [contact_path(folder, hand, name) for name in names]
+        spoken = folder / GESTURES
+        gestures = load_gesture_messages(spoken) if spoken.exists() else []
+        return cls(
+            tuple(load_object(path) for path in objects if path.exists()),
+            tuple(load_contact(path) for path in contacts if path.exists()),
+            tuple(one for one in gestures if one.hand == hand and one.t_ns >= from_ns),
+        )
+
+    def messages(self) -> list[ResultMessage]:
+        """All of it, each kind in the order of time."""
+        out: list[ResultMessage] = [*self.gestures]
+        for poses in self.objects:
+            out += [object_row(poses, row) for row in range(len(poses))]
+        for near in self.contacts:
+            out += [contact_row(near, row) for row in range(len(near))]
+        return out
+
+    def figures(self, scene: Scene | None, epoch_ns: int, from_ns: int, until_ns: int) -> dict[str, object]:
+        """Figures of the summary, of poses from a time to a time.
+
+        Returns:
+            Those of `score_objects`; held_s, how long an object was held; gestures, how often each was made
+            (kind and name -> count). Where the scene's hand knows what it signals: gestures_right, of those that it
+            made how many were reported, gestures_made, gestures_false, those not made; dial_deg, median error of
+            the dial's angle.
+        """
+        out: dict[str, object] = {}
+        if scene is not None and self.objects:
+            scores = {
+                poses.object: score_object(poses, truth_of_object(scene, poses, epoch_ns))
+                for poses in self.objects
+            }
+            out |= score_objects(scores)
+        if self.contacts:
+            out["held_s"] = round(max(_seconds(near.t_ns, near.held) for near in self.contacts), 1)
+        made = Counter(_label(one) for one in _beginnings(self.gestures))
+        if made:
+            out["gestures"] = dict(made.most_common())
+        if scene is not None and isinstance(scene.motion, Annotated):
+            out |= judge_gestures(self.gestures, scene.motion, epoch_ns, from_ns, until_ns)
+        return out
+
+
+def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTruth:
+    """Where the scene has an object while there are poses of it."""
+    if len(poses) == 0:
+        return ObjectTruth(np.empty(0, np.int64), np.empty((0, 4, 4)))
+    first, last = max(int(poses.t_ns[0]), epoch_ns), int(poses.t_ns[-1])
+    t_ns = np.arange(first, max(last, first) + 1, round(1e9 / _TRUTH_HZ), dtype=np.int64)
+    true = [scene.truth(float(t - epoch_ns) * 1e-9).objects[poses.object] for t in t_ns.tolist()]
+    return ObjectTruth(t_ns, np.array(true))
+
+
+def judge_gestures(
+    published: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
+) -> dict[str, object]:
+    """Compare the published gestures with those of a scene's hand.
+
+    Poses of the hand are not judged.
+
+    Args:
+        told: Gestures in the order of time.
+        motion: The hand of the scene.
+        epoch_ns: Scene time 0 on the clock of the messages.
+        from_ns: The first pose of the run.
+        until_ns: Its last one.
+    """
+    begun = [one for one in _beginnings(published) if one.kind != "pose"]
+    first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
+    made = [
+        (one, cycle * motion.period_s)
+        for cycle in range(int(end_s // motion.period_s) + 1)
+        for one in motion.annotations
+        if first_s <= one.start_s + cycle * motion.period_s and one.stop_s + cycle * motion.period_s <= end_s
+    ]
+    received: set[int] = set()
+    right = 0
+    for one, after_s in made:
+        span = (one.start_s + after_s, one.stop_s + after_s + _LATE_S)
+        own = [
+            k
+            for k, published_one in enumerate(begun)
+            if k not in received and _is(published_one, one, span, epoch_ns)
+        ]
+        right += bool(own)
+        received.update(own)
+    # One that begin or end of the run cut off was made all the same.
+    cut = [
+        k for k, one in enumerate(begun) if k not in received and _cut(one, motion, epoch_ns, first_s, end_s)
+    ]
+    out: dict[str, object] = {
+        "gestures_right": right,
+        "gestures_made": len(made),
+        "gestures_false": len(begun) - len(received) - len(cut),
+    }
+    dials = [one for one in published if one.kind == "dial" and np.isfinite(one.angle_rad)]
+    began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in dials]
+    error = [
+        abs(one.angle_rad - motion.dial_rad(_seconds_of(one, epoch_ns)) + motion.dial_rad(t_s))
+        for one, t_s in zip(dials, began_s, strict=True)
+    ]
+    return out | ({"dial_deg": round(float(np.degrees(np.median(error))), 2)} if error else {})
+
+
+def object_row(poses: ObjectPoses, row: int) -> ObjectPose:
+    """Row of the poses of an object as the message it was."""
+    return ObjectPose(
+        object=poses.object,
+        t_ns=int(poses.t_ns[row]),
+        position_m=poses.position_m[row],
+        orientation_wxyz=poses.orientation_wxyz[row],
+        cov=poses.cov[row],
+        residual_m=float(poses.residual_m[row]),
+        source=int(poses.source[row]),
+        tracked=bool(poses.tracked[row]),
+        seen=int(poses.seen[row]),
+        expected=int(poses.expected[row]),
+        occluded=bool(poses.occluded[row]),
+        latency_ns=int(poses.latency_ns[row]),
+    )
+
+
+def contact_row(near: Contacts, row: int) -> Contact:
+    """Row of contact as the message it was."""
+    return Contact(
+        hand=near.hand,
+        object=near.object,
+        t_ns=int(near.t_ns[row]),
+        distance_m=near.distance_m[row],
+        sigma_m=near.sigma_m[row],
+        point_m=near.point_m[row],
+        touching=near.touching[row],
+        palm_distance_m=float(near.palm_distance_m[row]),
+        held=bool(near.held[row]),
+    )
+
+
+def _beginnings(published: Sequence[Gesture]) -> list[Gesture]:
+    """One message of each gesture: its first, of a tap the only one."""
+    return [one for one in published if one.phase == "begin" or one.kind == "tap"]
+
+
+def _label(one: Gesture) -> str:
+    return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
+
+
+def _cut(published: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
+    """Check whether a gesture is cut off by the run.
+
+    The hand had begun it before the first pose, or had not completed it at the last.
+    """
+    turns = range(int(end_s // motion.period_s) + 1)
+    spans = (
+        (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)
+        for one in motion.annotations
+        for k in turns
+    )
+    return any(
+        (start < first_s or stop > end_s) and _is(published, one, (start, stop + _LATE_S), epoch_ns)
+        for one, start, stop in spans
+    )
+
+
+def _is(published: Gesture, made: Annotation, span_s: tuple[float, float], epoch_ns: int) -> bool:
+    same = (published.kind, published.name) == (made.kind, made.name)
+    return same and span_s[0] <= _seconds_of(published, epoch_ns) <= span_s[1]
+
+
+def _seconds_of(one: Gesture, epoch_ns: int) -> float:
+    return (one.t_ns - epoch_ns) * 1e-9
+
+
+def _seconds(t_ns: Int, holds: Bool) -> float:
+    """How long something held [s], a gap in the rows not counted."""
+    step = np.diff(t_ns)
+    return float(step[holds[:-1] & (step < _GAP_NS)].sum() * 1e-9) if len(t_ns) > 1 else 0.0

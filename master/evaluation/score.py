@@ -1,0 +1,222 @@
+"""Errors against exact truth, in millimetres and degrees.
+
+A finger counts as *visible* where its marker is at least half seen by two cameras. Scores come twice: over
+visible fingers (the palm's joints with them), and over all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float, Int
+from common.errors import RecordingError
+from common.hand.model import FINGER_JOINTS
+from common.recording.recorded_files import TRUTH, has_truth, read_truth
+from master.outputs.poses import Poses
+
+_MATCH_NS = 1_000_000
+_FOLLOWS_NS = 100_000_000  # longer apart, two poses are no step
+_HAND_OVER_NS = 200_000_000
+_OF_HAND = ("t_ref", "joints", "angles", "paint_centroid", "frac")  # arrays of a truth
+_OF_SWEEP = ("depth", "center", "frac")
+_FINGER_OF_JOINT = np.full(26, -1)
+for _f, _joints in enumerate(FINGER_JOINTS):
+    _FINGER_OF_JOINT[list(_joints)] = _f
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Exact values at N moments.
+
+    Attributes:
+        t_ns: (N,) the moments, on the clock of the poses.
+        joints_m: (N, 25, 3) WebXR joints [m], rig frame; NaN where the scene has no hand.
+        pip_rad: (N, 4) PIP of index ... little.
+        markers_m: (N, M, 3) cap centroids.
+        visible: (N, C, M) visible share of each marker in each camera.
+    """
+
+    t_ns: Int
+    joints_m: Float
+    pip_rad: Float
+    markers_m: Float
+    visible: Float
+
+
+def load_truth(folder: Path, shown: Bool) -> Truth | None:
+    """Truth of a rendered recording; None where the folder holds none.
+
+    Args:
+        folder: The recording.
+        shown: (M,) markers found most often; a sweep of the depth shows a single flat one.
+
+    Raises:
+        RecordingError: truth.npz is broken, lacks an array, or leads out of the folder.
+    """
+    if not has_truth(folder):
+        return None
+    data = read_truth(folder, also=(*_OF_SWEEP, *_OF_HAND))
+    try:
+        truth = _sweep(data, shown) if "depth" in data else _hand(data)
+        _check(truth, len(shown))
+        return truth
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise RecordingError(f"{folder / TRUTH}: not the truth of a marker recording: {error}") from error
+
+
+def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
+    """Mean errors over the frames that have a truth.
+
+    Args:
+        poses: Solved poses.
+        truth: Exact values.
+        fingers: For each marker the finger it sits on, or -1.
+
+    Returns:
+        marker_mm (median over markers seen at least half by two cameras), marker_raw_mm (the same before the
+        filter), markers_missed (such markers not found), joint_mm, joint_mm_visible, pip_deg, pip_deg_visible,
+        frames_without_pose.
+        A score with nothing to average is left out.
+    """
+    rows, columns = _match(poses.t_ns, truth.t_ns)
+    clear = (truth.visible[columns] >= 0.5).sum(axis=1) >= 2
+    out: dict[str, float] = {}
+    for name, found in (("marker_mm", poses.markers_m[rows]), ("marker_raw_mm", poses.markers_raw_m[rows])):
+        error = np.linalg.norm(found - truth.markers_m[columns], axis=2)[clear]
+        put(out, name, 1e3 * error[np.isfinite(error)], np.median)
+    wanted = np.isfinite(truth.markers_m[columns]).all(axis=2) & clear
+    out["markers_missed"] = float((wanted & ~np.isfinite(poses.markers_raw_m[rows]).all(axis=2)).sum())
+    solved = np.isfinite(poses.position_m[rows]).all(axis=(1, 2))
+    if not np.isfinite(truth.joints_m[columns]).any():
+        return out
+    joint = 1e3 * np.linalg.norm(poses.position_m[rows][:, 1:] - truth.joints_m[columns], axis=2)
+    pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
+    finger_clear = _fingers_clear(clear, fingers)
+    joint_clear = np.where(_FINGER_OF_JOINT[1:] < 0, True, finger_clear[:, _FINGER_OF_JOINT[1:]])
+    put(out, "joint_mm", joint[solved], np.mean)
+    put(out, "joint_mm_visible", joint[solved][joint_clear[solved]], np.mean)
+    put(out, "pip_deg", pip[solved], np.mean)
+    put(out, "pip_deg_visible", pip[solved][finger_clear[:, 1:][solved]], np.mean)
+    out["frames_without_pose"] = float((~solved).sum())
+    return out
+
+
+def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
+    """Score poses where the cameras see nothing of a finger.
+
+    Also when the source of information on it changes.
+
+    Returns:
+        joint_mm_hidden, pip_deg_hidden: Mean errors of fingers that are valid while their marker is at least half seen
+            by less than two cameras; hidden_invalid: share of hidden fingers that are not valid.
+        hand_over_step_mm: Largest step of a joint from pose to pose beyond its true step, within 0.2 s of a change of
+            any joint's source.
+        A score with nothing to average is left out.
+    """
+    rows, columns = _match(poses.t_ns, truth.t_ns)
+    found, exact = poses.position_m[rows][:, 1:], truth.joints_m[columns]
+    valid = poses.valid[rows][:, 1:] & np.isfinite(found).all(axis=2)
+    clear = (truth.visible[columns] >= 0.5).sum(axis=1) >= 2
+    hidden = ~_fingers_clear(clear, fingers)
+    of_finger = (_FINGER_OF_JOINT[1:] >= 0) & hidden[:, _FINGER_OF_JOINT[1:]]
+    out: dict[str, float] = {}
+    put(out, "joint_mm_hidden", 1e3 * np.linalg.norm(found - exact, axis=2)[of_finger & valid], np.mean)
+    all_valid = np.stack(
+        [valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1
+    )
+    pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
+    put(out, "pip_deg_hidden", pip[hidden[:, 1:] & all_valid], np.mean)
+    put(out, "hidden_invalid", (~all_valid)[hidden[:, 1:]].astype(np.float64), np.mean)
+    step = 1e3 * np.linalg.norm(np.diff(found, axis=0) - np.diff(exact, axis=0), axis=2)
+    t_ns = poses.t_ns[rows]
+    follows = (np.diff(t_ns) <= _FOLLOWS_NS)[:, None] & valid[1:] & valid[:-1]
+    near = _near_change(t_ns, poses.source[rows])
+    put(out, "hand_over_step_mm", step[follows & near[1:, None]], np.max)
+    return out
+
+
+def _near_change(t_ns: Int, source: Code) -> Bool:
+    """Return a mask (N,) of the times near a change of any joint's source.
+
+    Within 0.2 s of each of the times (N,), of sources (N, 26).
+    """
+    changed = t_ns[1:][(source[1:] != source[:-1]).any(axis=1)]
+    after = np.searchsorted(changed, t_ns - _HAND_OVER_NS)
+    return np.searchsorted(changed, t_ns + _HAND_OVER_NS, side="right") > after
+
+
+def put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:
+    """Add the score `name`; with nothing to reduce it is left out."""
+    if values.size:
+        out[name] = round(float(np.asarray(reduce(values))), 4)
+
+
+def _fingers_clear(clear: Bool, fingers: tuple[int, ...]) -> Bool:
+    """(N, 5) whether a marker of each finger is clearly seen."""
+    out = np.zeros((len(clear), 5), dtype=bool)
+    for marker, finger in enumerate(fingers):
+        if finger >= 0:
+            out[:, finger] |= clear[:, marker]
+    return out
+
+
+def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
+    """Rows of the poses and of the truth that belong together.
+
+    A recording has one truth per frame of the reference camera, hence per pose, or one for all its frames;
+    any other truth is matched by time.
+    """
+    rows = np.arange(len(t_ns))
+    if len(truth_ns) == 1:
+        return rows, np.zeros_like(rows)
+    if len(truth_ns) == len(t_ns):
+        return rows, rows
+    nearest = np.clip(np.searchsorted(truth_ns, t_ns), 1, len(truth_ns) - 1)
+    nearest = nearest - (np.abs(truth_ns[nearest - 1] - t_ns) <= np.abs(truth_ns[nearest] - t_ns))
+    rows = np.flatnonzero(np.abs(truth_ns[nearest] - t_ns) <= _MATCH_NS)
+    return rows, nearest[rows]
+
+
+def _check(truth: Truth, markers: int) -> None:
+    """Refuse arrays that do not fit together.
+
+    Raises:
+        ValueError: Naming the array, its shape and what is expected.
+    """
+    n = len(truth.t_ns)
+    cameras = truth.visible.shape[1] if truth.visible.ndim == 3 else 1
+    for name, array, shape in (
+        ("t_ref", truth.t_ns, (max(n, 1),)),
+        ("joints", truth.joints_m, (n, 25, 3)),
+        ("angles", truth.pip_rad, (n, 4)),
+        ("paint_centroid", truth.markers_m, (n, markers, 3)),
+        ("frac", truth.visible, (n, cameras, markers)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+
+
+def _hand(data: dict[str, Float]) -> Truth:
+    exact = {name: data[name].astype(np.float64) for name in _OF_HAND}
+    return Truth(
+        t_ns=np.round(1e9 * (1.0 + exact["t_ref"])).astype(np.int64),
+        joints_m=exact["joints"],
+        pip_rad=exact["angles"][:, [7, 11, 15, 19]],
+        markers_m=exact["paint_centroid"],
+        visible=exact["frac"],
+    )
+
+
+def _sweep(data: dict[str, Float], shown: Bool) -> Truth:
+    """One flat marker moved along the axis in steps of a second; there is no hand."""
+    depth, centre, seen = (data[name].astype(np.float64) for name in _OF_SWEEP)
+    n = depth.size if depth.ndim == 1 else 0
+    return Truth(
+        t_ns=1_000_000_000 * (1 + np.arange(n)),
+        joints_m=np.broadcast_to(np.nan, (n, 25, 3)),
+        pip_rad=np.broadcast_to(np.nan, (n, 4)),
+        markers_m=np.where(shown[None, :, None], centre[:, None], np.nan),
+        visible=np.where(shown, seen[:, :, None], 0.0),
+    )

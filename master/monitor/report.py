@@ -1,0 +1,181 @@
+"""Status of a live master.
+
+It has the master's health on the bus, answers to requests there, and a line for each change.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+
+from common.bus.zenoh_bus import ZenohBus
+from common.clock import Clock
+from common.errors import BusError
+from common.messages import Command, Health
+from common.messages.streams import MASTER
+from master.monitor.clocks import ClockMonitor
+from master.monitor.extrinsics import ExtrinsicsMonitor
+from master.recording.probe import Probe
+from master.run.admission import limits_of
+from master.run.app import RunFigures, health
+from master.run.dispatcher import Dispatcher
+from master.run.ingest import Ingest
+from master.run.rejected_peers import MarkerCounts
+from master.run.tuning import LivePipeline, RigTuning
+
+_REPORT_S = 1.0
+
+
+class Reporter:
+    """Status reporter of the master.
+
+    It reports on the bus, to whoever asks there, and prints a line for each change.
+
+    Holds the id of this run, and what it reports on.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        trackers: tuple[str, ...],
+        clock: Clock,
+        bus: ZenohBus,
+        ingest: Ingest,
+        dispatcher: Dispatcher,
+        extrinsics: Sequence[tuple[ExtrinsicsMonitor, LivePipeline]],
+        tuning: RigTuning | None,
+        monitor: ClockMonitor,
+        figures: RunFigures,
+        probe: Probe,
+        stop: threading.Event,
+        notify: Callable[[str], None],
+    ) -> None:
+        """Be there on the bus from now on; `work` belongs to a thread."""
+        self.session = secrets.randbits(63)
+        self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
+        self._ingest, self._dispatcher, self._figures = ingest, dispatcher, figures
+        self._tuning, self._monitor, self._extrinsics = tuning, monitor, extrinsics
+        self._probe, self._stop, self._notify = probe, stop, notify
+        self._mismatched: frozenset[str] = frozenset()
+        bus.announce(MASTER)
+        bus.serve(MASTER, self.answer)
+
+    def health(self) -> Health:
+        """Return the current health report.
+
+        Of what never happened only `received` is reported, to keep it short.
+        """
+        events = self._ingest.counts | self._bus.counts
+        happened = {name: number for name, number in events.items() if number or name.endswith("received")}
+        changes = {} if self._tuning is None else self._tuning.counts()
+        counts = dict(self._dispatcher.counts) | happened | changes | self._probe.counts
+        times = dict(self._monitor.metrics(self._ingest.clock_of)) | (
+            {"open_bus": 1.0} if self._bus.open else {}
+        )
+        return health(self.session, self._clock, self._figures, counts, times)
+
+    def answer(self, command: Command) -> Health:
+        """Execute a command and return the health.
+
+        "report" returns the status, "reload" uses the files as they are now, "filter" sets another 1 € filter for one
+        rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
+
+        Raises:
+            CalibrationError: The files cannot be used; the old ones still are.
+            ValueError: Another verb; the asker reads which ones there are.
+        """
+        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._probe.lease}
+        if self._tuning is not None:
+            tuning = self._tuning
+            verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
+        if command.verb not in verbs:
+            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
+        verbs[command.verb]()
+        return self.health()
+
+    def work(self) -> None:
+        """Publish health on the bus and the rate once a second until the stop.
+
+        Prints a line whenever something changes.
+        """
+        connected: frozenset[str] | None = None
+        started = False
+        poses = 0
+        while not self._stop.wait(_REPORT_S):
+            lines = self._looked()
+            try:
+                self._bus.publish("health", MASTER, self.health())
+            except BusError:
+                if self._stop.is_set():
+                    return  # the run has ended
+                raise
+            received = self._ingest.connected
+            if received != connected:
+                connected = received
+                self._notify(cameras_line(self._cameras, connected, self._trackers))
+            if self._ingest.started and not started:
+                started = True
+                self._notify("started")
+            if self._figures.poses and not poses:
+                self._notify("tracking")
+            if started:
+                self._notify(f"rate {self._figures.poses - poses} poses/s")
+            for line in lines:
+                self._notify(line)
+            poses = self._figures.poses
+
+    def _looked(self) -> list[str]:
+        """Lines of what the monitors of this second found.
+
+        What senders send may make one fail, but not the report.
+        """
+        try:
+            if self._tuning is not None:
+                self._tuning.look()
+                self._monitor.follow(self._tuning.setups)
+                self._ingest.limit(limits_of(self._tuning.setups))
+            lines = self._monitor.look()
+            lines += [
+                line for extrinsics, pipeline in self._extrinsics for line in extrinsics.look(pipeline.counts)
+            ]
+        except Exception as error:  # noqa: BLE001
+            self._ingest.quarantine.note(MASTER, error)
+            lines = []
+        mismatched = self._ingest.marker_counts()
+        lines += [
+            marker_line(name, counts) for name, counts in mismatched.items() if name not in self._mismatched
+        ]
+        self._mismatched = frozenset(mismatched)
+        return lines
+
+
+def marker_line(name: str, counts: MarkerCounts) -> str:
+    """Return the line about a slave whose rig file differs from the master's."""
+    return (
+        f"camera {name}: its slave sends {counts.sent} markers, the rig here has {counts.expected}: nothing of it is"
+        " used. Deploy the rig to it again (phalanx fleet deploy), then restart this master if its own file has changed"
+    )
+
+
+def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
+    """Return the line for the user when a sender comes or goes.
+
+    It states who is there, and which cameras are waited for.
+    """
+    here = ", ".join(name for name in cameras if name in connected) or "none yet"
+    absent = ", ".join(name for name in cameras if name not in connected)
+    line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
+    others = connected.difference(cameras)
+    for kind, names in (("IMU", others.difference(trackers)), ("tracker", others.intersection(trackers))):
+        line += f"; {kind}: {', '.join(sorted(names))}" if names else ""
+    return line
+
+
+def unplaced_line(name: str, tracker: str) -> str:
+    """Return the line about a tracker whose poses are not placed in the rig.
+
+    Its poses mean nothing there.
+    """
+    return (
+        f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
+        f" `phalanx calibrate tracker {name}`"
+    )

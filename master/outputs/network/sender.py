@@ -1,0 +1,322 @@
+"""Sender that feeds the live outputs from the bus.
+
+Follows their settings file, obeys commands, reports.
+
+On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file states
+otherwise; `report` states how it is; `stop` ends it.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+from common.bus.bus import Bus, Subscription
+from common.calibration import load
+from common.calibration.file_monitor import MonitoredFiles
+from common.calibration.output_settings import OutputSettings, default_outputs
+from common.clock import Clock, SystemClock
+from common.errors import BusError, PhalanxError
+from common.machine import program
+from common.messages import Command, Health, Message, ResultMessage
+from common.messages.streams import MASTER
+from master.outputs.network.line import Counters, OutputLine
+from master.outputs.network.outputs import OUTPUTS, switched_on, who_reads
+from master.outputs.network.times import MasterTimes
+
+NAME = "outputs"
+STREAMS = ("hand", "object", "contact", "gesture")
+_DEPTH = 512  # of each stream; it is emptied at once
+_POLL_S = 0.02
+
+
+class Switch(Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of the commands `on` and `off`."""
+
+    output: str
+
+
+def settings_of(path: Path) -> OutputSettings:
+    """The settings file; where there is none called default.json, the defaults.
+
+    Raises:
+        CalibrationError: It is broken, or there is none.
+    """
+    if path.name == "default.json" and not path.exists():
+        return default_outputs()
+    return load(path, OutputSettings)
+
+
+class Sender:
+    """Set of live outputs.
+
+    Holds the settings, which outputs are on, a line for each of those, and the counts of each.
+    """
+
+    def __init__(
+        self,
+        settings: OutputSettings,
+        only: Collection[str],
+        notify: Callable[[str], None],
+        clock: Clock | None = None,
+    ) -> None:
+        """Switch on what the settings have on, or exactly what `only` names.
+
+        `only` overrides the settings.
+
+        Raises:
+            PhalanxError: `only` names an output that there is not.
+        """
+        refuse_unknown(only)
+        self._settings, self._notify = settings, notify
+        self._clock: Clock = SystemClock() if clock is None else clock
+        self._only = frozenset(only)
+        self._session = secrets.randbits(63)
+        self.times = MasterTimes()
+        self.counters_by_name = {name: Counters() for name in OUTPUTS}
+        self._lines: dict[str, OutputLine] = {}
+        self._received = 0
+        self._lock = threading.RLock()  # commands come on a thread of the bus
+        for name, on in switched_on(settings).items():
+            if name in self._only or (on and not self._only):
+                self.switch(name, on=True)
+
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Names of the outputs that are switched on."""
+        with self._lock:
+            return tuple(name for name in OUTPUTS if name in self._lines)
+
+    def where(self, name: str) -> str:
+        """Where an output sends to, and who else can read it there, for a person."""
+        try:
+            where = OUTPUTS[name].where(self._settings)
+        except PhalanxError as error:
+            return str(error)  # it is not opened either
+        reader = who_reads(name, self._settings)
+        return where if reader is None else f"{where}; {reader}"
+
+    def switch(self, name: str, *, on: bool) -> None:
+        """Switch one output.
+
+        Raises:
+            PhalanxError: There is no such output.
+        """
+        _known(name)
+        with self._lock:
+            line = self._lines.pop(name, None)
+            if on and line is not None:
+                self._lines[name] = line
+            elif on:
+                make, settings = OUTPUTS[name].make, self._settings
+                self._lines[name] = OutputLine(
+                    name, lambda: make(settings, self.times), self.counters_by_name[name], self._notify
+                )
+        if line is not None and not on:
+            line.close()
+            self.counters_by_name[name].trouble = ""
+
+    def use(self, settings: OutputSettings) -> None:
+        """Apply other settings from now on.
+
+        An output that is on and is set otherwise is recreated; a changed `on` switches.
+
+        Outputs that were chosen by name (`only`) stay chosen, whatever the file states.
+        """
+        with self._lock:
+            before, self._settings = self._settings, settings
+        was_on, is_on = switched_on(before), switched_on(settings)
+        for name, output in OUTPUTS.items():
+            if output.part(before) == output.part(settings):
+                continue
+            switched = was_on[name] != is_on[name] and not self._only
+            on = is_on[name] if switched else name in self.on
+            self.switch(name, on=False)
+            self.switch(name, on=on)
+            self._notify(f"{name}: {self.where(name)}" if on else f"{name}: off")
+
+    def push(self, message: ResultMessage) -> None:
+        """Give a message to every output that is on and takes it; never waits."""
+        self._received += 1
+        with self._lock:
+            for name, line in self._lines.items():
+                if isinstance(message, OUTPUTS[name].takes):
+                    line.offer(message)
+
+    def health(self, lost: int = 0) -> Health:
+        """Return the present health report.
+
+        `lost`: messages that this process was too slow to take from the bus.
+        """
+        counts = {"received": self._received, "lost": lost}
+        metrics: dict[str, float] = {}
+        with self._lock:
+            for name, counters in self.counters_by_name.items():
+                line = self._lines.get(name)
+                counts[f"sent.{name}"] = counters.sent
+                counts[f"failed.{name}"] = counters.failed
+                counts[f"dropped.{name}"] = counters.dropped
+                metrics[f"on.{name}"] = float(line is not None)
+                metrics[f"open.{name}"] = float(line is not None and line.open)
+        return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
+
+    def obey(self, command: Command) -> None:
+        """Obey a command, except `stop`.
+
+        Raises:
+            PhalanxError: Unknown verb or output, or a body that is none. The text lists what there is.
+        """
+        if command.verb in ("on", "off"):
+            try:
+                body = msgspec.json.decode(command.body, type=Switch)
+            except msgspec.MsgspecError as error:
+                raise PhalanxError(
+                    f'{command.verb}: body {command.body!r}: {error}; write {{"output": "osc"}}'
+                ) from error
+            self.switch(body.output, on=command.verb == "on")
+            self._notify(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
+        elif command.verb not in ("report", "stop"):
+            raise PhalanxError(f"unknown verb {command.verb!r}; there are on, off, report, stop")
+
+    def close(self) -> None:
+        """Send what waits and close every output."""
+        with self._lock:
+            lines, self._lines = list(self._lines.values()), {}
+        for line in lines:
+            line.close()
+
+
+class Housekeeping:
+    """Background tasks of the sender, on a thread of its own.
+
+    File, report, echoes of the master's clock.
+
+    Holds the bus and the file, which belong to the caller.
+    """
+
+    def __init__(self, sender: Sender, bus: Bus, path: Path, subscribers: Collection[Subscription]) -> None:
+        self._sender, self._bus, self._path, self._subscribers = sender, bus, path, subscribers
+        self._monitored = MonitoredFiles()
+        self._monitored.changed([path])  # as it was read
+        self._clock = SystemClock()
+
+    def step(self, notify: Callable[[str], None]) -> None:
+        """Run one step of the background tasks.
+
+        Use the file if it changed, ask the master for its time, publish the report.
+
+        Raises:
+            BusError: The bus is closed.
+        """
+        if self._monitored.changed([self._path]):
+            try:
+                self._sender.use(settings_of(self._path))
+            except PhalanxError as error:
+                notify(f"{error}; the settings stay as they were")
+        self._echo()
+        self._bus.publish("health", NAME, self.health())
+
+    def health(self) -> Health:
+        """The report, with what was lost on the way here."""
+        return self._sender.health(sum(subscriber.dropped for subscriber in self._subscribers))
+
+    def _echo(self) -> None:
+        asked_ns = self._clock.now_ns()
+        try:
+            master_ns = self._bus.ask(Command(MASTER, "report"), 0.5).t_ns
+        except BusError:
+            return  # no master now: nothing comes from it either
+        self._sender.times.push(asked_ns, master_ns, self._clock.now_ns())
+
+
+def run_sender(
+    bus: Bus,
+    settings: OutputSettings,
+    path: Path,
+    only: Collection[str],
+    stop: threading.Event,
+    notify: Callable[[str], None],
+) -> None:
+    """Send until `stop` is set or the command `stop` comes.
+
+    The bus belongs to the caller.
+
+    Raises:
+        BusError: The bus is closed.
+        PhalanxError: `only` names an output that there is not.
+    """
+    subscribers = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
+    sender = Sender(settings, only, notify)
+    housekeeping = Housekeeping(sender, bus, path, subscribers)
+
+    def obey(command: Command) -> Health:
+        sender.obey(command)
+        if command.verb == "stop":
+            stop.set()
+        return housekeeping.health()
+
+    bus.serve(NAME, obey)
+    bus.announce(NAME)
+    for name in sender.on:
+        notify(f"{name}: {sender.where(name)}")
+    if not sender.on:
+        notify(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
+    thread = threading.Thread(
+        target=lambda: _report_until(housekeeping, stop, notify), name="outputs report", daemon=True
+    )
+    thread.start()
+    try:
+        while not stop.is_set():
+            _drain(subscribers, sender)
+    finally:
+        stop.set()
+        thread.join(2.0)
+        sender.close()
+        for subscriber in subscribers:
+            subscriber.close()
+
+
+def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Callable[[str], None]) -> None:
+    while not stop.wait(1.0):
+        try:
+            housekeeping.step(notify)
+        except BusError:
+            return  # closing
+
+
+def _drain(subscribers: list[Subscription], sender: Sender) -> None:
+    """Forward all pending messages.
+
+    If there are none, wait for a hand, since the other messages come with hands.
+    """
+    hands, *others = subscribers
+    message = hands.get(_POLL_S)
+    while message is not None:
+        _push(sender, message)
+        message = hands.get(0.0)
+    for subscriber in others:
+        while (message := subscriber.get(0.0)) is not None:
+            _push(sender, message)
+
+
+def _push(sender: Sender, message: Message) -> None:
+    if isinstance(message, ResultMessage):
+        sender.push(message)
+
+
+def refuse_unknown(names: Collection[str]) -> None:
+    """Refuse names of outputs that there are not.
+
+    Raises:
+        PhalanxError: With what there is.
+    """
+    for name in names:
+        _known(name)
+
+
+def _known(name: str) -> None:
+    if name not in OUTPUTS:
+        raise PhalanxError(f"output {name!r}: unknown; there are {', '.join(OUTPUTS)}")

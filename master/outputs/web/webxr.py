@@ -1,0 +1,167 @@
+"""Hand as JSON in the joint order of WebXR Hand Input.
+
+Web pages, game engines and scripts read it.
+
+Two frames are offered. `webxr` (the usual): x right, y up, z towards the viewer, so that the hand is before an eye at
+the origin that looks along -z, as the reference camera does. It is the rig frame (x right, y down, z away) turned by pi
+about x, which maps
+
+    (x, y, z) -> (x, -y, -z)        w + xi + yj + zk -> i (w + xi + yj + zk) = -x + wi - zj + yk
+
+Joint axes need no turn: those of OpenXR (-z along the bone to the tip, +y dorsal) are those of WebXR. `rig` leaves all
+as it is. The message states which of the two it is in.
+
+Numbers are rounded to 1 um and 1e-6 of a quaternion: far below the noise, and half the bytes.
+"""
+
+from math import isnan
+from typing import Literal
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from common.arrays import Float
+from common.hand.model import WEBXR_JOINTS
+from common.messages import HandPose, ObjectPose, ObjectSource, Source
+from master.outputs.network.sides import Side, side_of
+
+FORMAT_VERSION = 1
+Frame = Literal["webxr", "rig"]
+Triple = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+
+_SOURCES = tuple(source.name.lower() for source in Source)
+_OBJECT_SOURCES = tuple(source.name.lower() for source in ObjectSource)
+_POINT_SIGNS: dict[Frame, Float] = {"webxr": np.array([1.0, -1.0, -1.0]), "rig": np.ones(3)}
+# x, y, z, w of the message: which of w, x, y, z it is, and with which sign.
+_QUATERNION_ORDER: dict[Frame, tuple[list[int], Float]] = {
+    "webxr": ([0, 3, 2, 1], np.array([1.0, -1.0, 1.0, -1.0])),
+    "rig": ([1, 2, 3, 0], np.ones(4)),
+}
+_ENCODER = msgspec.json.Encoder()  # writes NaN as null
+
+
+class JointJson(Struct, frozen=True):
+    """One joint.
+
+    Attributes:
+        name: As in WebXR Hand Input.
+        position: [m], frame of the message. None: not known.
+        orientation: Unit quaternion x, y, z, w with w >= 0, joint axes -> frame of the message. None: not known.
+        radius: From the joint to the skin [m]; NaN: not known.
+        valid: The pose may be used.
+        tracked: It is observed now, not inferred; tracked implies valid.
+        sigma_mm: Standard deviation of the position per axis [mm], root mean square of the three. NaN: not known.
+        source: none, measured, solved, held or wrist (`common.messages.Source`).
+    """
+
+    name: str
+    position: Triple | None
+    orientation: Four | None
+    radius: float
+    valid: bool
+    tracked: bool
+    sigma_mm: float
+    source: str
+
+
+class HandJson(Struct, frozen=True, tag_field="type", tag="hand"):
+    """One hand at one time: the JSON object of `webxr_json`.
+
+    `joints` are 25 in the order of WebXR.
+    """
+
+    version: int
+    frame: Frame
+    hand: str
+    side: Side | None
+    t_ns: int
+    latency_ms: float
+    joints: list[JointJson]
+
+
+class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
+    """One rigid object at one time: the JSON object of `object_json`.
+
+    Fields as in `JointJson` and `ObjectPose`.
+    """
+
+    version: int
+    frame: Frame
+    object: str
+    t_ns: int
+    latency_ms: float
+    position: Triple | None
+    orientation: Four | None
+    tracked: bool
+    source: str
+
+
+def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
+    """Encode the pose as JSON (`HandJson`), without line feeds.
+
+    What is not known is null, never NaN.
+    """
+    points = _points(pose.position_m[1:], frame)
+    rotations = _quaternions(pose.orientation_wxyz[1:], frame)
+    sigma_mm: Float = np.sqrt(np.einsum("jii->j", pose.cov_m2[1:]) / 3.0) * 1e3
+    columns = zip(
+        WEBXR_JOINTS,
+        points,
+        rotations,
+        np.round(pose.radius_m[1:], 6).tolist(),
+        pose.valid[1:].tolist(),
+        pose.tracked[1:].tolist(),
+        np.round(sigma_mm, 3).tolist(),
+        [_SOURCES[code] for code in pose.source[1:].tolist()],
+        strict=True,
+    )
+    joints = [JointJson(*column) for column in columns]
+    latency_ms = round(pose.latency_ns / 1e6, 3)
+    return _ENCODER.encode(
+        HandJson(FORMAT_VERSION, frame, pose.hand, side_of(pose), pose.t_ns, latency_ms, joints)
+    )
+
+
+def object_json(pose: ObjectPose, frame: Frame = "webxr") -> bytes:
+    """Encode the pose of an object as JSON (`ObjectJson`).
+
+    What is not known is null, never NaN.
+    """
+    return _ENCODER.encode(
+        ObjectJson(
+            version=FORMAT_VERSION,
+            frame=frame,
+            object=pose.object,
+            t_ns=pose.t_ns,
+            latency_ms=round(pose.latency_ns / 1e6, 3),
+            position=_points(pose.position_m[None], frame)[0],
+            orientation=_quaternions(pose.orientation_wxyz[None], frame)[0],
+            tracked=pose.tracked,
+            source=_OBJECT_SOURCES[pose.source],
+        )
+    )
+
+
+def _points(position_m: Float, frame: Frame) -> list[Triple | None]:
+    """Points (N, 3) [m] of the rig frame in the frame of the message."""
+    # Adding 0 turns -0.0, which JSON would show, into 0.0.
+    rows = (np.round(position_m * _POINT_SIGNS[frame], 6) + 0.0).tolist()
+    return [tuple(row) if _known(row) else None for row in rows]
+
+
+def _quaternions(orientation_wxyz: Float, frame: Frame) -> list[Four | None]:
+    """Convert quaternions (N, 4) from the rig frame to the frame of the message.
+
+    They rotate to the rig frame, as w x y z; the result rotates to the frame of the message, as x y z w.
+    """
+    order, signs = _QUATERNION_ORDER[frame]
+    rotations = orientation_wxyz[:, order] * signs
+    rotations = np.where(rotations[:, 3:] < 0.0, -rotations, rotations)
+    return [tuple(row) if _known(row) else None for row in (np.round(rotations, 6) + 0.0).tolist()]
+
+
+def _known(row: list[float]) -> bool:
+    """Whether no number of the row is NaN."""
+    return not isnan(sum(row))

@@ -1,0 +1,1 @@
+"""Export: recorded hands enter, CSV, Parquet, BVH, glTF and Rerun files leave."""

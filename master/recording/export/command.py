@@ -1,0 +1,117 @@
+"""`phalanx export`: what was recorded of hands, for every other tool."""
+
+import sys
+from argparse import Namespace
+
+from common.clock import now_ns
+from common.errors import PhalanxError
+from common.terminal import echo
+from master.commands.summary import write_summary
+from master.recording.lines import ProgressLine, bar
+
+_EVERY_NS = 100_000_000
+_MOTION = ("bvh", "gltf")
+
+
+def export(options: Namespace) -> None:
+    """Export recorded hands for other tools.
+
+    The formats are tables, motion capture, an animated model and Rerun.
+    """
+    if options.compare is not None:
+        for given, option in (
+            (options.to, "--to"),
+            (options.out, "--out"),
+            (options.hand, "--hand"),
+            (options.up, "--up"),
+        ):
+            _refuse(bool(given), option, "exporting", f"--compare {options.compare}")
+        from master.mocap.read import Reading
+        from master.recording.export import truth
+        from master.recording.export.window import Window
+
+        part, how = (
+            Window(options.from_s, options.to_s),
+            Reading(options.joints, options.unit, options.side, options.rate),
+        )
+        wanted = truth.Wanted(
+            how,
+            tuple(options.only or ()),
+            part,
+            options.aligned,
+            options.calibration,
+            tuple(options.rig or ()),
+        )
+        found = truth.compare_source(
+            options.source, options.compare, wanted, lambda line: echo(f"compare: {line}")
+        )
+        if options.json_file is not None:
+            write_summary(options.json_file, found)
+        return
+    if options.to is None:
+        raise PhalanxError("give --to FORMAT to export, or --compare FILE to hold the poses against it")
+    for given, option in (
+        (options.joints, "--joints"),
+        (options.side, "--side"),
+        (options.aligned, "--aligned"),
+        (options.json_file, "--json"),
+    ):
+        _refuse(bool(given), option, "--compare", f"--to {options.to}")
+    _refuse(
+        options.to not in _MOTION and options.rate is not None, "--rate", "bvh and gltf", f"--to {options.to}"
+    )
+    _refuse(
+        options.to not in _MOTION and options.up is not None, "--up", "bvh and gltf", f"--to {options.to}"
+    )
+    _refuse(options.to != "bvh" and options.unit is not None, "--unit", "bvh", f"--to {options.to}")
+    _refuse(options.to != "rrd" and bool(options.rig), "--rig", "rrd", f"--to {options.to}")
+    # Imported here: what writes these formats takes a second to load, which no other command should wait for.
+    from master.recording.export.bvh import Axes
+    from master.recording.export.run import Wanted
+    from master.recording.export.run import export as export_source
+    from master.recording.export.window import Window
+
+    wanted = Wanted(
+        options.to,
+        options.out,
+        tuple(options.only or ()),
+        tuple(options.hand or ()),
+        options.calibration,
+        tuple(options.rig or ()),
+        Window(options.from_s, options.to_s),
+        options.rate,
+        Axes(options.unit or "cm", options.up or "y"),
+    )
+    progress = _Progress()
+    export_source(options.source, wanted, progress.notify, progress.update)
+
+
+def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
+    if wrong:
+        raise PhalanxError(f"{option} is for {purpose}, and this is {this}")
+
+
+class _Progress:
+    """Progress bar of an export, and the lines of what is done.
+
+    Holds when the bar was drawn last.
+    """
+
+    def __init__(self) -> None:
+        self._line = ProgressLine(sys.stderr, "export")
+        self._shown_ns = now_ns()
+
+    def update(self, what: str, done: int, total: int) -> None:
+        """Redraw the progress bar.
+
+        Where no terminal shows the bar in place it is omitted: files are written in seconds.
+        """
+        if sys.stderr.isatty() and now_ns() - self._shown_ns > _EVERY_NS:
+            self._shown_ns = now_ns()
+            self._line.show(f"{bar(done / max(total, 1))} {what}, {done} of {total}")
+
+    def notify(self, line: str) -> None:
+        """Something is done."""
+        if sys.stderr.isatty():
+            sys.stderr.write("\r\x1b[K")
+        echo(f"export: {line}")

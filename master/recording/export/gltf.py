@@ -1,0 +1,236 @@
+"""glTF 2.0 export of a hand as an animated, skinned model.
+
+Blender, Unity, Unreal, Godot, three.js and model viewers read it.
+
+Its skeleton is 26 nodes named and turned like the joints of OpenXR, in metres; its bind pose is the rest pose of the
+hand profile. Each pose is a key at its own time, in seconds from the first; between keys a reader goes linearly in the
+frame of the parent, over a gap the hand stands still. A joint has keys of its place only where its bone is not rigid.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+from pygltflib import (
+    ARRAY_BUFFER,
+    ELEMENT_ARRAY_BUFFER,
+    FLOAT,
+    GLTF2,
+    UNSIGNED_BYTE,
+    UNSIGNED_INT,
+    Accessor,
+    Animation,
+    AnimationChannel,
+    AnimationChannelTarget,
+    AnimationSampler,
+    Asset,
+    Attributes,
+    Buffer,
+    BufferFormat,
+    BufferView,
+    Material,
+    Mesh,
+    Node,
+    PbrMetallicRoughness,
+    Primitive,
+    Scene,
+)
+from pygltflib import Skin as GltfSkin
+
+from common.arrays import Float
+from common.calibration.replacing import replacing
+from common.geometry.transforms import quaternion_to_matrix
+from common.hand.model import JOINTS, WRIST
+from master.recording.export.bvh import RIGID_M, Up, upright
+from master.recording.export.hand_mesh import Skin, skin_of
+from master.recording.export.motion import Motion, local
+from master.recording.export.skeleton import CHILDREN, PARENT, Skeleton, back, name_of, rotate, times
+
+_STILL = 1e-6  # of a quaternion
+_HOLD_S = 1e-3  # before the end of a gap the hand still stands where it was
+_COLOUR = [0.80, 0.62, 0.52, 1.0]
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_TYPES = {"f": FLOAT, "I": UNSIGNED_INT, "B": UNSIGNED_BYTE}
+
+
+@dataclass(slots=True)
+class _Data:
+    """The model's bytes so far, and what stands where in them."""
+
+    gltf: GLTF2
+    blob: bytearray = field(default_factory=bytearray)
+
+    def add(self, array: npt.NDArray[np.generic], target: int | None = None, *, bounds: bool = False) -> int:
+        """Append the rows of an array; return the number of its accessor."""
+        self.gltf.bufferViews.append(
+            BufferView(buffer=0, byteOffset=len(self.blob), byteLength=array.nbytes, target=target)
+        )
+        self.blob += array.tobytes()
+        self.blob += b"\0" * (-len(self.blob) % 4)
+        width = int(np.prod(array.shape[1:]))
+        rows = array.reshape(len(array), width)
+        accessor = Accessor(
+            bufferView=len(self.gltf.bufferViews) - 1,
+            componentType=_TYPES[array.dtype.char],
+            count=len(array),
+            type=_KINDS[width],
+        )
+        if bounds:
+            accessor.min, accessor.max = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
+        self.gltf.accessors.append(accessor)
+        return len(self.gltf.accessors) - 1
+
+
+def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[int, ...]:
+    """Write a motion as .glb or .gltf, by the name of the file.
+
+    A .gltf has all data inside.
+
+    Args:
+        path: The file; replaced only by a complete one.
+        motion: Rig frame, one time or more.
+        skeleton: The hand at rest.
+        up: See `bvh.Axes`; y is what glTF means.
+
+    Returns:
+        The joints, without the wrist, that have keys of their place because their bone is not rigid.
+
+    Raises:
+        OSError: It cannot be written; nothing half written is left.
+    """
+    data = _Data(GLTF2(asset=Asset(version="2.0", generator="Phalanx", extras=_about(motion, skeleton, up))))
+    _nodes(data, skeleton)
+    _skin(data, skeleton, skin_of(skeleton))
+    free = _animation(data, local(with_holds(upright(motion, up))), skeleton)
+    data.gltf.buffers.append(Buffer(byteLength=len(data.blob)))
+    data.gltf.set_binary_blob(bytes(data.blob))
+    with replacing(path) as file:
+        if path.suffix == ".gltf":
+            data.gltf.convert_buffers(BufferFormat.DATAURI)
+            file.write(data.gltf.gltf_to_json().encode())
+        else:
+            file.writelines(cast(list[bytes], data.gltf.save_to_bytes()))
+    return free
+
+
+def _about(motion: Motion, skeleton: Skeleton, up: Up) -> dict[str, object]:
+    return {
+        "hand": skeleton.hand,
+        "side": skeleton.side,
+        "up": up,
+        "first_t_ns": str(int(motion.t_ns[0])),  # more digits than a number of JSON has everywhere
+        "held_keys": motion.held_frames,
+    }
+
+
+def with_holds(motion: Motion) -> Motion:
+    """Return the motion with a hold key just before the end of every gap.
+
+    At that key the hand is still as it was at the beginning of the gap.
+    """
+    gaps = np.flatnonzero(np.diff(motion.t_ns) > motion.gap_ns)
+    rows = np.sort(np.concatenate([np.arange(len(motion)), gaps]))
+    t_ns = motion.t_ns[rows].copy()
+    second = np.append(False, rows[1:] == rows[:-1])
+    after = motion.t_ns[np.minimum(rows + 1, len(motion) - 1)]
+    t_ns[second] = after[second] - round(_HOLD_S * 1e9)
+    return Motion(
+        t_ns, motion.position_m[rows], motion.orientation_wxyz[rows], motion.held[rows], motion.gap_ns
+    )
+
+
+def _nodes(data: _Data, skeleton: Skeleton) -> None:
+    """Nodes 0 ... 25 are the joints, 26 is the mesh, 27 holds the joints."""
+    at, q = _rest(skeleton)
+    for joint in range(len(JOINTS)):
+        data.gltf.nodes.append(
+            Node(
+                name=name_of(joint),
+                translation=at[joint].tolist(),
+                rotation=_xyzw(q[joint]).tolist(),
+                children=list(CHILDREN[joint]),
+            )
+        )
+    mesh, whole = len(JOINTS), len(JOINTS) + 1
+    data.gltf.nodes.append(Node(name=f"{skeleton.hand} skin", mesh=0, skin=0))
+    data.gltf.nodes.append(Node(name=skeleton.hand, children=[WRIST]))
+    data.gltf.scenes.append(Scene(nodes=[whole, mesh]))  # a skinned mesh goes by its joints, not by a parent
+    data.gltf.scene = 0
+
+
+def _rest(skeleton: Skeleton) -> tuple[Float, Float]:
+    """Return the joints at rest in the frame of their parent: (26, 3) [m], (26, 4).
+
+    The wrist is in the palm's frame.
+    """
+    at, q = skeleton.position_m.copy(), skeleton.orientation_wxyz.copy()
+    for joint, parent in PARENT.items():
+        there = back(skeleton.orientation_wxyz[parent])
+        at[joint] = rotate(there, skeleton.position_m[joint] - skeleton.position_m[parent])
+        q[joint] = times(there, skeleton.orientation_wxyz[joint])
+    return at, q
+
+
+def _xyzw(q_wxyz: Float) -> Float:
+    return np.roll(q_wxyz, -1, axis=-1)
+
+
+def _skin(data: _Data, skeleton: Skeleton, skin: Skin) -> None:
+    """The mesh, and which vertex moves with which joint."""
+    joints = np.zeros((len(skin.joint), 4), np.uint8)
+    joints[:, 0] = skin.joint
+    weights = np.zeros((len(skin.joint), 4), "<f4")
+    weights[:, 0] = 1.0
+    attributes = Attributes(
+        POSITION=data.add(skin.vertex_m.astype("<f4"), ARRAY_BUFFER, bounds=True),
+        NORMAL=data.add(skin.normal.astype("<f4"), ARRAY_BUFFER),
+        JOINTS_0=data.add(joints, ARRAY_BUFFER),
+        WEIGHTS_0=data.add(weights, ARRAY_BUFFER),
+    )
+    triangles = data.add(skin.triangle.astype("<u4").reshape(-1, 1), ELEMENT_ARRAY_BUFFER)
+    look = PbrMetallicRoughness(baseColorFactor=_COLOUR, metallicFactor=0.0, roughnessFactor=0.65)
+    data.gltf.materials.append(Material(name="skin", pbrMetallicRoughness=look))
+    data.gltf.meshes.append(
+        Mesh(name=skeleton.hand, primitives=[Primitive(attributes=attributes, indices=triangles, material=0)])
+    )
+    bind = np.zeros((len(JOINTS), 4, 4))
+    rotation = quaternion_to_matrix(skeleton.orientation_wxyz).swapaxes(1, 2)
+    bind[:, :3, :3], bind[:, 3, 3] = rotation, 1.0
+    bind[:, :3, 3] = -(rotation @ skeleton.position_m[..., None])[..., 0]
+    by_columns = np.ascontiguousarray(bind.swapaxes(1, 2)).astype("<f4").reshape(-1, 16)
+    data.gltf.skins.append(
+        GltfSkin(
+            name=skeleton.hand,
+            skeleton=WRIST,
+            joints=list(range(len(JOINTS))),
+            inverseBindMatrices=data.add(by_columns),
+        )
+    )
+
+
+def _animation(data: _Data, own: Motion, skeleton: Skeleton) -> tuple[int, ...]:
+    """Keys of all that moves; what stands still is set in its node."""
+    at, q = _rest(skeleton)
+    times_s = ((own.t_ns - own.t_ns[0]) * 1e-9).astype("<f4")
+    clip = Animation(name=skeleton.hand)
+    keys = data.add(times_s.reshape(-1, 1), bounds=True)
+    free: list[int] = []
+    for joint in range(len(JOINTS)):
+        moves = float(np.abs(own.position_m[:, joint] - at[joint]).max()) > RIGID_M
+        if moves:
+            _channel(data, clip, keys, joint, "translation", own.position_m[:, joint])
+            if joint != WRIST:
+                free.append(joint)
+        from_rest = 1.0 - np.abs(own.orientation_wxyz[:, joint] @ q[joint])
+        if joint == WRIST or float(from_rest.max()) > _STILL**2:
+            _channel(data, clip, keys, joint, "rotation", _xyzw(own.orientation_wxyz[:, joint]))
+    data.gltf.animations.append(clip)
+    return tuple(free)
+
+
+def _channel(data: _Data, clip: Animation, keys: int, joint: int, path: str, values: Float) -> None:
+    clip.samplers.append(AnimationSampler(input=keys, output=data.add(values.astype("<f4"))))
+    target = AnimationChannelTarget(node=joint, path=path)
+    clip.channels.append(AnimationChannel(sampler=len(clip.samplers) - 1, target=target))

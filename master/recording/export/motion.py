@@ -1,0 +1,235 @@
+"""Motion of one hand without gaps, which can be resampled to any frame rate.
+
+Missing poses are held and counted.
+
+Formats of animation know no "not observed", every joint of every frame must be somewhere. A joint that a pose does not
+have (not valid, or NaN) stays as it last was *to its parent*, so that it goes along with what is seen of the hand;
+before it was first seen it is as then, and one that never was is at rest. The wrist stays where it last was.
+
+Between two poses each joint is interpolated in the frame of its parent, its place linearly, its turn along the
+shortest arc: bones that are rigid in the poses stay rigid between them, which they would not between places in the rig
+frame. Over a gap in time nothing is interpolated: the hand stands still.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import RecordingError
+from common.hand.model import WRIST
+from master.outputs.poses import Poses
+from master.recording.export.skeleton import ORDER, PARENT, Skeleton, back, rotate, times
+
+GAP_S = 0.25  # without a pose: longer than that nobody knows how the hand went
+_GAP_POSES = 3.0  # of a source that is as slow as that all the time
+# A frame takes 7 kB while it is made, so one late pose must not cost what it likes. There may be a break of ten minutes
+# at 60 Hz, and 16 frames for each pose (of poses at 15 Hz, 240 frames/s).
+FREE_FRAMES, FRAMES_OF_POSE = 36_000, 16
+MOST_FRAMES = 1_000_000  # 4.6 hours at 60 Hz
+_DENSE, _MOST_HZ = 10.0, 1000.0  # per cent of the steps
+_UNIT = 0.5  # a quaternion shorter than that is none
+_STRAIGHT = 1e-7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Motion of one hand at T epochs, with all joints at every epoch.
+
+    Attributes:
+        t_ns: (T,) [ns], rising.
+        position_m: (T, 26, 3) [m], rig frame; of `local` in the frame of the joint's parent, the wrist in the rig's.
+        orientation_wxyz: (T, 26, 4) unit quaternions, joint -> the same frame.
+        held: (T, 26) not observed at that time.
+        gap_ns: Two times that are farther apart have nothing between them.
+    """
+
+    t_ns: Int
+    position_m: Float
+    orientation_wxyz: Float
+    held: Bool
+    gap_ns: int
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def held_frames(self) -> int:
+        """Return the number of epochs at which some joint is held."""
+        return int(self.held.any(axis=1).sum())
+
+    @property
+    def rate_hz(self) -> float:
+        """Return the frame rate of the poses where they are densest.
+
+        A late pose thus makes no file coarser. The rate is rounded where it is nearly a whole number.
+
+        60 where there is one pose alone.
+        """
+        if len(self) < 2:
+            return 60.0
+        rate = min(1e9 / float(np.percentile(np.diff(self.t_ns), _DENSE)), _MOST_HZ)
+        return round(rate) if rate > 0.5 and abs(rate / round(rate) - 1.0) < 0.01 else rate
+
+
+def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
+    """Return all poses of a hand as a motion, in order of time.
+
+    Of two poses at one epoch the later one is taken.
+
+    Raises:
+        RecordingError: No pose has a wrist that may be used.
+    """
+    t_ns, position, orientation, usable = _stacked(batches)
+    if not usable[:, WRIST].any():
+        raise RecordingError(f"hand {skeleton.hand!r}: none of its {len(t_ns)} poses is valid")
+    for joint in ORDER:
+        good = usable[:, joint]
+        if joint == WRIST:
+            row = _last(good)
+            position[:, joint], orientation[:, joint] = position[row, joint], orientation[row, joint]
+            continue
+        at, q = _held(joint, usable, position, orientation, skeleton)
+        parent = PARENT[joint]
+        away = position[:, parent] + rotate(orientation[:, parent], at)
+        position[:, joint] = np.where(good[:, None], position[:, joint], away)
+        composed = times(orientation[:, parent], q)
+        orientation[:, joint] = np.where(good[:, None], orientation[:, joint], composed)
+    typical_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * typical_ns)))
+
+
+def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
+    """Return times, positions, rotations and their usable mask, in order of time.
+
+    Where a pose may not be used it is the identity.
+    """
+    parts = [
+        (poses.t_ns, poses.position_m, poses.orientation_wxyz, poses.valid) for poses in batches if len(poses)
+    ]
+    if not parts:
+        return np.empty(0, np.int64), np.empty((0, 26, 3)), np.empty((0, 26, 4)), np.empty((0, 26), np.bool_)
+    t_ns, position, orientation, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(t_ns, kind="stable")
+    order = order[np.append(np.diff(t_ns[order]) > 0, True)]
+    t_ns, position, orientation, valid = (column[order] for column in (t_ns, position, orientation, valid))
+    length = np.sqrt(np.vecdot(orientation, orientation))
+    usable = valid & np.isfinite(position).all(axis=2) & (length > _UNIT)  # NaN is not longer than anything
+    position = np.where(usable[..., None], position, 0.0)
+    orientation = np.where(usable[..., None], orientation, [1.0, 0.0, 0.0, 0.0])
+    return t_ns, position, orientation / np.where(usable, length, 1.0)[..., None], usable
+
+
+def _last(good: Bool) -> Int:
+    """Return for each row the index of the last good row up to it (T,).
+
+    Where there is none yet, it is the first good one of all; at least one is good.
+    """
+    rows = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))
+    return np.where(rows < 0, np.argmax(good), rows)
+
+
+def _held(
+    joint: int, usable: Bool, position: Float, orientation: Float, skeleton: Skeleton
+) -> tuple[Float, Float]:
+    """Return the last pose of a joint relative to its parent, (T, 3) and (T, 4).
+
+    It is the last one at which both were seen, or the rest pose if they never were.
+    """
+    parent = PARENT[joint]
+    both = usable[:, joint] & usable[:, parent]
+    if not both.any():
+        q = back(skeleton.orientation_wxyz[parent])
+        at = rotate(q, skeleton.position_m[joint] - skeleton.position_m[parent])
+        shape = (len(usable), 1)
+        return np.tile(at, shape), np.tile(times(q, skeleton.orientation_wxyz[joint]), shape)
+    row = _last(both)
+    q = back(orientation[row, parent])
+    return (
+        rotate(q, position[row, joint] - position[row, parent]),
+        times(q, orientation[row, joint]),
+    )
+
+
+def local(motion: Motion) -> Motion:
+    """Return each joint in the frame of its parent.
+
+    The wrist is in the rig frame; quaternions have no jumps of sign.
+    """
+    position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
+    for joint, parent in PARENT.items():
+        q = back(motion.orientation_wxyz[:, parent])
+        position[:, joint] = rotate(q, motion.position_m[:, joint] - motion.position_m[:, parent])
+        orientation[:, joint] = times(q, motion.orientation_wxyz[:, joint])
+    flips = np.vecdot(orientation[1:], orientation[:-1]) < 0.0
+    sign = np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
+    orientation[1:] *= sign[..., None]
+    return Motion(motion.t_ns, position, orientation, motion.held, motion.gap_ns)
+
+
+def world(motion: Motion) -> Motion:
+    """The way back from `local`."""
+    position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
+    for joint, parent in PARENT.items():
+        position[:, joint] = position[:, parent] + rotate(orientation[:, parent], position[:, joint])
+        orientation[:, joint] = times(orientation[:, parent], orientation[:, joint])
+    return Motion(motion.t_ns, position, orientation, motion.held, motion.gap_ns)
+
+
+def resample(motion: Motion, rate_hz: float) -> Motion:
+    """Resample the motion at a constant rate from its first epoch on.
+
+    It ends at most at its last epoch.
+
+    A frame is held where one of the two poses beside it is, and in a gap.
+
+    Args:
+        motion: In the rig frame.
+        rate_hz: Positive.
+
+    Raises:
+        RecordingError: That would be more frames than fit in memory.
+    """
+    count = 1 + int((motion.t_ns[-1] - motion.t_ns[0]) * 1e-9 * rate_hz + 1e-6)
+    most = min(FREE_FRAMES + FRAMES_OF_POSE * len(motion), MOST_FRAMES)
+    if count > most:
+        raise RecordingError(
+            f"{count} frames at {rate_hz:g} Hz, at most {most} of {len(motion)} poses: export one part, with --from and"
+            " --until, or at a lower --rate"
+        )
+    t_ns = motion.t_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    passed = cast(Int, np.searchsorted(motion.t_ns, t_ns, side="right"))
+    before = np.maximum(passed - 1, 0)
+    after: Int = np.minimum(before + 1, len(motion) - 1)
+    span = motion.t_ns[after] - motion.t_ns[before]
+    share = np.clip((t_ns - motion.t_ns[before]) / np.maximum(span, 1), 0.0, 1.0)
+    gap = (span > motion.gap_ns) & (share > 0.0) & (share < 1.0)
+    share = np.where(gap, 0.0, share)[:, None]
+    own = local(motion)
+    position = _between(own.position_m, before, after, share)
+    orientation = slerp(own.orientation_wxyz[before], own.orientation_wxyz[after], share)
+    held = motion.held[before] | (motion.held[after] & (share > 0.0)) | gap[:, None]
+    return world(Motion(t_ns, position, orientation, held, motion.gap_ns))
+
+
+def _between(values: Float, before: Int, after: Int, share: Float) -> Float:
+    first = values[before]
+    return first + share[..., None] * (values[after] - first)
+
+
+def slerp(first: Float, second: Float, share: Float) -> Float:
+    """Interpolate unit quaternions (..., 4) on the shorter arcs.
+
+    Shares (...) are of the way between the two (Shoemake, 1985).
+    """
+    cosine = np.vecdot(first, second)
+    second = np.where(cosine[..., None] < 0.0, -second, second)
+    angle = np.arccos(np.minimum(np.abs(cosine), 1.0))
+    near = angle < _STRAIGHT
+    sine = np.where(near, 1.0, np.sin(angle))
+    a = np.where(near, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
+    b = np.where(near, share, np.sin(share * angle) / sine)
+    out = a[..., None] * first + b[..., None] * second
+    return out / np.sqrt(np.vecdot(out, out))[..., None]

@@ -1,0 +1,1 @@
+"""Offline solving: recorded frames or detections enter, the same poses leave."""

@@ -1,0 +1,1 @@
+"""A rig and its files: a calibration folder enters, checked setups leave."""

@@ -1,0 +1,209 @@
+"""Rigs grouped by the hand that they observe.
+
+Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Objects are
+those of all of them together.
+
+Each pair of cameras is calibrated in a frame of its own; `T_world_rig` is where that lies in the one they share. What
+rigs of one hand specify twice must be specified alike: a silent choice between two filters would be nobody's.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import ImuCalibration, Provenance, RigCalibration, Volume
+from common.calibration.parts import Matrix4, Quaternion, Row4, Vector3
+from common.calibration.rig import check_places
+from common.errors import CalibrationError
+from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
+from common.hand.model import HandModel
+
+_ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
+_UNTURNED = 1e-9  # of a rotation matrix that turns nothing
+
+
+def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
+    """Merge marker rigs into one with the cameras of all of them.
+
+    In their order and in the frame that they share.
+
+    It triangulates by all of them, whatever law of two cameras each has (`depth_model` "stereo"). Its residual is that
+    of the rig that was measured worst. It states the first volume that a rig states, where that is a box along the axes
+    of the shared frame, and the first place of a tracking system and file of gestures.
+
+    Raises:
+        CalibrationError: They share a camera, two cameras stand in
+            one place, or markers, filter, pairing or solver differ.
+    """
+    placed = [in_world(rig) for rig in rigs]
+    if len(placed) == 1:
+        return placed[0]
+    refuse_shared_senders(rigs)
+    first = placed[0]
+    for rig in placed:
+        for key in _ALIKE:
+            if getattr(rig, key) != getattr(first, key):
+                raise CalibrationError(
+                    f"rigs {first.name!r} and {rig.name!r}: {key}: differ, and both watch hand {first.hand!r}"
+                )
+    merged = replace(
+        first,
+        name="_and_".join(rig.name for rig in placed),
+        cameras=tuple(name for rig in placed for name in rig.cameras),
+        depth_model="stereo",
+        T_rig_camera={name: pose for rig in placed for name, pose in rig.T_rig_camera.items()},
+        stamp_offset_us={name: us for rig in placed for name, us in rig.stamp_offset_us.items()},
+        volume=next((rig.volume for rig in placed if rig.volume is not None), None),
+        provenance=_worst_places(placed),
+        imu=next((rig.imu for rig in placed if rig.imu is not None), None),
+        objects=tuple(dict.fromkeys(name for rig in placed for name in rig.objects)),
+        T_rig_tracking=next((rig.T_rig_tracking for rig in placed if rig.T_rig_tracking is not None), None),
+        gestures=gestures_named(placed),
+    )
+    check_places(merged, f"rigs {' and '.join(repr(rig.name) for rig in placed)} in one frame (T_world_rig)")
+    return merged
+
+
+def gestures_named(rigs: Sequence[RigCalibration]) -> str | None:
+    """Which file of gestures rigs of one hand name; None: none does.
+
+    Raises:
+        CalibrationError: They name two.
+    """
+    named = [rig for rig in rigs if rig.gestures is not None]
+    for rig in named[1:]:
+        if rig.gestures != named[0].gestures:
+            raise CalibrationError(
+                f"rigs {named[0].name!r} and {rig.name!r}: gestures: differ, and both watch hand {rig.hand!r}"
+            )
+    return named[0].gestures if named else None
+
+
+def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
+    """Refuse rigs that share the name of a camera or an IMU.
+
+    A message identifies its sender by that name alone.
+
+    Raises:
+        CalibrationError: With both rigs and the name.
+    """
+    owner: dict[str, RigCalibration] = {}
+    for rig in rigs:
+        for sender in (*rig.cameras, *(() if rig.imu is None else (rig.imu.name,))):
+            if sender in owner:
+                raise CalibrationError(
+                    f"rigs {owner[sender].name!r} and {rig.name!r} both have {sender!r}: every camera and every IMU"
+                    " has a name of its own"
+                )
+            owner[sender] = rig
+
+
+def rigs_by_hand(
+    rig: RigCalibration, hands: Mapping[str, HandModel]
+) -> list[tuple[str, RigCalibration, tuple[int, ...]]]:
+    """Split a rig by hand.
+
+    For each hand: its name, the rig as if it observed that hand alone, and which of the rig's markers those are.
+
+    A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free markers
+    and objects stay with its first hand.
+
+    Raises:
+        CalibrationError: A marker is mounted by none of the hands or by two, or a hand mounts none.
+    """
+    if len(hands) == 1:
+        return [(rig.hand, rig, tuple(range(len(rig.markers))))]
+    owner: dict[str, str] = dict.fromkeys(rig.free_markers, rig.hand)
+    for marker in rig.markers:
+        if marker in rig.free_markers:
+            continue
+        owners = [name for name, hand in hands.items() if marker in hand.profile.markers]
+        if len(owners) != 1:
+            who = " and ".join(owners) or f"none of {', '.join(hands)}"
+            raise CalibrationError(
+                f"rig {rig.name!r}: other_hands: marker {marker!r} is mounted by {who}; each is of one hand"
+            )
+        owner[marker] = owners[0]
+    parts: list[tuple[str, RigCalibration, tuple[int, ...]]] = []
+    for name in hands:
+        chosen = tuple(m for m, marker in enumerate(rig.markers) if owner[marker] == name)
+        if not chosen:
+            raise CalibrationError(f"rig {rig.name!r}: other_hands: {name!r} mounts none of its markers")
+        own = replace(
+            rig,
+            hand=name,
+            other_hands=(),
+            markers=tuple(rig.markers[m] for m in chosen),
+            free_markers=rig.free_markers if name == rig.hand else (),
+            objects=rig.objects if name == rig.hand else (),
+        )
+        parts.append((name, own, chosen))
+    return parts
+
+
+def in_world(rig: RigCalibration) -> RigCalibration:
+    """Return the marker rig in the frame that several rigs share.
+
+    Transforms cameras, world of its IMU, tracking system, and volume; a rig without `T_world_rig` stays as it is.
+
+    A volume that the shared frame's axes turn away from is no box there, and is not stated any more.
+    """
+    if rig.T_world_rig is None:
+        return rig
+    T_world_rig = np.array(rig.T_world_rig)
+    poses = {name: _matrix(T_world_rig @ rig.camera_pose(name)) for name in rig.T_rig_camera}
+    return replace(
+        rig,
+        T_world_rig=None,
+        T_rig_camera=poses,
+        imu=_imu(rig.imu, T_world_rig),
+        volume=_volume(rig.volume, T_world_rig),
+        T_rig_tracking=None
+        if rig.T_rig_tracking is None
+        else _matrix(T_world_rig @ np.array(rig.T_rig_tracking)),
+    )
+
+
+def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | None:
+    if imu is None or imu.q_rig_world is None:
+        return imu
+    rotated = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
+    return replace(imu, q_rig_world=_quaternion(rotated))
+
+
+def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
+    if volume is None or not np.allclose(T_world_rig[:3, :3], np.eye(3), rtol=0.0, atol=_UNTURNED):
+        return None
+    low, high = transform(T_world_rig, np.array([volume.low_m, volume.high_m]))
+    return Volume(low_m=_vector(low), high_m=_vector(high))
+
+
+def _worst_places(rigs: Sequence[RigCalibration]) -> dict[str, Provenance]:
+    """Return the accuracy of the cameras' poses in the merged rig.
+
+    As good as that of the rig whose cameras are placed worst.
+    """
+    key = "T_rig_camera"
+    known = [rig.provenance[key] for rig in rigs if key in rig.provenance]
+    return {} if not known else {key: max(known, key=lambda one: one.residual.get("rms_px", 0.0))}
+
+
+def _matrix(pose: Float) -> Matrix4:
+    a, b, c, d = (_row(row) for row in pose)
+    return a, b, c, d
+
+
+def _row(row: Float) -> Row4:
+    a, b, c, d = (float(value) for value in row)
+    return a, b, c, d
+
+
+def _quaternion(q_wxyz: Float) -> Quaternion:
+    return _row(q_wxyz)
+
+
+def _vector(point: Float) -> Vector3:
+    x, y, z = (float(value) for value in point)
+    return x, y, z

@@ -1,0 +1,207 @@
+"""Live loop from messages to sinks, and the figures of a run.
+
+Messages in; hands, objects, contact and gestures out to every sink.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+
+from common.clock import Clock
+from common.machine import program
+from common.messages import (
+    Contact,
+    Detections,
+    Gesture,
+    HandPose,
+    Health,
+    ImuSample,
+    ObjectPose,
+    ResultMessage,
+    TagDetections,
+    TrackerPose,
+    restamped,
+)
+from master.monitor.rates import CameraRates
+from master.outputs.sink import Sink
+
+_NAME = 64  # characters of a name in `Health`
+_KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour would halt the loop 3 ms every second
+_OBJECT_KEPT = 2_000  # and of objects, some seconds of each
+
+SeenT = TypeVar("SeenT", bound=Detections)
+SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
+SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
+AuxiliaryMessage: TypeAlias = (
+    TagDetections | ImuSample | TrackerPose
+)  # what comes beside the frames of cameras
+_AUXILIARY = (TagDetections, ImuSample, TrackerPose)
+
+
+class SolvedT(Protocol):
+    """Hand or object at one time, with the arrival time of its last frame.
+
+    That is when the last frame that contributed was handed to its slave [ns].
+    """
+
+    @property
+    def pose(self) -> HandPose | ObjectPose:
+        """Where it is."""
+        ...
+
+    @property
+    def ready_t_ns(self) -> int:
+        """When the last frame of it was there, master's clock."""
+        ...
+
+
+Solved: TypeAlias = SolvedT | Contact | Gesture
+
+
+class Source(Protocol[SeenT_co]):
+    """Where detections, samples and poses come from: the network, or a test."""
+
+    def get(self, timeout_s: float) -> SeenT_co | AuxiliaryMessage | None:
+        """The next message, or None when none came in time."""
+        ...
+
+
+class Solver(Protocol[SeenT_contra]):
+    """What is made of all that comes: the world of a master."""
+
+    def push(self, message: SeenT_contra | AuxiliaryMessage) -> Iterable[Solved]:
+        """Take one message and yield what it completes.
+
+        Each result is out before the next is computed.
+        """
+        ...
+
+
+class RunFigures:
+    """Performance figures of a run.
+
+    Written by the loop, read by health reports and the summary.
+    """
+
+    def __init__(self) -> None:
+        self.poses = 0
+        # All keys from the beginning: a report on another thread never sees it grow.
+        self.published = Counter(objects=0, contacts=0, gestures=0)
+        self.rates = CameraRates()
+        # A ring of fixed size: the report of every second reads it in one copy, however long the run.
+        self._latency_ms = np.zeros(_KEPT)
+        self._object_ms = np.zeros(_OBJECT_KEPT)
+        self._first_ns = self._last_ns = 0
+
+    def count(self, t_ns: int, message: ResultMessage) -> None:
+        """Count what was published at `t_ns`."""
+        if isinstance(message, HandPose):
+            self.add(t_ns, message.latency_ns)
+        elif isinstance(message, ObjectPose):
+            if message.tracked:  # what is held waits for nothing that was seen
+                self._object_ms[self.published["objects"] % _OBJECT_KEPT] = message.latency_ns * 1e-6
+                self.published["objects"] += 1
+        else:
+            self.published["contacts" if isinstance(message, Contact) else "gestures"] += 1
+
+    def add(self, t_ns: int, latency_ns: int) -> None:
+        """Count one published pose of a hand."""
+        if self.poses == 0:
+            self._first_ns = t_ns
+        self._last_ns = t_ns
+        self._latency_ms[self.poses % _KEPT] = latency_ns * 1e-6
+        self.poses += 1
+
+    def summary(self) -> dict[str, float]:
+        """Return the rate and latencies of the hand poses.
+
+        poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms: of hands.
+
+        Of objects that were tracked object_latency_p50_ms, object_latency_p99_ms.
+        """
+        span_s = (self._last_ns - self._first_ns) * 1e-9
+        out = {"poses": float(self.poses)}
+        if self.poses > 1 and span_s > 0:
+            out["poses_per_s"] = round((self.poses - 1) / span_s, 2)
+        if self.poses:
+            p50, p99 = np.percentile(self._latency_ms[: self.poses], [50, 99])
+            out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
+        if tracked := self.published["objects"]:
+            p50, p99 = np.percentile(self._object_ms[:tracked], [50, 99])
+            out |= {
+                "object_latency_p50_ms": round(float(p50), 3),
+                "object_latency_p99_ms": round(float(p99), 3),
+            }
+        return out
+
+
+class Observed(Generic[SeenT]):
+    """A solver, with measurements of the cameras' messages around it.
+
+    Rates are counted before it; `monitor` is called once all is out.
+    """
+
+    def __init__(self, solver: Solver[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
+        self._solver, self._rates, self._monitor = solver, rates, monitor
+
+    def push(self, message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
+        """Take one message; give what it completes."""
+        if isinstance(message, _AUXILIARY):
+            yield from self._solver.push(message)
+            return
+        self._rates.push(message)
+        yield from self._solver.push(message)
+        self._monitor(message)
+
+
+def run(
+    source: Source[SeenT],
+    solver: Solver[SeenT],
+    sinks: Sequence[Sink],
+    clock: Clock,
+    figures: RunFigures,
+    stop: threading.Event,
+) -> None:
+    """Solve and publish until `stop` is set."""
+    while not stop.is_set():
+        message = source.get(timeout_s=0.1)
+        if message is None:
+            continue
+        for solved in solver.push(message):
+            now = clock.now_ns()
+            published = result_at(solved, now)
+            for sink in sinks:
+                sink.write(published)
+            figures.count(now, published)
+
+
+def result_at(solved: Solved, t_ns: int) -> ResultMessage:
+    """Return the message that is published at `t_ns`.
+
+    A pose reports its latency.
+    """
+    if isinstance(solved, Contact | Gesture):
+        return solved
+    return restamped(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
+
+
+def health(
+    session: int,
+    clock: Clock,
+    figures: RunFigures,
+    counts: dict[str, int],
+    times: Mapping[str, float] | None = None,
+) -> Health:
+    """Return the master's health report.
+
+    Metrics distinguish the rate at which a camera runs (camera_hz.NAME) from the rate of solved poses (poses_per_s).
+    """
+    metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
+    metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
+    metrics |= times or {}
+    published = {name: number for name, number in figures.published.items() if number}
+    events = {"poses": figures.poses} | published | counts
+    return Health("master", session, clock.now_ns(), events, metrics, *program())

@@ -1,0 +1,279 @@
+"""Everything a master derives from its senders' messages, behind one push.
+
+The results are hands, objects, contact and gestures.
+
+In this order, because the hand is what is waited for: first the poses that a message completes, of every hand, then
+those of objects, then what the hands do. `push` is a generator: what it gave is out before the next is worked out.
+
+Objects belong to the marker rig that names them; a hand measured by markers has the same frame, so contact is made for
+each of those and every object. A wrist device alone has a frame of its own: its hand touches nothing that we know.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import nan
+from typing import Protocol
+
+import msgspec
+
+from common.arrays import Float
+from common.messages import (
+    Contact,
+    Detections,
+    Gesture,
+    HandPose,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+)
+from master.estimator.pipeline import SolvedPose, Stage
+from master.gestures.recogniser import GestureRecogniser
+from master.objects.contact import ContactMonitor
+from master.objects.line import SolvedObject
+from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigSetup
+from master.run.app import Solved
+from master.run.link_senders import SensorMessage
+from master.run.stages import StageTimes
+from master.run.tracked_object import TrackedObject
+
+_NAME = 64  # characters of a name in `Health`
+_FRAMES = MarkerDetections, WristDetections
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Auxiliary:
+    """What is made beside the hands with one state of the files.
+
+    Attributes:
+        shown: Camera -> the objects that it may see.
+        trackers: Tracker -> the object that it sits on.
+        contacts, gestures: Hand -> what detects that of it.
+    """
+
+    objects: tuple[TrackedObject, ...]
+    shown: dict[str, list[TrackedObject]]
+    trackers: dict[str, TrackedObject]
+    contacts: dict[str, ContactMonitor]
+    gestures: dict[str, GestureRecogniser]
+
+    @classmethod
+    def of(cls, setups: Sequence[RigSetup], counts: Counter[str], *, gestures: bool) -> "_Auxiliary":
+        """Build all of it.
+
+        Raises:
+            CalibrationError: An object does not fit its rig.
+        """
+        objects: list[TrackedObject] = []
+        shown: dict[str, list[TrackedObject]] = {}
+        for setup in setups:
+            own = [TrackedObject(setup, one.name, counts) for one in setup.objects]
+            objects += own
+            for camera in setup.models if own else ():
+                shown.setdefault(camera, []).extend(own)
+        profiles = [one for setup in setups for one in setup.objects]
+        hands = {setup.hand.profile.name: setup for setup in setups}
+        return cls(
+            tuple(objects),
+            shown,
+            {one.tracker: one for one in objects if one.tracker is not None},
+            {
+                name: ContactMonitor(setup.hand, profiles)
+                for name, setup in hands.items()
+                if profiles and setup.has_markers
+            },
+            {name: GestureRecogniser(setup.gestures, setup.hand) for name, setup in hands.items()}
+            if gestures
+            else {},
+        )
+
+
+class Line(Protocol):
+    """What makes poses of one hand: the pipeline of its setup, or a `LivePipeline`."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Events since the start."""
+        ...
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        ...
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take the orientation (4,) that the hand's IMU reports."""
+        ...
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for something."""
+        ...
+
+
+class Dispatcher:
+    """Push machine over all that comes.
+
+    Holds the line of each hand, what is beside them, and the gestures that have not ended.
+    """
+
+    def __init__(
+        self, setups: Sequence[RigSetup], lines: Sequence[Line], stage: Stage, *, gestures: bool = True
+    ) -> None:
+        """Join each hand's setup with its solver line and build the other stages.
+
+        The other stages are what is beside the hands.
+
+        Args:
+            setups: Of each hand.
+            lines: What makes its poses.
+            stage: Measures the stages.
+            gestures: False: poses are unrelated, as of single pictures; there is no doing in them.
+
+        Raises:
+            CalibrationError: An object does not fit its rig.
+        """
+        self._stage, self._gesture_begins = stage, gestures
+        self._hands = tuple(zip(setups, lines, strict=True))
+        self._watching = {
+            name: [
+                (setup.own if name in setup.rows else None, line)
+                for setup, line in self._hands
+                if name in setup.cameras
+            ]
+            for setup in setups
+            for name in setup.camera_names
+        }
+        self._line_of_imu = {name: line for setup, line in self._hands for name in setup.imus}
+        self._counts: Counter[str] = Counter()
+        self._now = _Auxiliary.of(setups, self._counts, gestures=gestures)
+        self._begun: dict[tuple[str, str, str], Gesture] = {}
+        # One thread fills it, another empties it.
+        self._next: deque[_Auxiliary] = deque(maxlen=1)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Return the event counts since the start.
+
+        Where there are several hands, the events of a hand are under its name.
+
+        Of objects object.NAME.poses, .tracked, .occluded; of gestures gesture.KIND, how many began; of trackers
+        tracker.NAME.lost, .leap, .late, .broken, and .unplaced where it is not registered.
+        """
+        # The loop may add a count meanwhile: a copy is made at once.
+        each = [(setup.hand.profile.name, dict(line.counts)) for setup, line in self._hands]
+        if len(each) > 1:
+            each = [(hand, {f"{hand}.{event}"[:_NAME]: n for event, n in own.items()}) for hand, own in each]
+        return Counter({event: n for _, own in each for event, n in own.items()} | dict(self._counts))
+
+    @property
+    def auxiliary_counts(self) -> dict[str, int]:
+        """Those of objects, gestures and trackers alone."""
+        return dict(self._counts)
+
+    @property
+    def unplaced(self) -> tuple[TrackedObject, ...]:
+        """Return the objects whose tracker is not registered.
+
+        What such a tracker reports is of no use.
+        """
+        return tuple(one for one in self._now.objects if one.unplaced)
+
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
+        """Take one message; give what it completes, of each hand and object oldest first."""
+        if self._next:
+            yield from self._take_over(self._next.popleft())
+        if isinstance(message, ImuSample):
+            if (line := self._line_of_imu.get(message.source)) is not None:
+                line.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
+            return
+        poses: list[SolvedPose] = []
+        if isinstance(message, _FRAMES):
+            for own, line in self._watching.get(message.camera, ()):
+                poses += line.push(message if own is None else own(message))
+            yield from poses
+        if self._now.objects:
+            yield from self._seen(message)
+        if self._now.contacts or self._now.gestures:
+            for one in poses:
+                yield from self._done(one.pose)
+
+    def flush(self) -> Iterator[Solved]:
+        """At the end of a recording: what still waits for something."""
+        poses = [solved for _, line in self._hands for solved in line.flush()]
+        yield from poses
+        for one in self._now.objects:
+            yield from self._known(one.flush())
+        for one in poses:
+            yield from self._done(one.pose)
+
+    def prepare(self, setups: Sequence[RigSetup]) -> Callable[[], None]:
+        """Build the stages beside the hands for changed files.
+
+        The function that is returned lets them take over with the next message.
+
+        From any thread but the loop's. What was known of objects and gestures begins anew.
+
+        Raises:
+            CalibrationError: An object does not fit its rig; nothing has changed.
+        """
+        new = _Auxiliary.of(setups, self._counts, gestures=self._gesture_begins)
+        return lambda: self._next.append(new)
+
+    def _take_over(self, new: _Auxiliary) -> Iterator[Gesture]:
+        """The old gestures end: who listens would wait for that for ever."""
+        self._now = new
+        begun, self._begun = list(self._begun.values()), {}
+        for gesture in begun:
+            yield msgspec.structs.replace(gesture, phase="end")
+
+    def _seen(self, message: SensorMessage) -> Iterator[SolvedObject]:
+        """Poses of objects that a message completes."""
+        if isinstance(message, TrackerPose):
+            if (carried := self._now.trackers.get(message.source)) is not None:
+                yield from self._known(carried.push_tracker(message))
+        elif isinstance(message, MarkerDetections | TagDetections):
+            for one in self._now.shown.get(message.camera, ()):
+                with self._stage("objects"):
+                    solved = one.push(message)
+                yield from self._known(solved)
+
+    def _known(self, solved: list[SolvedObject]) -> list[SolvedObject]:
+        """The same; hands know now where it is."""
+        for one in solved:
+            for contact in self._now.contacts.values():
+                contact.push_object(one.pose)
+        return solved
+
+    def _done(self, pose: HandPose) -> Iterator[Contact | Gesture]:
+        """What a hand does."""
+        if (contact := self._now.contacts.get(pose.hand)) is not None:
+            with self._stage("contact"):
+                near = contact.push(pose)
+            yield from near
+        if (gestures := self._now.gestures.get(pose.hand)) is not None:
+            with self._stage("gestures"):
+                messages = gestures.push(pose)
+            for gesture in messages:
+                self._remember(gesture)
+                yield gesture
+
+    def _remember(self, gesture: Gesture) -> None:
+        key = gesture.hand, gesture.kind, gesture.name
+        if gesture.phase == "begin" or gesture.kind == "tap":
+            self._counts[f"gesture.{gesture.kind}"[:_NAME]] += 1
+        if gesture.phase == "end":
+            self._begun.pop(key, None)
+        else:
+            self._begun[key] = gesture
+
+
+def new_dispatcher(setups: Sequence[RigSetup]) -> Dispatcher:
+    """A world of these hands in its first state, of which nothing is measured.
+
+    Raises:
+        CalibrationError: As `Dispatcher`.
+    """
+    stages = StageTimes()
+    return Dispatcher(setups, [pipeline_of(setup, stages) for setup in setups], stages)

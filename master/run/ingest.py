@@ -1,0 +1,271 @@
+"""Conversion of datagrams to detections and IMU samples.
+
+They are decoded, checked, counted, and put on the master's clock.
+
+A socket around `master.run.link`: one thread reads, answers and repeats what has to be repeated; the live loop takes
+messages from a queue (`master.run.message_queue`).
+"""
+
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from ipaddress import AddressValueError, IPv4Address
+from types import MappingProxyType
+
+from common.clock import Clock
+from common.errors import BusError
+from common.link.clock_offset import ClockEstimate
+from common.link.datagram import Address
+from common.link.link_key import LinkKey
+from common.link.session import Random
+from common.link.udp import UdpSocket
+from common.supervisor import until
+from master.run.admission import SenderLimits
+from master.run.link import MasterLink
+from master.run.link_senders import SensorMessage
+from master.run.message_queue import MessageQueue
+from master.run.quarantine import Quarantine
+from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.run.sequence import CameraCounts
+
+AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
+DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
+
+
+class Ingest:
+    """Receiver of all slaves of one rig, on one UDP port.
+
+    Holds the socket, its thread, and the link's state behind a lock.
+
+    Attributes:
+        queue: What came and was not taken yet.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        key: LinkKey | bytes,
+        clock: Clock,
+        beacon: Address,
+        bind: Address,
+        zenoh_endpoint: str,
+        start_timeout_s: float = 5.0,
+        random: Random = os.urandom,
+        imus: tuple[str, ...] = (),
+        wrists: tuple[str, ...] = (),
+        trackers: tuple[str, ...] = (),
+        limits: Mapping[str, SenderLimits] = MappingProxyType({}),
+    ) -> None:
+        """Begin to call the slaves.
+
+        Args:
+            cameras: Names that may take part; any other slave is refused.
+            key: Rig key (32 bytes), alone or with the root of the secrets of devices.
+            clock: The clock that every time is moved to.
+            beacon: Where beacons go: a broadcast address and the slaves' beacon port.
+            bind: Own address and port (0: any).
+            zenoh_endpoint: Where this master's bus listens, sent to the slaves; may be empty.
+            start_timeout_s: How long the first slave waits for the others.
+            random: Source of nonces.
+            imus: Names of IMUs that may take part.
+            wrists: Those of `cameras` that belong to a wrist device.
+            trackers: Names of devices that track themselves and may take part.
+            limits: What files state of each sender (`admission.limits_of`); without, only what its messages can be.
+
+        Raises:
+            BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
+            ValueError: Key of wrong length, no camera, too many senders, one name for two, or a wrist's camera that is
+                none of the cameras.
+        """
+        _check_address(beacon[0])
+        self._clock = clock
+        timeout_ns = round(start_timeout_s * 1e9)
+        self._link = MasterLink(
+            cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists, trackers, limits
+        )
+        self._cameras, self._senders = cameras, (*cameras, *imus, *trackers)
+        self._socket = UdpSocket(bind, broadcast=True)
+        self._lock = threading.Lock()
+        self.queue = MessageQueue(len(cameras))
+        self._closing = threading.Event()
+        self._thread = threading.Thread(
+            target=until(self._closing.is_set, self._run), name="ingest", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def address(self) -> Address:
+        """Own address and port."""
+        return self._socket.address
+
+    @property
+    def quarantine(self) -> Quarantine:
+        """Senders that are silenced, as their messages made something fail."""
+        return self._link.quarantine
+
+    @property
+    def started(self) -> bool:
+        """Whether the start was given."""
+        with self._lock:
+            return self._link.started
+
+    @property
+    def connected(self) -> frozenset[str]:
+        """Return the cameras, IMUs and trackers received within the last second."""
+        with self._lock:
+            return self._link.connected()
+
+    @property
+    def lost(self) -> int:
+        """Return the number of sent frames of all cameras that never arrived.
+
+        Strobe cycles count as frames do.
+        """
+        return sum(self.counts_of(camera).lost for camera in self._cameras)
+
+    @property
+    def skipped(self) -> int:
+        """Return the number of frames of all cameras that were never sent.
+
+        Strobe cycles count as frames do. Camera or slave had no time for them.
+        """
+        return sum(self.counts_of(camera).skipped for camera in self._cameras)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Reason (docs/wire.md) -> datagrams refused for it."""
+        with self._lock:
+            return {str(reason): n for reason, n in self._link.refused.items()}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Event -> how often, as `Health.counts` wants it.
+
+        <sender>.<event>, refused.<reason>, fault.<sender>, queue.*; of tags <camera>.tags_received and
+        <camera>.tags_late, once there were any.
+        """
+        counts = {
+            "queue.dropped": self.queue.overflowed,
+            "would_block": self._socket.would_block,
+            "send_failed": self._socket.failed,
+            "unsynchronised": self._link.unsynchronised,
+        }
+        for sender in self._senders:
+            of = asdict(self.counts_of(sender))
+            counts |= {f"{sender}.{event}": number for event, number in of.items()}
+            with self._lock:
+                counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
+                counts[f"{sender}.restarts"] = self._link.restarts_of(sender)
+                counts[f"{sender}.refused"] = self._link.refused_of(sender)
+                tags = self._link.tag_counts_of(sender)
+            if tags is not None and tags.received:
+                counts |= {f"{sender}.tags_received": tags.received, f"{sender}.tags_late": tags.late}
+        counts |= {f"fault.{sender}": n for sender, n in dict(self.quarantine.faults).items()}
+        return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
+
+    def limit(self, limits: Mapping[str, SenderLimits]) -> None:
+        """Accept from each sender what its files state now (`admission.limits_of`)."""
+        with self._lock:
+            self._link.limit(limits)
+
+    def counts_of(self, sender: str) -> CameraCounts:
+        """Return what became of the frames, samples or poses of `sender`.
+
+        Raises:
+            KeyError: The rig has no such sender.
+        """
+        with self._lock:
+            return self._link.counts_of(sender)
+
+    def rejected_peers(
+        self,
+    ) -> tuple[dict[str, RejectedPeer], dict[str, RejectedPeer], dict[str, RejectedPeer]]:
+        """Return the recently rejected peers by sender, in three mappings.
+
+        The first has where a second process of the sender's name was rejected lately; the second where it speaks
+        another version; the third where somebody sends a hello without its secret.
+        """
+        t_ns = self._clock.now_ns()
+        with self._lock:
+            rejected = self._link.rejected_peers
+            return rejected.duplicates(t_ns), rejected.versions(t_ns), rejected.secrets(t_ns)
+
+    def marker_counts(self) -> dict[str, MarkerCounts]:
+        """Camera -> how many markers its slave sent lately and its rig has here.
+
+        Of those cameras alone where the two differ.
+        """
+        t_ns = self._clock.now_ns()
+        with self._lock:
+            return self._link.rejected_peers.marker_counts(t_ns)
+
+    def clock_of(self, camera: str) -> ClockEstimate | None:
+        """Return how the clock of `camera` runs against this one; None while unknown.
+
+        Raises:
+            KeyError: The rig has no such camera.
+        """
+        with self._lock:
+            return self._link.clock_of(camera)
+
+    def get(self, timeout_s: float) -> SensorMessage | None:
+        """Return the oldest waiting message; None after `timeout_s`.
+
+        Its times are on the master's clock.
+        """
+        return self.queue.get(timeout_s)
+
+    def close(self) -> None:
+        """End the thread and give the port back. Safe to call twice."""
+        self._closing.set()
+        self._thread.join()
+        self.queue.close()
+        self._socket.close()
+
+    def _run(self) -> None:
+        due_ns = self._clock.now_ns()
+        while not self._closing.is_set():
+            first = self._socket.receive()
+            messages: list[SensorMessage] = []
+            outbox: list[tuple[bytes, Address]] = []
+            pending = 0
+            with self._lock:
+                for datagram, address in self._pending(first):
+                    pending += 1
+                    message = self._link.receive(datagram, address, self._clock.now_ns())
+                    if message is not None:
+                        messages.append(message)
+                now_ns = self._clock.now_ns()
+                if pending != len(messages) or pending == 0 or now_ns >= due_ns:
+                    outbox, due_ns = self._link.due(), now_ns + DUE_NS
+            for datagram, address in outbox:
+                self._socket.send(datagram, address)
+            if messages:
+                self.queue.put(messages)
+
+    def _pending(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
+        """Yield the datagrams that have arrived, at most `AT_ONCE`.
+
+        So under a flood the periodic duties are not checked for each datagram.
+        """
+        if first is None:
+            return
+        yield first
+        for _ in range(AT_ONCE - 1):
+            if (arrived := self._socket.receive_waiting()) is None:
+                return
+            yield arrived
+
+
+def _check_address(host: str) -> None:
+    """Refuse a host name.
+
+    Looking it up would stop the thread that reads, at every beacon.
+    """
+    try:
+        IPv4Address(host)
+    except AddressValueError as error:
+        raise BusError(
+            f"beacon address {host!r}: must be an IPv4 address, for example 192.168.1.255"
+        ) from error

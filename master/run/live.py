@@ -1,0 +1,248 @@
+"""A live master.
+
+It opens bus, ingest and sinks, runs the loop, reports once a second, and writes the summary.
+"""
+
+import gc
+import os
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.bus.zenoh_bus import ZenohBus
+from common.clock import Clock, SystemClock
+from common.link.link_key import LinkKey
+from common.service_manager import ServiceManager
+from common.supervisor import until
+from master.checklist.files import FileMonitor
+from master.checklist.publisher import ChecklistPublisher
+from master.commands.summary import write_summary
+from master.monitor.clocks import ClockMonitor
+from master.monitor.extrinsics import ExtrinsicsMonitor
+from master.monitor.loop import MonitoredLoop
+from master.monitor.report import Reporter, cameras_line, unplaced_line
+from master.outputs.bus import BusSink
+from master.outputs.devices import DevicePoses
+from master.outputs.files import RunFiles
+from master.outputs.sink import Sink
+from master.recording.child import RecorderProcess
+from master.recording.probe import Probe, Tapped
+from master.rig.files import RigFiles
+from master.rig.setup import RigSetup
+from master.run.admission import limits_of
+from master.run.app import Observed, RunFigures, run
+from master.run.dispatcher import Dispatcher, new_dispatcher
+from master.run.ingest import Ingest
+from master.run.load_shedding import LoadShedding, Shedding
+from master.run.master_bus import host_bus
+from master.run.solver_supervisor import SolverSupervisor
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline, RigTuning, renew
+
+__all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
+
+_JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSettings:
+    """Addresses and files of a live run.
+
+    Attributes:
+        beacon: Broadcast address and port where slaves listen.
+        bind: Own UDP address and port for data (0: any).
+        bus: Endpoint on which the zenoh bus listens, for example tls/0.0.0.0:47802.
+        start_timeout_s: How long the first slave waits for the others.
+        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and objects,
+            contact and gestures in its folder.
+        summary: Where to write the summary, or None.
+        files: Where the setups were read: what changes there is used at once. None: they stay as they are.
+        record: Where to record all that is received and published (MCAP), or None; needs `files`.
+    """
+
+    beacon: tuple[str, int]
+    bind: tuple[str, int]
+    bus: str
+    start_timeout_s: float = 5.0
+    poses: Path | None = None
+    summary: Path | None = None
+    files: RigFiles | None = None
+    record: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a recording without the files that it carries."""
+        if self.record is not None and self.files is None:
+            raise ValueError("record: a recording carries the files of its rigs: give files, too")
+
+
+def run_live(
+    setups: Sequence[RigSetup],
+    key: LinkKey | bytes,
+    settings: LiveSettings,
+    stop: threading.Event,
+    notify: Callable[[str], None],
+) -> dict[str, object]:
+    """Track until `stop` is set.
+
+    Args:
+        setups: Of each hand its rigs, cameras and model.
+        key: Rig key, alone or with the root of the secrets of devices.
+        settings: Addresses and files.
+        stop: Set by a signal handler, or by the command "stop" on the bus.
+        say: Called with one line when a state changes.
+
+    Returns:
+        The summary.
+
+    Raises:
+        BusError: An address cannot be bound.
+        RecordingError: A file cannot be written.
+    """
+    clock: Clock = SystemClock()
+    stages, figures = StageTimes(), RunFigures()
+    load_shedding = LoadShedding(setups)
+    pipelines = [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups]
+    dispatcher = Dispatcher(setups, pipelines, stages)
+    tuning = (
+        None if settings.files is None else RigTuning(settings.files, setups, pipelines, notify, dispatcher)
+    )
+    with ExitStack() as stack:
+        bus = host_bus(settings.bus, devices_of(setups))
+        stack.callback(bus.close)
+        probe = Probe(bus, clock, always=settings.record is not None)
+        stack.callback(probe.close)
+        if settings.record is not None and settings.files is not None:
+            recorder = RecorderProcess(
+                settings.record, settings.files, settings.bus, notify, probe.end_always
+            )
+            stack.callback(recorder.close)
+            recorder.wait_ready(bus)
+        ingest = ingest_of(setups, key, clock, settings)
+        stack.callback(ingest.close)
+        load_shedding.waiting = ingest.queue.frame_spans
+        sinks = _sinks(setups, settings, bus)
+        for sink in sinks:
+            stack.callback(sink.close)
+        monitor = ClockMonitor(setups)
+        extrinsics = [ExtrinsicsMonitor(setup.rig.cameras) for setup in setups]
+        reporter = Reporter(
+            cameras_of(setups),
+            trackers_of(setups),
+            clock,
+            bus,
+            ingest,
+            dispatcher,
+            list(zip(extrinsics, pipelines, strict=True)),
+            tuning,
+            monitor,
+            figures,
+            probe,
+            stop,
+            notify,
+        )
+        files = (
+            None if settings.files is None else FileMonitor(settings.files.calibration, settings.files.rigs)
+        )
+        writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
+        checklist = ChecklistPublisher(
+            bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to
+        )
+        in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
+        supervisor = SolverSupervisor(
+            Observed(dispatcher, figures.rates, monitor.push),
+            ingest.quarantine,
+            clock,
+            (lambda sender: renew(setups, pipelines, dispatcher, sender)) if tuning is None else tuning.renew,
+            lambda sender: new_dispatcher([setup for setup in in_use() if sender in setup.senders]),
+        )
+        threads = (
+            threading.Thread(target=until(stop.is_set, reporter.work), name="master health", daemon=True),
+            threading.Thread(
+                target=until(stop.is_set, lambda: checklist.work(stop, in_use)),
+                name="master checklist",
+                daemon=True,
+            ),
+        )
+        stack.callback(stop.set)  # before anything is closed that a thread uses
+        for thread in threads:
+            thread.start()
+        for one in dispatcher.unplaced:
+            notify(unplaced_line(one.name, one.tracker or ""))
+        notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
+        gc.collect()
+        gc.freeze()  # what lives until the end is never walked again: no pause in the loop
+        source = Tapped(DevicePoses(ingest.queue, bus), probe, load_shedding)
+        run(MonitoredLoop(source, ServiceManager(os.environ)), supervisor, sinks, clock, figures, stop)
+        source.flush()
+        probe.drain()
+        stop.set()
+        for thread in threads:
+            thread.join(_JOIN_S)
+        summary: dict[str, object] = {
+            **figures.summary(),
+            "camera_hz": figures.rates.camera_hz,
+            "received_hz": figures.rates.received_hz,
+            "lost": ingest.lost,
+            "skipped": ingest.skipped,
+            "counts": reporter.health().counts,
+            "stage_us": stages.mean_us(),
+        }
+    if settings.summary is not None:
+        write_summary(settings.summary, summary)
+    return summary
+
+
+def _sinks(setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus) -> list[Sink]:
+    """Return the sinks of the results.
+
+    Results go to the bus, and to files where that is requested.
+    """
+    sinks: list[Sink] = [BusSink(bus)]
+    if settings.poses is not None:
+        counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+        objects = [one.name for setup in setups for one in setup.objects]
+        sinks.append(RunFiles(settings.poses, counts, objects))
+    return sinks
+
+
+def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All cameras, each once: some watch two hands."""
+    return tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
+
+
+def trackers_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All trackers that sit on objects."""
+    return tuple(name for setup in setups for name in setup.trackers)
+
+
+def devices_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All that may connect: cameras, IMUs and trackers."""
+    imus = tuple(name for setup in setups for name in setup.imus)
+    return tuple(dict.fromkeys((*cameras_of(setups), *imus, *trackers_of(setups))))
+
+
+def ingest_of(
+    setups: Sequence[RigSetup], key: LinkKey | bytes, clock: Clock, settings: LiveSettings
+) -> Ingest:
+    """Return the receiver of all senders of these hands and objects.
+
+    The senders are cameras, IMUs and trackers.
+
+    Raises:
+        BusError: The address cannot be bound, or the beacon's is no IPv4 address.
+    """
+    return Ingest(
+        cameras_of(setups),
+        key,
+        clock,
+        settings.beacon,
+        settings.bind,
+        settings.bus,
+        settings.start_timeout_s,
+        imus=tuple(name for setup in setups for name in setup.imus),
+        wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
+        trackers=trackers_of(setups),
+        limits=limits_of(setups),
+    )

@@ -1,0 +1,65 @@
+"""Access of the PC's programs to the bus.
+
+A master listens, all others join it, each with its own certificate.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterable
+
+from common.bus.certificates import MASTER, OPERATOR
+from common.bus.keys import access_of
+from common.bus.zenoh_bus import ZenohBus
+from common.errors import BusError
+
+_TRY_AGAIN_S = 0.3
+
+
+def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
+    """Join the bus as the master at `endpoint` sees it.
+
+    Where a router is at the endpoint, it is what is published of `site`.
+
+    Raises:
+        BusError: Nobody listens there, or refuses this program's certificate; the endpoint is malformed.
+    """
+    return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True, namespace=site)
+
+
+def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
+    """The bus of a master, which listens at `endpoint`.
+
+    Args:
+        endpoint: As `tls/0.0.0.0:47802`.
+        devices: Names of cameras, IMUs and trackers that may connect, beside those whose keys are in the keys folder.
+
+    Raises:
+        BusError: The address is taken; keys are missing; the endpoint is malformed.
+    """
+    return ZenohBus(endpoint, None, access_of(os.environ, MASTER), devices=devices)
+
+
+def bus_of_master(
+    endpoint: str, stop: threading.Event, waiting: Callable[[BusError], None], site: str | None = None
+) -> ZenohBus | None:
+    """Return the bus, once a master listens at `endpoint`; None when stopped before.
+
+    A router for `site` will do too.
+
+    `waiting` is called once with why not yet.
+
+    Raises:
+        BusError: The endpoint is malformed, or keys are missing.
+    """
+    notified = False
+    while not stop.is_set():
+        try:
+            return join_bus(endpoint, site)
+        except BusError as error:
+            if error.__cause__ is None:  # refused by us, not by the network: endpoint or keys
+                raise
+            if not notified:
+                waiting(error)
+            notified = True
+            stop.wait(_TRY_AGAIN_S)
+    return None

@@ -1,0 +1,366 @@
+"""Live changes of the setup while the master tracks.
+
+Other geometry, depth model, filter, hand, object or gestures: a new pipeline replaces the old one.
+
+Each hand has a pipeline; only those change whose files did; objects and gestures change together
+(`master.run.dispatcher`).
+
+The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
+it takes over, between two messages. An epoch is never solved twice: poses go on with rising times.
+"""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from math import ceil, nan
+
+import msgspec
+
+from common.arrays import Float
+from common.calibration import FilterCalibration, parse
+from common.calibration.file_monitor import MonitoredFiles
+from common.calibration.parts import Part
+from common.errors import CalibrationError, PhalanxError
+from common.messages import Detections, Name
+from master.estimator.pipeline import SolvedPose, Stage
+from master.rig.files import RigFiles
+from master.rig.needs_restart import refuse_other_hands, refuse_restart
+from master.rig.pipeline import Pipeline, pipeline_of
+from master.rig.setup import RigSetup
+from master.run.dispatcher import Dispatcher
+
+_WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
+_CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
+_ROUNDS = 20
+
+
+class FilterTrial(Part, frozen=True):
+    """Body of the command "filter".
+
+    It names the rig, and gives its filter as the rig file would have it.
+    """
+
+    rig: Name
+    filter: FilterCalibration
+
+
+class _WhenOpen:
+    """A `Stage` that measures nothing until it is opened."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.open = False
+
+    def __call__(self, name: str) -> AbstractContextManager[None]:
+        return self._stage(name) if self.open else nullcontext()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _OrientationSample:
+    """One orientation measurement of an IMU.
+
+    Its fields are the arguments of `Pipeline.push_orientation`.
+    """
+
+    t_ns: int
+    orientation_wxyz: Float
+    heading_sigma_rad: float
+
+
+class LivePipeline:
+    """The pipeline of one hand in use.
+
+    Holds it, its setup, what it was passed last, and the one that is to take over with the next message.
+    """
+
+    def __init__(
+        self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
+    ) -> None:
+        """Begin with the pipeline of `setup`.
+
+        `stage` measures the stages of whichever pipeline is in use; `dropped_epochs` is asked for each of its epochs
+        whether it is rejected.
+
+        Raises:
+            CalibrationError: The depth model does not fit the rig.
+        """
+        self._stage, self._dropped_epochs = stage, dropped_epochs
+        self._setup: RigSetup = setup
+        self._now = pipeline_of(setup, stage, dropped_epochs=dropped_epochs)
+        per_frame = _messages_per_frame(setup)
+        self._close = _CLOSE_FRAMES * per_frame
+        self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
+            maxlen=_WARM_FRAMES * per_frame
+        )
+        self._number = 0
+        self._last_ns = -(2**63)
+        # And the number of the last message it has seen. One thread fills it, another empties it.
+        self._next: deque[tuple[Pipeline, int]] = deque(maxlen=1)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Events since the start, whichever pipeline counted them."""
+        return self._now.counts
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        self._number += 1
+        self._recent.append((self._number, message))
+        solved = self._take_over(*self._next.popleft()) if self._next else self._now.push(message)
+        if solved:
+            self._last_ns = solved[-1].pose.t_ns
+        return solved
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take an orientation (4,) measured by the hand's IMU."""
+        self._number += 1
+        self._recent.append((self._number, _OrientationSample(t_ns, orientation_wxyz, heading_sigma_rad)))
+        self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
+
+    def flush(self) -> list[SolvedPose]:
+        """Nothing comes any more: the poses that still wait for something."""
+        return self._now.flush()
+
+    def renew(self) -> None:
+        """Let a new pipeline of the same setup take over.
+
+        It has seen nothing of what came until now.
+        """
+        take = self.prepare(self._setup)
+        self._recent.clear()
+        take()
+
+    def change(self, setup: RigSetup) -> None:
+        """Replace the running pipeline by one of `setup`.
+
+        May be called from any thread but the loop's; takes as long as it takes to build a pipeline.
+
+        Raises:
+            CalibrationError: The depth model does not fit the rig; nothing has changed.
+        """
+        self.prepare(setup)()
+
+    def prepare(self, setup: RigSetup) -> Callable[[], None]:
+        """Build a pipeline of `setup` and return the function that switches to it.
+
+        The returned function shows it the last messages and lets it take over.
+
+        Raises:
+            CalibrationError: As `change`.
+        """
+        stage = _WhenOpen(self._stage)
+        # What it is shown to warm up has been solved by the other already: nothing of it is dropped.
+        dropped_epochs = self._dropped_epochs
+        new = pipeline_of(
+            setup,
+            stage,
+            dropped_epochs=None if dropped_epochs is None else lambda: stage.open and dropped_epochs(),
+        )
+
+        def take() -> None:
+            shown = self._warm(new)
+            stage.open = True
+            self._setup = setup
+            self._next.append((new, shown))
+
+        return take
+
+    def _warm(self, new: Pipeline) -> int:
+        """Show it the last messages; the number of the last one."""
+        shown = 0
+        for _ in range(_ROUNDS):  # while these are solved, more come
+            waiting = [(number, sample) for number, sample in list(self._recent) if number > shown]
+            for number, sample in waiting:
+                _show(new, sample)
+                shown = number
+            if len(waiting) <= self._close:
+                break
+        return shown
+
+    def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
+        """Switch to the new pipeline and return its new poses.
+
+        It is shown the samples that it has not seen yet; only its poses that are later than the last one are taken.
+        """
+        old, self._now = self._now.counts, new
+        new.counts.clear()
+        new.counts.update(old)
+        missed = [sample for number, sample in self._recent if number > shown]
+        solved = [one for sample in missed for one in _show(new, sample)]
+        later = [one for one in solved if one.pose.t_ns > self._last_ns]
+        new.counts["poses"] -= len(solved) - len(later)
+        return later
+
+
+class RigTuning:
+    """Follower of the files of all rigs.
+
+    Holds the setups in use, and how often a change was applied and refused.
+
+    Its methods are called on several threads and take turns.
+    """
+
+    def __init__(
+        self,
+        files: RigFiles,
+        setups: Sequence[RigSetup],
+        pipelines: Sequence[LivePipeline],
+        notify: Callable[[str], None],
+        dispatcher: Dispatcher | None = None,
+    ) -> None:
+        """Follow the calibration files and change the pipelines with them.
+
+        `files` hold the `setups`, `pipelines` are changed; `notify` gets one line for each change.
+
+        Objects and gestures are those of `dispatcher`; None: nobody asks for any.
+        """
+        self._files, self._notify, self._dispatcher = files, notify, dispatcher
+        self._setups, self._pipelines = tuple(setups), tuple(pipelines)
+        self._monitored = MonitoredFiles()
+        self._lock = threading.Lock()
+        self._applied = self._refused = 0
+
+    @property
+    def setups(self) -> tuple[RigSetup, ...]:
+        """The setups in use."""
+        return self._setups
+
+    def counts(self) -> dict[str, int]:
+        """`reload.applied`, `reload.refused`."""
+        return {"reload.applied": self._applied, "reload.refused": self._refused}
+
+    def look(self) -> None:
+        """Apply the files if they were changed.
+
+        Where that fails, this is reported once and the old setups stay in use.
+        """
+        with self._lock:
+            changed = self._monitored.changed(self._files.paths(self._setups))
+        if not changed:
+            return
+        try:
+            self.reload()
+        except PhalanxError as error:
+            self._notify(f"changed files are not used: {error}")
+
+    def reload(self) -> None:
+        """Use the files as they are now, those of all hands or none.
+
+        Raises:
+            CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
+        """
+        with self._lock:
+            changed = self._use(self._files.load)
+        if changed:
+            self._notify("changed files are in use")
+
+    def try_filter(self, body: str) -> None:
+        """Use another 1 € filter for one rig.
+
+        It stays until the rig's files change or `reload` (body: `FilterTrial`).
+
+        What has changed in the files until now is used first: the next look does not take the trial back for that.
+
+        Raises:
+            CalibrationError: The body is none, or of a rig that does not run. Nothing has changed.
+        """
+        trial = parse(body.encode(), FilterTrial, "filter")
+        self.look()
+        with self._lock:
+            self._use(lambda: _with_filter(self._setups, trial))
+
+    def renew(self, sender: str) -> None:
+        """As the function `renew`, of the setups in use."""
+        with self._lock:
+            renew(self._setups, self._pipelines, self._dispatcher, sender)
+
+    def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
+        """Have these setups in use, all or none; False if they were."""
+        try:
+            setups = tuple(get())
+            refuse_other_hands(self._setups, setups)
+            both = list(zip(self._setups, setups, self._pipelines, strict=True))
+            for old, new, _ in both:
+                refuse_restart(old, new)
+            changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
+            switches = [line.prepare(new) for _, new, line in changed]
+            if self._dispatcher is not None and any(
+                _auxiliary_inputs(old) != _auxiliary_inputs(new) for old, new, _ in both
+            ):
+                switches.append(self._dispatcher.prepare(setups))
+        except PhalanxError:
+            self._refused += 1
+            raise
+        if not switches:
+            return False
+        for switch in switches:
+            switch()
+        self._setups = setups
+        self._applied += 1
+        return True
+
+
+def renew(
+    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
+) -> None:
+    """Replace all solvers that `sender` feeds by new ones.
+
+    The state of the old ones may be broken.
+
+    Args:
+        setups: Of each hand, as they are in use.
+        pipelines: Of each setup.
+        world: What is made beside the hands; None: nothing is.
+        sender: A camera, an IMU or a tracker.
+    """
+    for setup, pipeline in zip(setups, pipelines, strict=True):
+        if sender in setup.senders:
+            pipeline.renew()
+    if dispatcher is not None:
+        dispatcher.prepare(setups)()
+
+
+def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:
+    """These setups with another filter for one rig.
+
+    Raises:
+        CalibrationError: None of them is of that rig.
+    """
+    names = [setup.rig.name for setup in setups]
+    if trial.rig not in names:
+        raise CalibrationError(f"filter: rig: {trial.rig!r} does not run here; there are {', '.join(names)}")
+    return [
+        replace(setup, rig=msgspec.structs.replace(setup.rig, filter=trial.filter))
+        if setup.rig.name == trial.rig
+        else setup
+        for setup in setups
+    ]
+
+
+def _messages_per_frame(setup: RigSetup) -> int:
+    """Estimate the messages per frame of the slowest camera.
+
+    The approximate number of messages of all cameras and of the IMU that come with each such frame.
+    """
+    slowest_hz = min(camera.frame_rate_hz for camera in setup.cameras.values())
+    imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
+    samples = max((imu.rate_hz for imu in imus), default=0.0) / slowest_hz
+    return len(setup.camera_names) + ceil(samples)
+
+
+def _show(pipeline: Pipeline, sample: Detections | _OrientationSample) -> list[SolvedPose]:
+    """Push one sample into a pipeline and return the poses that it completes."""
+    if isinstance(sample, _OrientationSample):
+        pipeline.push_orientation(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
+        return []
+    return pipeline.push(sample)
+
+
+def _content(setup: RigSetup) -> tuple[object, ...]:
+    return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows, setup.settings
+
+
+def _auxiliary_inputs(setup: RigSetup) -> tuple[object, ...]:
+    return setup.rig, setup.cameras, setup.hand.profile, setup.rows, setup.objects, setup.gestures
