@@ -31,7 +31,7 @@ def gestures(options: Namespace) -> None:
     Raises:
         UsageError: An option has no meaning with what is asked for.
     """
-    if options.make_template is None:
+    if options.teach is None:
         for given, option in (
             (options.ranges, "--range"),
             (options.within, "--within"),
@@ -40,7 +40,7 @@ def gestures(options: Namespace) -> None:
         ):
             if given:
                 raise UsageError(f"{option} is for --teach")
-    if options.make_template is not None:
+    if options.teach is not None:
         _teach(options)
     elif options.forget is not None:
         _forget(options)
@@ -60,10 +60,10 @@ def _teach(options: Namespace) -> None:
         raise PhalanxError("--range: belongs to a recorded run, name it with --poses")
     else:
         shown, source = _live(options), "shown before the sensors"
-    templates = learn(options.make_template, shown, known, options.within)
+    templates = learn(options.teach, shown, known, options.within)
     target: Path = options.out or path
     target.parent.mkdir(parents=True, exist_ok=True)
-    save(target, with_pose(known, options.make_template, templates, source))
+    save(target, with_pose(known, options.teach, templates, source))
     for line in (*templates.stated, f"wrote {target}"):
         echo(line)
 
@@ -86,7 +86,7 @@ def _list(known: GestureSettings) -> None:
     """The poses, and what is asked of each."""
     for name, shape in known.poses.items():
         templates = known.provenance.get(name)
-        echo(f"{name}{'' if templates is None else f' (templates {templates.date})'}")
+        echo(f"{name}{'' if templates is None else f' (template of {templates.date})'}")
         for quantity, span in shape.ranges.items():
             echo(f"  {quantity:24s} {span.low:8.4g} to {span.high:8.4g}, border {span.soft:.3g}")
 
@@ -164,7 +164,7 @@ def _live(options: Namespace) -> list[Example]:
             return message if isinstance(message, HandPose) and message.hand == first.hand else None
 
         model = _model(options.hand, first.hand, options.calibration)
-        return template_session(receive, model, options.make_template, options.examples, SystemClock(), echo)
+        return template_session(receive, model, options.teach, options.examples, SystemClock(), echo)
     finally:
         link.close()
 

@@ -297,12 +297,12 @@ import sys, resource, signal
 from pathlib import Path
 from common.errors import RecordingError
 from common.recording.messages import MessageWriter
-from tests.common.test_recording import FILES, told
+from tests.common.test_recording import FILES, recorded
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
 writer = MessageWriter(Path(sys.argv[1]), FILES)
 try:
-    for stream, message, t_ns in told():
+    for stream, message, t_ns in recorded():
         writer.write(stream, message, t_ns)
 except RecordingError as error:
     print(error)

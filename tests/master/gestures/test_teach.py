@@ -192,7 +192,7 @@ def test_the_commands_teach_from_a_file_read_it_list_and_forget(
     names = [line.split(" pose ")[1].split()[0] for line in read.output.splitlines() if " pose " in line]
     assert names == ["horns", "open_palm"] * 4
     listed = invoke("gestures", *given)
-    assert "horns (taught" in listed.output
+    assert "horns (template of" in listed.output
     gone = invoke("gestures", "--forget", "horns", *given)
     assert gone.exit_code == 0
     assert load(mine, GestureSettings).poses == SETTINGS.poses

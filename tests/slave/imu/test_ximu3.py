@@ -174,7 +174,7 @@ def test_a_setting_that_older_devices_lack_is_only_reported(
 
 
 def test_ports_that_cannot_be_opened_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(ImuError, match=r"nowhere cannot be opened: there is no such port; .* --list"):
+    with pytest.raises(ImuError, match=r"nowhere cannot be opened: there is no such port; .* --ports"):
         opened(tmp_path / "nowhere")
     locked = FakeXimu3(tmp_path / "locked")
     other = open_port(SerialPlace(str(tmp_path / "locked")))
