@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replaced
 
-from bench.wrist_mounting import errors
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
 from common.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
@@ -20,6 +19,7 @@ from master.calibrate.mounting.seen import Fit
 from master.calibrate.mounting.unknown import UNKNOWN
 from master.rig_setup import RigSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
+from tests.master.calibrate.mounting.worn import errors
 from tests.master.test_solve_both import write_detections
 
 CERTAIN = {
