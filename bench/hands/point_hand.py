@@ -35,8 +35,9 @@ class PointHand:
             CalibrationError: The profile mounts no marker of one of the names.
         """
         settings = settings if faces else settings._replace(facing_rad=inf)
-        options = {"continuous": continuous, "natural": natural}
-        self.estimator = Estimator([_NO_RAY], model, markers, markers, **options, settings=settings)
+        self.estimator = Estimator(
+            [_NO_RAY], model, markers, markers, continuous=continuous, natural=natural, settings=settings
+        )
 
     def push(
         self,

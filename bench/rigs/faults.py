@@ -173,8 +173,8 @@ def of_links(seconds: float = 4.0) -> list[Fault]:
               ("left.clock_steps",)),
         Fault("slave_stopped", f"SIGSTOP of a slave for {_STOPPED_S:g} s", "one camera alone: tracked for 0.4 s,"
               " then depth is unsure", _stopped("left"), ("left.lost", "left.skipped"), ("camera_absent",)),
-        Fault("master_stopped", f"SIGSTOP of the master for {_STOPPED_S:g} s", "of what waited the newest second counts",
-              _stopped(MASTER)),
+        Fault("master_stopped", f"SIGSTOP of the master for {_STOPPED_S:g} s",
+              "of what waited the newest second counts", _stopped(MASTER)),
         Fault("wrong_key", "a slave comes back with another rig's key, then with its own", "refused: it"
               " receives a foreign rig; the camera is absent", _other(key="5a" * 32), (), ("camera_absent",)),
         Fault("version", "a slave of another wire version, then ours", "refused; named on both sides",

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.report import ROOT
-from common.bus import Subscription
+from common.bus import ANY, Subscription
 from common.certificates import OPERATOR
 from common.errors import BusError, PhalanxError
 from common.keys import FOLDER, access_of
@@ -265,9 +265,7 @@ class Rig:
         """Return the master's counts since it began."""
         return dict(self.ask().counts)
 
-    def read(
-        self, stream: str, keep: Callable[[object], None], name: str | None = None, depth: int = 256
-    ) -> Reader:
+    def read(self, stream: str, keep: Callable[[object], None], name: str = ANY, depth: int = 256) -> Reader:
         """Hand the messages of a stream to `keep` from now on."""
         reader = Reader(self.bus.subscribe(stream, name, depth=depth), keep)
         self.closing.append(reader.close)

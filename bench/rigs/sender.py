@@ -97,10 +97,11 @@ def main() -> None:
     setattr(common.datagram, "WIRE_VERSION", given.wire)  # noqa: B010  as a program of that version has it
     clock, key = SkewedClock(round(given.clock_s * 1e9), 0.0), rig_key(os.environ, None)
     setup = load_setup(given.tree, given.rig)
-    loop_s, options = LOOP_S, {}
     if given.way:
-        loop_s, options = 2.0 * WAY_S, {"phases_s": LATE_S, "unseen": 0.0, "scene_s": scene_s}
-    frames = detections(setup, given.rate_hz, loop_s=loop_s, **options)
+        loop_s = 2.0 * WAY_S
+        frames = detections(setup, given.rate_hz, loop_s=loop_s, phases_s=LATE_S, unseen=0.0, scene_s=scene_s)
+    else:
+        loop_s, frames = LOOP_S, detections(setup, given.rate_hz)
     cameras = [
         Camera(Uplink(name, key, clock, given.port, "127.0.0.1"), frames[name], round(1e9 * loop_s))
         for name in given.cameras or frames

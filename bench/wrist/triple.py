@@ -61,7 +61,7 @@ def rows() -> Iterator[Row]:
         camera = cameras[rig.cameras[0]]
         name, view = "curl, simulated", WristView.of(rig, camera, hand)
         triples = drawn(
-            WristScene.by_name("curl", rig, cameras, hand), camera.name, 0.2 * np.arange(_TRIPLES)
+            WristScene.by_name("curl", rig, cameras, hand), camera.name, np.arange(0.0, 0.2 * _TRIPLES, 0.2)
         )
     frames = [frame for one in triples for frame in (one.ambient, one.laser, one.led)]
     found = [find(one, view) for one in triples]

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from msgspec import Struct
 
-from bench.hostile_messages import Attack, Fields, wire
-from bench.scale_rig import told
+from bench.rigs.fuzz import Attack, Fields, wire
+from bench.rigs.rooms import detections
 from common.arrays import Float
 from common.messages import (
     Backlog,
@@ -80,7 +80,7 @@ def frames_of(name: str, setup: RigSetup | None) -> dict[type[Struct], list[Fiel
         return {}
     if setup.wrist_cameras:
         return {WristDetections: [wire(one) for one in triples(setup, _LOOP, _RATE_HZ)]}
-    return {MarkerDetections: [wire(one) for one in told(setup, _RATE_HZ)[name][:_LOOP]]}
+    return {MarkerDetections: [wire(one) for one in detections(setup, _RATE_HZ)[name][:_LOOP]]}
 
 
 def own_kinds(name: str, setup: RigSetup) -> tuple[type[Message], ...]:

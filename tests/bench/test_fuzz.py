@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from msgspec import Meta, Struct
 
-from bench.hostile_examples import Speaker, examples
-from bench.hostile_messages import SAID, Attack, Now, all_attacks, attacks, flood, plausible
+from bench.rigs.fuzz import SAID, Attack, Now, all_attacks, attacks, flood, plausible
+from bench.rigs.fuzz_examples import Speaker, examples
 from common.arrays import Float
 from common.datagram import Kind
 from common.errors import MessageError

@@ -14,7 +14,7 @@ from typing import TypeAlias, get_args
 import msgspec
 from msgspec import Struct, inspect
 
-from bench.hostile_values import dtype_of, hostile, nested
+from bench.rigs.fuzz_values import dtype_of, hostile, nested
 from common.messages import AnyMessage, Message
 from common.session import EchoAnswer, Hello, Started
 

@@ -2,9 +2,9 @@
 
 It has its own key, a session as any other, and says what it likes in it. What devices say on the bus it says there.
 
-`python -m bench.hostile_sender NAME TREE RIG BEACON_PORT BUS COUNT PER_S SEED`, BUS the endpoint of the master's bus,
-the rig key in PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends COUNT messages, and
-prints how many of each type as JSON.
+`python -m bench.rigs.hostile_sender NAME TREE RIG BEACON_PORT BUS COUNT PER_S SEED`, BUS the endpoint of the master's
+bus, the rig key in PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends COUNT messages,
+and prints how many of each type as JSON.
 """
 
 import argparse
@@ -20,8 +20,8 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
-from bench.hostile_examples import Speaker, own_kinds
-from bench.hostile_messages import SAID, Attack, flood, wire
+from bench.rigs.fuzz import SAID, Attack, flood, wire
+from bench.rigs.fuzz_examples import Speaker, own_kinds
 from common.bus_settings import settings
 from common.clock import SystemClock
 from common.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
@@ -169,8 +169,7 @@ def main() -> None:
     began = time.monotonic()
     sender.send_all(attacks, options.count, options.per_s)
     seconds = time.monotonic() - began
-    said = {"seconds": seconds, **sender.sent}
-    print(json.dumps(said), flush=True)
+    print(json.dumps({"seconds": seconds, **sender.sent}), flush=True)
     sender.close()
 
 
