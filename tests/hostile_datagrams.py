@@ -1,23 +1,30 @@
-"""A million hostile datagrams at both ends of the link while a hand is tracked, over real sockets.
+"""Hostile datagrams at both ends of the link, and strangers at a TCP port, while a hand is tracked.
 
-Three kinds, mixed: random bytes; headers that pass every cheap check with random bodies, so that the cipher has to say
+Datagrams are of three kinds, mixed: random bytes; headers that pass every cheap check with random bodies, so that the cipher has to say
 no; and genuine datagrams, captured before, cut, lengthened, with bits turned, or as they were: replays.
 """
 
 import random
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
-from bench.faults_poses import Told
-from bench.faults_rig import RATE_HZ, FaultRig
-from bench.processes import cpu_s, footprint
+from bench.rigs.faults import FaultRig
+from bench.rigs.poses import Judged
 from common.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
 from common.messages import WIRE_VERSION
 from common.session import RigKeys
 from common.streams import MASTER
 
+_HELLO = bytes.fromhex("16030100c8010000c40303")  # how a TLS client begins
+_UPGRADE = (
+    b"GET /socket HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+CONNECT_S = 0.5
 POOL = 4096  # different ones; the network does not care
 
 
@@ -28,17 +35,15 @@ class Share:
     Attributes:
         seconds: How many.
         master_cpu, slave_cpu: Cores.
-        poses_per_s: Poses that came.
         lost: Share of the frames of both cameras that did not come.
-        told: The poses.
+        poses: The poses.
     """
 
     seconds: float
     master_cpu: float
     slave_cpu: float
-    poses_per_s: float
     lost: float
-    told: list[Told]
+    poses: list[Judged]
 
 
 class Watch:
@@ -52,7 +57,7 @@ class Watch:
     def end(self) -> Share:
         """What happened since."""
         seconds, used = time.monotonic() - self._began, self._cpu()
-        told, counts = self._rig.poses.since(self._began), self._rig.counts()
+        poses, counts = self._rig.poses.since(self._began), self._rig.counts()
         rise = {
             name: sum(
                 counts.get(f"{c}.{name}", 0) - self._counts.get(f"{c}.{name}", 0) for c in ("left", "right")
@@ -61,11 +66,10 @@ class Watch:
         }
         cpu = [(b - a) / seconds for a, b in zip(self._used, used, strict=True)]
         lost = rise["lost"] / max(rise["lost"] + rise["received"], 1)
-        return Share(seconds, cpu[0], cpu[1], len(told) / seconds, lost, told)
+        return Share(seconds, cpu[0], cpu[1], lost, poses)
 
     def _cpu(self) -> tuple[float, float]:
-        processes = self._rig.processes
-        return cpu_s(processes[MASTER].pid), cpu_s(processes["left"].pid)
+        return self._rig.footprint(MASTER).cpu_s, self._rig.footprint("left").cpu_s
 
 
 class Capture:
@@ -140,16 +144,61 @@ def _turns(pool: list[bytes], count: int) -> Iterator[bytes]:
 
 def targets(rig: FaultRig) -> list[Address]:
     """The master's port, the beacons' port and the data ports of both slaves."""
-    return [("127.0.0.1", rig.master_port), ("127.255.255.255", rig.port), *rig.relay.slaves()[:2]]
+    return [("127.0.0.1", rig.master_port), ("127.255.255.255", rig.beacon_port), *rig.relay.slaves()[:2]]
 
 
 def memory_mb(rig: FaultRig) -> tuple[float, float]:
     """Of the master and of a slave, what is no file's."""
-    return footprint(rig.processes[MASTER].pid).anonymous_mb, footprint(
-        rig.processes["left"].pid
-    ).anonymous_mb
+    return rig.footprint(MASTER).anonymous_mb, rig.footprint("left").anonymous_mb
 
 
-def nominal(share: Share) -> float:
-    """Poses, of the nominal number."""
-    return share.poses_per_s / RATE_HZ
+def openings(seed: int) -> list[bytes]:
+    """What is said first: noise, the beginning of TLS, HTTP and WebSocket and noise, lengths of gigabytes, nothing."""
+    source = random.Random(seed)
+    return [
+        source.randbytes(200),
+        source.randbytes(20_000),
+        _HELLO + source.randbytes(2000),
+        b"\xff" * 4000,
+        b"\x00" * 4000,
+        b"\xff\xff" + source.randbytes(65_535),
+        b"GET /" + b"A" * 100_000 + b" HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"X: " + b"y" * 60_000,
+        _UPGRADE + source.randbytes(5000),
+        b"POST / HTTP/1.1\r\nContent-Length: 99999999999\r\n\r\n" + source.randbytes(5000),
+        b"",
+    ]
+
+
+def assault(port: Address, connections: int, hold: int, seconds: float, seed: int = 3) -> Counter[str]:
+    """Connect so many times within so many seconds, keep the last `hold` connections half open until the end.
+
+    Returns:
+        How many were "open", "refused" at once, and "cut" while something was said.
+    """
+    said, became, kept = openings(seed), Counter[str](), list[socket.socket]()
+    began = time.monotonic()
+    with ExitStack() as stack:
+        for k in range(connections):
+            time.sleep(max(0.0, seconds * k / connections - (time.monotonic() - began)))
+            one = socket.socket()
+            one.settimeout(CONNECT_S)
+            stack.callback(one.close)
+            try:
+                one.connect(port)
+            except OSError:
+                became["refused"] += 1
+                continue
+            try:
+                one.settimeout(0.05)
+                one.sendall(said[k % len(said)])
+                became["open"] += 1
+            except OSError:
+                became["cut"] += 1
+            kept.append(one)
+            if len(kept) > hold:
+                old = kept.pop(0)
+                with suppress(OSError):
+                    old.shutdown(socket.SHUT_RDWR)
+                old.close()
+    return became

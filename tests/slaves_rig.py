@@ -1,81 +1,55 @@
-"""A rig of real processes for the rehearsal of the checklist: slaves with simulated cameras, an IMU and a master,
-started by their own command lines; and its list, as it comes over the bus."""
+"""A rig of real slaves for tests of the checklist: simulated cameras, an IMU and a master, and its list on the bus."""
 
 import json
-import os
-import secrets
 import shutil
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.local_rig import free_port, join_bus, until
-from bench.udp_relay import UdpRelay
-from common.errors import BusError, PhalanxError
-from common.messages import Checklist, Command, Health
+from bench.report import CALIBRATION
+from bench.rigs.local import UP_S, Rig, RigError, until
+from bench.rigs.relay import UdpRelay
+from common.errors import BusError
+from common.messages import Checklist
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
 
-ROOT = Path(__file__).resolve().parents[1]
 MARKER_HZ, WRIST_HZ = 12.0, 30.0  # slow enough for two busy cores to draw all pictures in time
-UP_S = 90.0
 _BEGIN_S = 4.0
 Key = tuple[str, str]
 
 
-class RehearsalError(PhalanxError):
-    """A process did not come up, or a list does not come."""
-
-
 class Lists:
-    """What the master published. Holds every list with the moment of its arrival, and how often the master reported."""
+    """What the master published: every list with the moment of its arrival, and how often the master reported."""
 
-    def __init__(self, bus: ZenohBus) -> None:
-        """Listen from now on, on a thread of its own."""
-        self._lists, self._health = (
-            bus.subscribe("checklist", depth=64),
-            bus.subscribe("health", MASTER, depth=64),
-        )
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._came: list[tuple[float, frozenset[Key]]] = []
-        self._closing = threading.Event()
         self.reports = 0
         self.sentences: dict[Key, tuple[str, str]] = {}
-        threading.Thread(target=self._hear, daemon=True).start()
 
     def now(self) -> frozenset[Key]:
-        """Code and subject of what the newest list has."""
+        """Return code and subject of what the newest list has."""
         with self._lock:
             return self._came[-1][1] if self._came else frozenset()
 
     def since(self, moment: float) -> list[tuple[float, frozenset[Key]]]:
-        """The lists that came after a moment of `time.monotonic`."""
+        """Return the lists that came after a moment of `time.monotonic`."""
         with self._lock:
             return [one for one in self._came if one[0] >= moment]
 
-    def close(self) -> None:
-        """Listen no more."""
-        self._closing.set()
-
-    def _hear(self) -> None:
-        while not self._closing.is_set():
-            told = self._lists.get(0.05)
-            if isinstance(told, Checklist):
-                with self._lock:
-                    keys = frozenset((item.code, item.subject) for item in told.items)
-                    self._came.append((time.monotonic(), keys))
-                self.sentences |= {(one.code, one.subject): (one.sentence, one.fix) for one in told.items}
-            while isinstance(self._health.get(0.0), Health):
-                self.reports += 1
+    def keep(self, message: object) -> None:
+        if isinstance(message, Checklist):
+            keys = frozenset((item.code, item.subject) for item in message.items)
+            with self._lock:
+                self._came.append((time.monotonic(), keys))
+            self.sentences |= {(one.code, one.subject): (one.sentence, one.fix) for one in message.items}
+        else:
+            self.reports += 1
 
 
-class Rig:
+class SlavesRig(Rig):
     """Processes of one rig, and the files with which they can be put wrong. Close it in any case.
 
     Attributes:
@@ -97,49 +71,42 @@ class Rig:
             environments: Process -> what it has in its environment besides.
 
         Raises:
-            RehearsalError: It does not come up.
+            RigError: It does not come up.
         """
-        self._folder, self._rig, self._environments = folder, rig, environments or {}
+        super().__init__(folder)
+        self._rig, self._environments = rig, environments or {}
         self.slaves, self.master, self.system = folder / "slaves", folder / "master", folder / "system"
-        folder.mkdir(parents=True)
-        self._write_trees()
-        file = self.read(self.slaves / "rigs" / f"{rig}.json")
-        self.cameras: list[str] = file["cameras"]
-        self.imu: str | None = None if file.get("imu") is None else file["imu"]["name"]
-        self.faults = {name: folder / f"faults-{name}.json" for name in self.cameras}
+        _write_trees(self.slaves, self.master, rig)
+        file = read(self.slaves / "rigs" / f"{rig}.json")
+        cameras, imu = file["cameras"], file.get("imu")
+        self.faults = {name: folder / f"faults-{name}.json" for name in cameras}
         zone = self.system / "sys/class/thermal/thermal_zone0"
         zone.mkdir(parents=True)
         (zone / "type").write_text("cpu-thermal\n")
         self.warm(48.0)
         self.disk(9000.0)
-        self._beacon = free_port(socket.SOCK_DGRAM)
-        self._end = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-        self._key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
         self._epoch_ns = time.monotonic_ns() + round(_BEGIN_S * 1e9)
-        self.relay = UdpRelay(self._beacon)
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.lists: Lists
-        self._bus: ZenohBus | None = None
+        self.relay, self.lists = UdpRelay(self.beacon_port), Lists()
+        self.closing.append(self.relay.close)
         try:
-            self._start()
+            beacon, own = "{}:{}".format(*self.relay.beacon), self._environments.get(MASTER, {})
+            self.start_master(self.master, [rig], beacon=beacon, **own)
+            for name in (*cameras, *([] if imu is None else [imu["name"]])):
+                self.start_slave(name)
+            self.join()
+            self.read("checklist", self.lists.keep)
+            self.read("health", self.lists.keep, MASTER)
+            if not until(self._tracking, UP_S):
+                raise RigError(f"rig {rig}: no poses; logs are in {folder}")
         except BaseException:
             self.close()
             raise
 
-    def close(self) -> None:
-        """End all processes."""
-        if self._bus is not None:
-            self.lists.close()
-            self._bus.close()
-        for process in self.processes.values():
-            process.send_signal(signal.SIGCONT)
-            process.kill()
-            process.wait()
-        self.relay.close()
-
     def start_slave(self, name: str) -> None:
         """Start the process of one camera, or of the IMU."""
-        link = ["--bind", "127.0.0.1", "--beacon-port", str(self._beacon)]
+        kind = ["imu", "--imu", "synthetic"]
+        if name in self.faults:
+            kind = ["run", "--camera", "synthetic", "--faults", str(self.faults[name])]
         scene = [
             "--scene-epoch-ns",
             str(self._epoch_ns),
@@ -148,21 +115,9 @@ class Rig:
             "--rig",
             self._rig,
         ]
-        kind = ["imu", "--imu", "synthetic"]
-        if name in self.faults:
-            kind = ["run", "--camera", "synthetic", "--faults", str(self.faults[name])]
-        self._popen(
-            name, ["slave", *kind, "--name", name, *scene, *link], {"PHALANX_SYSTEM_ROOT": str(self.system)}
-        )
-
-    def ask(self, target: str, verb: str, body: str = "") -> Health:
-        """Command a process.
-
-        Raises:
-            BusError: It refuses.
-        """
-        assert self._bus is not None
-        return self._bus.ask(Command(target, verb, body), 20.0)
+        link = ["--bind", "127.0.0.1", "--beacon-port", str(self.beacon_port)]
+        own = {"PHALANX_SYSTEM_ROOT": str(self.system), **self._environments.get(name, {})}
+        self.start(name, "slave", *kind, "--name", name, *scene, *link, **own)
 
     def warm(self, celsius: float) -> None:
         """Have the slaves' computer so warm."""
@@ -176,73 +131,46 @@ class Rig:
         """Put a camera wrong (`slave.cameras.faulty.Faults`); nothing: it is well again."""
         _put(self.faults[camera], json.dumps(faults))
 
-    @staticmethod
-    def read(path: Path) -> Any:
-        """A calibration file as it is."""
-        return json.loads(path.read_text())
-
-    @staticmethod
-    def write(path: Path, content: object) -> None:
-        """Replace a calibration file at once."""
-        _put(path, json.dumps(content))
-
-    def _start(self) -> None:
-        place = ["--rig", self._rig, "--calibration", str(self.master), "--bus", self._end]
-        link = ["--beacon", "{}:{}".format(*self.relay.beacon), "--bind", "127.0.0.1:0"]
-        self._popen("master", ["master", "run", *place, *link], {})
-        for name in (*self.cameras, *([] if self.imu is None else [self.imu])):
-            self.start_slave(name)
-        self._bus = join_bus(self._end, UP_S)
-        self.lists = Lists(self._bus)
-        if not until(lambda: self._tracking(), UP_S):
-            raise RehearsalError(f"rig {self._rig}: no poses; logs are in {self._folder}")
-
     def _tracking(self) -> bool:
         try:
-            return self.ask(MASTER, "report").counts.get("poses", 0) > 2 * MARKER_HZ
+            return self.counts().get("poses", 0) > 2 * MARKER_HZ
         except BusError:
             return False
 
-    def _popen(self, name: str, command: list[str], environment: Mapping[str, str]) -> None:
-        log = (self._folder / f"{name}.log").open("ab")
-        process = subprocess.Popen(
-            [sys.executable, "-m", *command],
-            cwd=ROOT,
-            env={**os.environ, **self._key, **environment, **self._environments.get(name, {})},
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
-        self.processes[name] = process
 
-    def _write_trees(self) -> None:
-        """Both sides' files: slower cameras, an IMU on the hand, and dates of measurements that fit together."""
-        shutil.copytree(ROOT / "calib_json", self.slaves)
-        rig_path = self.slaves / "rigs" / f"{self._rig}.json"
-        rig = self.read(rig_path)
-        wrist = rig["kind"] == "wrist"
-        for name in rig["cameras"]:
-            path = self.slaves / "cameras" / f"{name}.json"
-            dated = {"intrinsics": measured("2026-01-10")}
-            rate = {"frame_rate_hz": WRIST_HZ if wrist else MARKER_HZ}
-            self.write(path, {**self.read(path), **rate, "provenance": dated})
-        if wrist:
-            rig["imu"] = None
-        else:
-            rig["provenance"] = {"T_rig_camera": measured("2026-01-11")}
-            rig["imu"] = self.read(self.slaves / "rigs/wrist.json")["imu"]
-        self.write(rig_path, rig)
-        shutil.copytree(self.slaves, self.master)
+def read(path: Path) -> Any:
+    """Return a calibration file as it is."""
+    return json.loads(path.read_text())
+
+
+def write(path: Path, content: object) -> None:
+    """Replace a calibration file at once."""
+    _put(path, json.dumps(content))
 
 
 def measured(day: str) -> dict[str, object]:
-    """The provenance of something that was measured on a day."""
-    return {
-        "date": f"{day}T12:00:00Z",
-        "tool": "rehearsal",
-        "data": ["none"],
-        "residual": {"rms_px": 0.1},
-        "note": "",
-    }
+    """Return the provenance of something that was measured on a day."""
+    date, residual = f"{day}T12:00:00Z", {"rms_px": 0.1}
+    return {"date": date, "tool": "rehearsal", "data": ["none"], "residual": residual, "note": ""}
+
+
+def _write_trees(slaves: Path, master: Path, name: str) -> None:
+    """Write both sides' files: slower cameras, an IMU on the hand, dates of measurements that fit together."""
+    shutil.copytree(CALIBRATION, slaves)
+    rig_path = slaves / "rigs" / f"{name}.json"
+    rig = read(rig_path)
+    wrist = rig["kind"] == "wrist"
+    for camera in rig["cameras"]:
+        path, rate_hz = slaves / "cameras" / f"{camera}.json", WRIST_HZ if wrist else MARKER_HZ
+        dated = {"intrinsics": measured("2026-01-10")}
+        write(path, {**read(path), "frame_rate_hz": rate_hz, "provenance": dated})
+    if wrist:
+        rig["imu"] = None
+    else:
+        rig["provenance"] = {"T_rig_camera": measured("2026-01-11")}
+        rig["imu"] = read(slaves / "rigs/wrist.json")["imu"]
+    write(rig_path, rig)
+    shutil.copytree(slaves, master)
 
 
 def _put(path: Path, text: str) -> None:

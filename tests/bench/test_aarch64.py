@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from bench.aarch64 import baseline, scene, sysroot
-from bench.aarch64.__main__ import CASES, main
 from bench.aarch64.baseline import Baseline, BaselineError
+from bench.aarch64.command import CASES, main
 from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, forth_and_back, read, read_strobed, without
 from bench.aarch64.guest import Digest, Marks, run_case

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.marker_frames import STEP_NS, expose, frames_of, generator, sequences
-from bench.marker_kinds import KINDS
-from bench.marker_paints import camera_file, paints
-from bench.marker_scene import CLEAR, make_scene
-from bench.seed_markers import detect
+from bench.markers.frames import STEP_NS, expose, frames_of, generator, sequences
+from bench.markers.kinds import KINDS, camera_file, paints
+from bench.markers.published import detect
+from bench.markers.scene import CLEAR, make_scene
 from common.sim.light import bgr_bytes
 from slave.markers.classify import in_range
 

@@ -14,10 +14,10 @@ from shutil import copytree
 
 import numpy as np
 import pytest
-from bench.scale_rig import ROOM
 from msgspec import Struct
 
 from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
+from bench.rigs.rooms import ROOM
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.session import EchoAnswer
 from tests.hostile_rigs import (

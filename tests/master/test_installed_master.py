@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.local_rig import free_port
+from bench.rigs.local import free_port
 from master.keys_folder import make
 from master.service_unit import UNIT
 from tests.master.user_manager import user_manager, why_not

@@ -1,26 +1,22 @@
 """The wall clock of a machine jumps, on real processes: nothing between light and pose may notice.
 
-`python -m bench.faults_wall_clock [--runs 3]`, for docs/faults.md. The slave of one camera and the master run with
-bench/wall_clock.c loaded before the C library, so that a file says what their wall clock shows while they run; their
-monotonic clock is left alone, as it is by `date -s`, by NTP or by a battery that died. Needs a C compiler, `cc`.
+The slave of one camera and the master run with wall_clock.c loaded before the C library, so that a file says what their
+wall clock shows while they run; their monotonic clock is left alone, as it is by `date -s`, by NTP or by a battery that died. Needs a C compiler, `cc`.
 """
 
-import argparse
 import os
-import statistics
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from bench.checklist_rig import Rig
 from common.errors import PhalanxError
 from common.streams import MASTER
+from tests.slaves_rig import SlavesRig
 
 CAMERA, OTHER = "left", "right"
 STEPS_S = (10.0, -10.0)
@@ -100,7 +96,7 @@ class WallClock:
                 raise PhalanxError(f"{SOURCE}: does not move the wall clock alone here")
 
 
-def jump(rig: Rig, clock: WallClock, ahead_s: float) -> Run:
+def jump(rig: SlavesRig, clock: WallClock, ahead_s: float) -> Run:
     """Have the wall clock jump and come back, and see what the master counts meanwhile."""
     told = [_counts(rig)]
     for ahead in (0.0, ahead_s):
@@ -113,11 +109,6 @@ def jump(rig: Rig, clock: WallClock, ahead_s: float) -> Run:
     return Run(share, {name: told[2].get(name, 0) - told[1].get(name, 0) for name in _COUNTS})
 
 
-def wrong(run: Run) -> bool:
-    """Whether somebody noticed."""
-    return run.share < LEAST_SHARE or any(run.rise.values())
-
-
 def measure(folder: Path, runs: int) -> dict[float, list[Run]]:
     """Jumps of both directions, so many of each, on one rig.
 
@@ -125,7 +116,7 @@ def measure(folder: Path, runs: int) -> dict[float, list[Run]]:
         PhalanxError: The rig does not come up, or has its true clock.
     """
     clock = WallClock(folder)
-    rig = Rig(folder / "desk", "desk", dict.fromkeys((CAMERA, MASTER), clock.environment))
+    rig = SlavesRig(folder / "desk", "desk", dict.fromkeys((CAMERA, MASTER), clock.environment))
     try:
         for name in (CAMERA, MASTER):
             if _LIBRARY not in Path(f"/proc/{rig.processes[name].pid}/maps").read_text():
@@ -141,26 +132,5 @@ def _for_each(other: str, before: Mapping[str, int], after: Mapping[str, int]) -
     return {name: max(after[name] - before[name], 1) / frames for name in ("poses", f"{CAMERA}.received")}
 
 
-def _counts(rig: Rig) -> dict[str, int]:
+def _counts(rig: SlavesRig) -> dict[str, int]:
     return dict(rig.ask(MASTER, "report").counts)
-
-
-def main() -> int:
-    """Measure and print; 1 if somebody noticed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=3, metavar="N")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="phalanx-faults-") as folder:
-        found = measure(Path(folder), options.runs)
-    for ahead_s, runs in found.items():
-        rise = {name: sum(run.rise[name] for run in runs) for name in _COUNTS}
-        shares = [100.0 * run.share for run in runs]
-        print(
-            f"wall clock {ahead_s:+g} s: {statistics.median(shares):.0f} % of frames and poses of before (fewest"
-            f" {min(shares):.0f} %); {rise}"
-        )
-    return int(any(wrong(run) for runs in found.values() for run in runs))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

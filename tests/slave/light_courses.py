@@ -14,7 +14,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from bench.row import Row
+from bench.report import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.sim.illuminant import CALIBRATED_KELVIN, LightCourse

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.light import standard_scene
+from tests.slave.light_courses import standard_scene
 from common.arrays import Float, Image
 from common.sim.grasp import Grasp
 from common.sim.illuminant import Light

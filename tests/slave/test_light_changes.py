@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench.light import (
+from tests.slave.light_courses import (
     CANDLE,
     EXPOSURES,
     OPEN_S,

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.light import standard_scene
-from bench.marker_frames import sequences
-from bench.marker_kinds import KINDS
-from bench.marker_score import clicks
+from tests.slave.light_courses import standard_scene
+from bench.markers.frames import sequences
+from bench.markers.kinds import KINDS
+from bench.markers.accuracy import clicks
 from common.arrays import Image
 from common.frame_recording import open_recording
 from common.sim.illuminant import LightCourse

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.study.people import Participant, participant, turned, with_bones
+from bench.study.trials import orders
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
 from common.hand_model import FINGER_JOINTS, JOINTS, HandModel
 from common.sim.motion import POSES
-from master.study.participant import Participant, participant, turned, with_bones
-from master.study.session import orders
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 RIG = load(CALIB / "rigs/wrist.json", RigCalibration)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.study.command import cells_of, icc_1_1, repeated
+from bench.study.trials import Trial
 from common.sim.motion import POSES
-from master.study.statistics import cells_of, icc_1_1, repeated
-from master.study.trials import Trial
 
 # Shrout & Fleiss, Psychological Bulletin 86 (1979), table 2: four judges rate six targets. Table 4: ICC(1,1) = .17.
 SHROUT_FLEISS = np.array(
@@ -30,14 +30,10 @@ def trial(
         participant=who,
         block=block,
         pose=pose,
-        pip_deg=(true + off,) * 5,
-        truth_deg=(true,) * 5,
-        tracked=(tracked,) * 5,
-        level=(1,) * 5,
-        ambiguous=(False,) * 5,
-        laser_seen=(seen,) * 5,
-        tip_seen=(False,) * 5,
-        triples=6,
+        pip_deg=np.full(5, true + off),
+        truth_deg=np.full(5, true),
+        tracked=np.full(5, tracked),
+        seen=np.full(5, seen),
     )
 
 
@@ -73,7 +69,7 @@ def test_a_cell_is_mean_and_sd_of_absolute_errors() -> None:
     )
     assert [cell.pose for cell in found] == ["pinch"] * 5
     for cell in found:
-        assert (cell.trials, cell.reached, cell.told, cell.tip, cell.blind) == (4, 3, 4, 0, 0)
+        assert (cell.trials, cell.reached, cell.blind) == (4, 3, 0)
         assert cell.is_reached
         assert cell.mean_deg == pytest.approx(3.0)
         assert cell.sd_deg == pytest.approx(2.0)  # of 3, 5, 1 about 3, n - 1
@@ -89,7 +85,7 @@ def test_a_finger_tracked_in_fewer_than_half_of_the_trials_is_not_filled_in(
     assert (cell.reached, cell.trials) == (tracked, 4)
 
 
-def test_a_finger_that_was_told_by_something_else_is_counted_and_its_error_kept() -> None:
+def test_a_finger_tracked_though_nothing_of_it_is_seen_is_counted_and_its_error_kept() -> None:
     cell = cells_of([trial(1, off=2.0), trial(2, off=30.0, seen=False)])[0]
     assert (cell.reached, cell.blind) == (2, 1)
     assert cell.mean_deg == pytest.approx(16.0)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.joint_certainty import NOISE_M, Coverage, compared, joined, kinds
+from bench.hands.certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry import rigid
 from common.hand_model import CHAINS, PALM, TIPS, HandModel

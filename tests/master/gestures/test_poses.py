@@ -15,7 +15,7 @@ from common.messages import Gesture, HandPose
 from common.sim.motion import POSES, REST, angles_of, smooth_step
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import PoseRecogniser
-from master.study.participant import participant
+from bench.study.people import participant
 from tests.hand_helpers import LEFT, RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, LARGE, OPEN, PINCH, POINT, SMALL, TWO, posture, shown
 

@@ -9,7 +9,7 @@ import pytest
 import typer
 from msgspec.structs import replace
 
-from bench.wrist_wearers import CALIB, Person, knuckles
+from bench.wrist.wearers import CALIB, Person, knuckles
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError

@@ -1,16 +1,12 @@
-"""Observations made of truth are near it and end where sight does; kept ones are those that were made."""
-
-from pathlib import Path
+"""Observations made of truth are near it and end where sight does."""
 
 import numpy as np
 import pytest
 
-from bench import fusion_kept
-from bench.fusion_kept import observed
-from bench.fusion_scene import Both, Shown, Sight
-from bench.fusion_shown import shown
+from bench.both.scene import Shown
+from bench.both.shown import shown
 from bench.played import START_NS
-from common.messages import ImuSample, MarkerDetections, WristDetections, encode
+from common.messages import ImuSample, MarkerDetections, WristDetections
 
 SECONDS = 0.5
 
@@ -57,28 +53,3 @@ def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -
     assert line.any()
     assert not (line & (made.sight.line_m < 2e-3)).any()
     assert not (tip & ~made.sight.tip).any()
-
-
-def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Shown) -> None:
-    calls: list[str] = []
-
-    def once(both: Both, seconds: float) -> Shown:
-        calls.append(both.name)
-        return made
-
-    monkeypatch.setitem(fusion_kept._MAKE, "quick", once)
-    for _ in range(2):
-        again = observed("both-poses", SECONDS, 3, "quick", tmp_path)
-        assert [encode(message) for message in again.messages] == [
-            encode(message) for message in made.messages
-        ]
-        _same(again.sight, made.sight)
-    assert calls == ["both-poses"]
-
-
-def _same(a: Sight, b: Sight) -> None:
-    for name in b.paint_t_s:
-        np.testing.assert_array_equal(a.paint_t_s[name], b.paint_t_s[name])
-        np.testing.assert_array_equal(a.paint_px2[name], b.paint_px2[name])
-    for field in ("line_t_s", "line_m", "tip"):
-        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
