@@ -101,24 +101,22 @@ bench: $(STAMP) ## the table of performance, each row against a baseline of the 
 	@$(BIN)/python -m bench $(BENCH_ARGS)
 
 soak: $(STAMP) ## an hour with both sensors: memory, latency, loss; SOAK_ARGS='--minutes 5' for less
-	@$(BIN)/python -m bench.soak $(SOAK_ARGS)
+	@$(BIN)/python -m bench soak $(SOAK_ARGS)
 
 scale: $(STAMP) ## what 2 to 16 simulated cameras cost, what is lost, how late poses are; into docs/scale.html
-	@$(BIN)/python -m bench.scale --page docs/scale.html $(SCALE_ARGS)
+	@$(BIN)/python -m bench scale --page docs/scale.html $(SCALE_ARGS)
 
 faults: $(STAMP) ## every fault on real processes: what is expected, what is measured; FAULTS_ARGS='--runs 1'
-	@$(BIN)/python -m bench.faults $(FAULTS_ARGS)
-	@$(BIN)/python -m bench.faults_unplugged $(FAULTS_ARGS)
-	@$(BIN)/python -m bench.faults_wall_clock $(FAULTS_ARGS)
+	@$(BIN)/python -m bench faults $(FAULTS_ARGS)
 
 hostile: $(STAMP) ## stolen devices say what they like to a running master; HOSTILE_ARGS='--messages 20000' for less
-	@$(BIN)/python -m bench.hostile $(HOSTILE_ARGS)
+	@$(BIN)/python -m bench hostile $(HOSTILE_ARGS)
 
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
-	@$(BIN)/python -m bench.audit $(AUDIT_ARGS)
+	@$(BIN)/python -m bench audit $(AUDIT_ARGS)
 
 instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
-	@$(BIN)/python -m bench.aarch64 count $(INSTRUCTIONS_ARGS)
+	@$(BIN)/python -m bench instructions $(INSTRUCTIONS_ARGS)
 
 schema: $(STAMP) ## write docs/schema/*.json afresh from the types
 	@$(BIN)/python -m tests.test_schemas

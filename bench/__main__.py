@@ -1,118 +1,154 @@
-"""`make bench`: prints the table of performance, section by section; `python -m bench NAME ...` runs some of them.
+"""Benchmarks: `python -m bench NAME ...`; without a name all that print rows, one after another (`make bench`).
 
-`python -m bench oracle --help`: two solvers on the same frozen messages. `python -m bench study --help`: the paper's
-study repeated.
+`python -m bench NAME --help` shows the options of those that have their own.
 """
 
 import argparse
 import importlib
 import json
-import math
 import os
 import platform
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import monotonic
-from typing import cast
+from typing import Any, cast
 
-from bench.row import Row
+from bench.report import Row, show, write_json
 
-SECTIONS = {
-    "markers": "Marker detection, 640x480, six markers, one thread; baseline: the published pipeline rebuilt",
-    "marker_accuracy": "Centroids on generated frames with exact truth, kind by kind; baseline: the published pipeline",
-    "real_markers": "A real, lit ball in a hand, and photographs without paint (PHALANX_DATASETS, PHALANX_PHOTOS)",
-    "tags": "Fiducial tags on generated frames with exact corners; baseline: cv2.aruco and its ways to refine",
-    "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
-    "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",
-    "filters": "1 euro filter: points, the hand at three settings, speed; baseline: one object per signal",
-    "uncertainty": "95 % regions of markers: how often they hold the truth; rendered hands, a profile off by a tenth",
-    "ik": "Inverse kinematics of fingers, palm known; baseline: the papers' FABRIK with limits, scipy, mink",
-    "fabrik": "The card's line against the estimator, what each part costs, and its time; exact truth",
-    "hand_poses": "Hands of independent joints, palm turned by up to 45 degrees; baseline: the papers' fixed palm",
-    "hand": "A moving hand with its palm pose; baseline: the papers' fixed palm, scipy, mink",
-    "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",
-    "mocap": "Poses against motion capture in another frame and clock; hands made from joints; exact truth, leapjs",
-    "real_hands": "Real hands before ideal markers: grasping (PHALANX_MOTION), a glove with tips hidden; goals beside",
-    "joint_covariance": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
-    "hidden_fingers": "Flexion and PIP of a finger without a marker, with its neighbours; baseline: alone",
-    "pose_cost": "What a pose costs the master, stage by stage: two cameras, sixteen, fused; processor time",
-    "fusion": "Markers and wrist device as one hand, against each alone; either cut off and back; exact truth",
-    "fusion_cost": "Processor time of the fused line, message by message; baseline: each sensor alone",
-    "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
-    "forearm": "Palm by an IMU on the forearm, with markers and without: heading, bend; simulated, exact truth",
-    "imu": "Orientation by rates and forces; truth: BROAD (PHALANX_DATASETS), simulated arms; baseline: VQF",
-    "master": "The master above the bus; and 16 cameras over sealed UDP",
-    "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",
-    "depth": "Depth at rest, by fitted laws, and on recorded sweeps; baseline: the error budget",
-    "wrist": "A strobed triple of the wrist device, step by step; baseline: undistorted images, a blob per finger",
-    "wrist_strobe": "Triples of a stream of dropped, doubled and swapped frames; baseline: counting by three",
-    "wrist_laser": "Laser points, recorded and simulated from dark to sun; baseline: the centroid of the blob",
-    "wrist_tips": "Fingertips, recorded and simulated from dark to sun; exact truth, no baseline",
-    "wrist_fingers": "Bends of fingers by a wrist device alone, by level and light; baseline: the printed cubic",
-    "boards": "Lenses and places with a flat, a bent and the chosen board: exact truth; real pairs (PHALANX_DATASETS)",
-    "wrist_calibration": "Laser plane by number of views, flat field, palm by board, who wears it; exact truth",
-    "wrist_extrinsics": "How a wrist device sits, its clocks, from 10 s with markers: noisy, rendered; exact truth",
-    "tracker": "A Vive tracker registered to the cameras from 12 s, and its clock; goal 3 mm, 2 deg; exact truth",
-    "objects": "Objects of beads and of tags at half a metre, rendered, detected, partly hidden; goal 3 mm, 2 deg",
-    "auxiliary_cost": "Processor time of objects, contact and gestures, pose by pose; baseline: the hand's fit",
-    "watched_cost": "A master with console, recording and four outputs; baseline: the same process without",
-    "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
-    "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
-    "gesture_poses": "The six study poses: simulated people, rendered frames, handy_poses, leapjs; exact truth",
-    "gestures": "Pinch, dial, taps, pointing: late, wrong, false; two marker rigs, fused, silent hands; exact truth",
-    "volume": "A finger tip in 27 places of the volume that the rig desk states; exact truth, no baseline",
-    "replay": "Recorded frames with exact truth (PHALANX_DATASETS); exact truth, no baseline",
-    "live": "Two slaves and the master over real UDP, standard scene; baseline: an idle relay of datagrams",
+# Group -> name -> (module, what it measures). A module has `rows()`, or its own command line `main(arguments)`.
+COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
+    "markers": {
+        "markers": (
+            "markers.speed",
+            "time of detection, 640x480, six markers; baseline: the published pipeline",
+        ),
+        "marker_accuracy": (
+            "markers.accuracy",
+            "centroids on generated frames with exact truth, kind by kind",
+        ),
+        "real_markers": (
+            "markers.real",
+            "a real ball in a hand, photographs without markers (PHALANX_PHOTOS)",
+        ),
+    },
+    "hand": {
+        "ik": ("hands.ik", "fingers of a known palm; baseline: the papers' FABRIK with limits, scipy"),
+        "hand_poses": (
+            "hands.poses",
+            "random independent joints, palm turned by 45 degrees; baseline: the papers'",
+        ),
+        "real_motion": ("hands.motion", "recorded and held hands through solver and filter"),
+        "real_hands": (
+            "hands.grasping",
+            "captured hands before ideal markers (PHALANX_MOTION); a hidden tip",
+        ),
+        "joint_certainty": ("hands.certainty", "95 % regions of joints that are seen, hidden, gone"),
+        "mocap": ("hands.mocap", "poses against motion capture in another frame and clock"),
+        "imu": ("imu", "orientation by rates and forces (BROAD, simulated arms); baseline: VQF"),
+        "reliability": ("reliability", "stated against found, of markers, joints and IMU; --picture FILE"),
+    },
+    "cameras": {
+        "sync": ("cameras.sync", "depth of a hand at 1 m/s from unsynchronised cameras; --picture FILE"),
+        "depth": ("cameras.depth", "depth at rest, by fitted laws, and of recorded sweeps"),
+        "uncertainty": ("cameras.uncertainty", "95 % regions of markers, rendered hands with wrong radii"),
+        "occlusion": (
+            "cameras.occlusion",
+            "finger tips that no two cameras see; --picture FILE: where to mount",
+        ),
+    },
+    "wrist device": {
+        "wrist": ("wrist.triple", "time of a strobe cycle, step by step; --picture FILE"),
+        "wrist_strobe": ("wrist.strobe", "strobe cycles of a stream of dropped, doubled, swapped frames"),
+        "wrist_tips": ("wrist.tips", "fingertips, recorded and simulated from dark to sun"),
+        "wrist_fingers": ("wrist.fingers", "joint angles by the device alone, by level and light"),
+        "wrist_calibration": (
+            "wrist.calibration",
+            "laser plane by number of views, palm and knuckles of a subject",
+        ),
+    },
+    "hand, objects and gestures": {
+        "fusion": ("both.fusion", "markers and wrist device as one hand, against each alone; --picture FILE"),
+        "gesture_poses": ("gestures.poses", "the six study poses: people, rigs, recorded hands"),
+        "gestures": ("gestures.actions", "pinch, dial, taps, pointing: late, missed, false"),
+        "objects": ("objects.tracked", "objects of beads and of tags, rendered, detected, partly hidden"),
+        "tags": ("objects.tags", "fiducial tags on generated frames; baseline: cv2.aruco"),
+        "tracker": ("objects.tracker", "a Vive tracker registered to the cameras from 12 s"),
+        "study": ("study.command", "the study of Digits: simulated people, six poses, open loop"),
+    },
+    "cost": {
+        "pose_cost": ("pose_cost", "processor time of a pose, stage by stage; ends with a line of JSON"),
+        "instructions": (
+            "aarch64.command",
+            "aarch64 instructions of the slave per frame, against the record",
+        ),
+    },
+    "processes": {
+        "faults": ("rigs.faults", "faults of links, clocks, processes and cameras"),
+        "hostile": ("rigs.hostile", "stolen devices attack a running master"),
+        "scale": ("rigs.scale", "2 to 16 cameras: cost, loss, latency"),
+        "soak": ("rigs.soak", "an hour of a whole rig: memory, latency, loss"),
+    },
+    "guards": {
+        "oracle": ("oracle.command", "frozen recordings with exact truth; one solver against another"),
+        "audit": ("audit", "known vulnerabilities of all locked packages"),
+    },
 }
+ALL = {name: entry for group in COMMANDS.values() for name, entry in group.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the sections asked for, or oracle or study with their own options; return the exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] in (["oracle"], ["study"]):  # with options of their own
-        return int(importlib.import_module(f"bench.{given[0]}").main(given[1:]))
-    sections = "\n".join(f"  {name:18s} {what}" for name, what in SECTIONS.items())
+    """Run benchmarks by name; return the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in ALL and _own_options(module := _module(given[0]), given[1:]):
+        return int(module.main(given[1:]) or 0)
+    groups = "\n".join(
+        f"{group}:\n" + "\n".join(f"  {name:18s} {what}" for name, (_, what) in names.items())
+        for group, names in COMMANDS.items()
+    )
     parser = argparse.ArgumentParser(
         prog="python -m bench",
         description=__doc__,
-        epilog=f"sections:\n{sections}",
+        epilog=groups,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("sections", nargs="*", metavar="SECTION", help="one of those below (default: all)")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="one of those below (default: all with rows)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the picture of docs instead")
     options = parser.parse_args(given)
-    wanted = cast(list[str], options.sections) or list(SECTIONS)
-    if unknown := sorted(set(wanted) - SECTIONS.keys()):
-        parser.error(f"unknown section {unknown[0]!r}; there are {', '.join(SECTIONS)}")
+    names = cast(list[str], options.names) or [name for name in ALL if hasattr(_module(name), "rows")]
+    if unknown := sorted(set(names) - ALL.keys()):
+        parser.error(f"unknown benchmark {unknown[0]!r}; there are {', '.join(ALL)}")
+    if options.picture is not None:
+        if len(names) != 1 or not hasattr(_module(names[0]), "picture"):
+            parser.error("--picture goes with one benchmark that has a picture")
+        _module(names[0]).picture(options.picture)
+        return 0
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
-    everything: dict[str, list[Row]] = {}
-    for name in wanted:
-        print(f"\n{SECTIONS[name]}", flush=True)
-        start_s, everything[name] = monotonic(), []
-        section = importlib.import_module(f"bench.{name}")
-        for found in cast(Iterable[Row], section.rows()):
-            row = Row(*found)
-            everything[name].append(row)
-            print(f"  {row.name:58s} {_number(row.value):>10s} {row.unit:8s} {row.note}", flush=True)
+    tables: dict[str, list[Row]] = {}
+    for name in names:
+        print(f"\n{name}: {ALL[name][1]}", flush=True)
+        start_s, section = monotonic(), _module(name)
+        tables[name] = show(Row(*found) for found in cast(Iterable[Row], section.rows()))
         print(f"  ({monotonic() - start_s:.0f} s)", flush=True)
         if figures := cast(dict[str, str], getattr(section, "FIGURES", {})):
-            values = {row.name: row.value for row in everything[name]}
+            values = {row.name: row.value for row in tables[name]}
             print(json.dumps({key: round(values[row], 4) for key, row in figures.items()}), flush=True)
     if options.json is not None:
-        tables = {name: [_plain(row) for row in rows] for name, rows in everything.items()}
-        options.json.write_text(json.dumps(tables, indent=1, allow_nan=False))
+        write_json(options.json, tables)
     return 0
 
 
-def _plain(row: Row) -> dict[str, object]:
-    """A row for JSON, which has no number for what could not be measured."""
-    value = float(row.value) if math.isfinite(row.value) else None
-    return {"name": row.name, "value": value, "unit": row.unit, "note": row.note}
+def _own_options(module: Any, rest: Sequence[str]) -> bool:
+    """Whether a benchmark reads its own command line: it has no rows, or is given more than ours."""
+    ours = not rest or rest[0] in (*ALL, "--json", "--picture")
+    return hasattr(module, "main") and not (hasattr(module, "rows") and ours)
 
 
-def _number(value: float) -> str:
-    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+def _module(name: str) -> Any:
+    return importlib.import_module(f"bench.{ALL[name][0]}")
 
 
 if __name__ == "__main__":

@@ -10,17 +10,15 @@ rest; the drift there is held against what `heading_sigma_rad` says of it.
 """
 
 import importlib
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
 
-from bench.row import Row
+from bench.report import Row, datasets, rms, skipped
 from common.arrays import Bool, Float
 from common.calibration import ImuCalibration
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
@@ -30,7 +28,6 @@ from common.messages import ImuSample
 from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 from common.sim.motion import HandState
 
-_DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
 _NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}
 _SEEDS = range(8)
@@ -90,7 +87,7 @@ class Errors:
     @property
     def inclination_rms_deg(self) -> float:
         """Root mean square."""
-        return _rms(self.inclination_deg)
+        return rms(self.inclination_deg)
 
     @property
     def drift_deg_per_min(self) -> float:
@@ -101,7 +98,7 @@ class Errors:
 
 def recorded() -> dict[str, Recording]:
     """Those of BROAD in PHALANX_DATASETS, by name; none where they are absent."""
-    return recordings(_DATASETS / "broad")
+    return recordings(datasets() / "broad")
 
 
 def recordings(folder: Path, every: int = 1) -> dict[str, Recording]:
@@ -110,7 +107,7 @@ def recordings(folder: Path, every: int = 1) -> dict[str, Recording]:
 
 
 def stated(recording: Recording) -> tuple[Float, Float]:
-    """What this filter says of every sample: orientation (T, 4), and its tilt's standard deviation (T,) [rad]."""
+    """Return orientation (T, 4) and its tilt's standard deviation (T,) [rad] of every sample by our filter."""
     fusion = OrientationFilter(recording.rate_hz)
     found: list[Float] = []
     sigma_rad: list[float] = []
@@ -127,7 +124,7 @@ def tilt_errors(found_wxyz: Float, sigma_rad: Float, recording: Recording) -> Ti
 
 
 def played(push: Push, recording: Recording) -> Float:
-    """What a filter says of every sample (T, 4)."""
+    """Return the orientation of every sample (T, 4) by a filter."""
     return np.array([push(sample) for sample in recording.samples])
 
 
@@ -135,9 +132,7 @@ def rows() -> Iterator[Row]:
     """Measure; one row per figure."""
     found = recorded()
     if not found:
-        yield Row(
-            "recorded: skipped", 0.0, "", f"no recordings at {_DATASETS / 'broad'}: set PHALANX_DATASETS"
-        )
+        yield skipped("recorded", datasets() / "broad")
     pooled: list[TiltErrors] = []
     for name, recording in found.items():
         yield from _recorded(name.replace("undisturbed_", "").replace("_", " "), recording, pooled)
@@ -147,7 +142,6 @@ def rows() -> Iterator[Row]:
         for rest_s in (3.0, 0.0):
             yield from _simulated(part, rest_s, pooled)
     yield from _reliability("simulated", pooled)
-    yield from _cost()
 
 
 def _recorded(what: str, recording: Recording, pooled: list[TiltErrors]) -> Iterator[Row]:
@@ -163,9 +157,9 @@ def _recorded(what: str, recording: Recording, pooled: list[TiltErrors]) -> Iter
     stated_text = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
     yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {stated_text}")
     errors = Errors.of(found, recording)
-    note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
+    note = f"{rms(errors.heading_deg):.2f} deg rms against its begin"
     if theirs is not None:
-        note += f"; VQF {theirs.drift_deg_per_min:.2f} deg/min, {_rms(theirs.heading_deg):.2f} deg"
+        note += f"; VQF {theirs.drift_deg_per_min:.2f} deg/min, {rms(theirs.heading_deg):.2f} deg"
     yield Row(f"{what}: heading", errors.drift_deg_per_min, "deg/min", note)
 
 
@@ -181,9 +175,8 @@ def _reliability(what: str, pooled: list[TiltErrors]) -> Iterator[Row]:
         some = errors.where((sigma_deg >= low) & (sigma_deg < high))
         if len(some.sigma_rad):
             note = f"stated {some.stated_deg:.2f}, {100 * some.within:.1f} % within 95 %, {len(some.sigma_rad)} samples"
-            yield Row(
-                f"{what}, stated {low:g} to {high:g} deg per axis: inclination", some.rms_deg, "deg rms", note
-            )
+            name = f"{what}, stated {low:g} to {high:g} deg per axis: inclination"
+            yield Row(name, some.rms_deg, "deg rms", note)
 
 
 def forces_alone(rate_hz: float) -> Push:
@@ -261,16 +254,17 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
         )
     pooled += tilt
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
-    rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])
-    against = f"VQF {_rms(np.array(theirs)):.2f}" if theirs else "VQF is not installed"
-    stated_text = (
-        f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
-    )
+    found_deg, within = rms([one.rms_deg for one in tilt]), np.mean([one.within for one in tilt])
+    against = f"VQF {rms(theirs):.2f}" if theirs else "VQF is not installed"
+    stated_text = f"stated {rms([one.stated_deg for one in tilt]):.2f}, {100 * within:.0f} % within 95 %"
     yield Row(
-        f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {stated_text}"
+        f"{name}: inclination",
+        found_deg,
+        "deg rms",
+        f"{len(_SEEDS)} arms, a minute each; {against}; {stated_text}",
     )
-    note = f"{_rms(np.array(joint_chi2)):.1f} of what heading_sigma_rad says (rms)"
-    yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
+    note = f"{rms(joint_chi2):.1f} of what heading_sigma_rad says (rms)"
+    yield Row(f"{name}: heading", rms(drift), "deg/min", note)
 
 
 def _lies(motion: Gestures, t_s: float) -> Float:
@@ -278,24 +272,8 @@ def _lies(motion: Gestures, t_s: float) -> Float:
     return matrix_to_quaternion(motion.at(t_s).T_rig_palm[:3, :3])
 
 
-def _cost() -> Iterator[Row]:
-    """Microseconds per sample."""
-    fusion = OrientationFilter(_LEVEL.rate_hz)
-    spent: list[float] = []
-    for sample in list(SimulatedImu(Gestures(1, 0.0), _LEVEL, 1).around(2.0, 10.0)):
-        start = perf_counter_ns()
-        fusion.push(sample)
-        spent.append((perf_counter_ns() - start) * 1e-3)
-    mine = float(np.median(spent))
-    yield Row("cost of a sample", mine, "us", f"{100 * mine * 120e-6:.1f} % of a core at 120 Hz")
-
-
 def _level(force: Float) -> Float:
     """The quaternion (4,) of the shortest turn that brings a force (3,) up."""
     x, y, z = (force / np.linalg.norm(force)).tolist()
     q = np.array([1.0 + z, y, -x, 0.0])
     return q / np.linalg.norm(q)
-
-
-def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,4 +1,4 @@
-"""A scene played through the whole line in one process: rendered frames, real detector, real pipeline, exact truth.
+"""A scene through the whole line in one process: rendered frames, real detector, real pipeline, exact truth.
 
 What the cameras of a rig would deliver live, without clocks and network, so that the same scene gives the same figures.
 """
@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
+from common.hand.model import HandModel
 from common.messages import HandPose, MarkerDetections
+from common.sim.motion import HandState, base_pose, smooth_step
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from master.rig.pipeline import build_pipeline
@@ -20,7 +22,30 @@ from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
 START_NS = 1_000_000_000  # scene time 0 on the clock of the messages
+HOLD_S, MOVE_S = 0.8, 0.7  # of a motion that holds poses
 _ROWS_S = 0.02  # a marker's row is exposed within this time after row 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldPoses:
+    """A motion that holds each of some states, then moves on to the next.
+
+    Attributes:
+        model: The hand.
+        held: Place (3,) [m], rotation vector (3,) [rad] and angles (5, 4) [rad] of each state.
+    """
+
+    model: HandModel
+    held: Sequence[tuple[Float, Float, Float]]
+    period_s: float = 1e6
+
+    def at(self, t_s: float) -> HandState:
+        """Return the hand at time `t_s` [s]; before 0 the pose of 0."""
+        step, phase = divmod(max(t_s, 0.0), HOLD_S + MOVE_S)
+        here, there = (self.held[(int(step) + k) % len(self.held)] for k in range(2))
+        share = smooth_step((phase - HOLD_S) / MOVE_S)
+        at, rotation, angles = ((1.0 - share) * a + share * b for a, b in zip(here, there, strict=True))
+        return HandState(base_pose(self.model, at, np.zeros(3), rotation), angles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,19 +65,18 @@ class Watched:
 
 
 def times_of(scene: Scene, camera: str, seconds: float, rate_hz: float, start_s: float = 0.0) -> Float:
-    """Scene times (T,) [s] of the frames of a camera: it begins as late after the others as the scene says."""
-    return (
-        start_s + scene.timing(camera).start_offset_ns * 1e-9 + np.arange(round(seconds * rate_hz)) / rate_hz
-    )
+    """Return scene times (T,) [s] of the frames of a camera, which begins as late as the scene has it."""
+    late_s = scene.timing(camera).start_offset_ns * 1e-9
+    return start_s + late_s + np.arange(round(seconds * rate_hz)) / rate_hz
 
 
 def shown_by(scene: Scene, camera: str, times_s: Float) -> Float:
-    """Exact visibility alone, (T, M) as in `Watched`; nothing is drawn."""
+    """Return exact visibility alone, (T, M) as in `Watched`; nothing is drawn."""
     renderer = Renderer(scene, camera)
     return np.array([_shown(scene, camera, renderer, float(t)) for t in times_s])
 
 
-def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
+def found_by(scene: Scene, camera: str, times_s: Float) -> list[MarkerDetections]:
     """Render and detect the frames of one camera."""
     renderer = Renderer(scene, camera)
     detector = detector_for(scene.cameras[camera], scene.rig.markers, Inline(), free=scene.rig.free_markers)
@@ -60,17 +84,22 @@ def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
     for seq, t in enumerate(times_s.tolist()):
         t_ns = START_NS + round(t * 1e9)
         messages.append(message_of(camera, seq, t_ns, detector.push(renderer.render(t), t_ns)))
-    return Watched(tuple(messages), times_s, shown_by(scene, camera, times_s))
+    return messages
+
+
+def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
+    """Render and detect the frames of one camera, with exact visibility beside them."""
+    return Watched(tuple(found_by(scene, camera, times_s)), times_s, shown_by(scene, camera, times_s))
 
 
 def message_of(camera: str, seq: int, t_ns: int, found: Detections) -> MarkerDetections:
-    """What a slave would send of frame `seq`, taken at `t_ns` [ns] and handed over at once."""
+    """Return the message of frame `seq`, taken at `t_ns` [ns] and handed over at once."""
     seen = (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv)
     return MarkerDetections(camera, 1, seq, t_ns, t_ns, *seen)
 
 
 def solve(setup: RigSetup, watched: Sequence[Watched]) -> tuple[list[HandPose], dict[str, int]]:
-    """The poses of everything that was watched, in the order of capture, and the pipeline's counts."""
+    """Return the poses of all cameras' messages in the order of capture, and the pipeline's counts."""
     pipeline = build_pipeline(setup, StageTimes())
     messages = sorted((m for one in watched for m in one.messages), key=lambda message: message.t_ns)
     poses = [solved.pose for message in messages for solved in pipeline.push(message)]
@@ -78,7 +107,7 @@ def solve(setup: RigSetup, watched: Sequence[Watched]) -> tuple[list[HandPose], 
 
 
 def times_of_poses(poses: Sequence[HandPose]) -> Float:
-    """Scene times (T,) [s] of poses."""
+    """Return scene times (T,) [s] of poses."""
     stamps: Int = np.array([pose.t_ns for pose in poses], np.int64)
     return np.asarray((stamps - START_NS) * 1e-9, np.float64)
 

@@ -1,8 +1,8 @@
 """What a pose costs the master, stage by stage: processor time of one thread, no socket; or in turns with other code.
 
     python -m bench pose_cost                    each rig, stage by stage; its figures as a line of JSON at the end
-    python -m bench.pose_cost --functions desk   where in the code, by the profiler (its own cost is in it)
-    python -m bench.pose_cost --against DIR      this code and that of another checkout, some poses each in turns
+    python -m bench pose_cost --functions desk   where in the code, by the profiler (its own cost is in it)
+    python -m bench pose_cost --against DIR      this code and that of another checkout, some poses each in turns
 
 A pose is all that the master does from sealed datagrams to the bytes that it publishes, gestures among it. What senders
 do for it is not counted.
@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from bench.fusion_shown import shown
-from bench.row import Row
-from bench.scale_rig import ROOM, detections_of, in_order, room
+from bench.both.shown import shown
+from bench.report import ROOT, Row
+from bench.rigs.rooms import ROOM, detections, in_order, room
 from common.messages import ImuSample, encode
 from master.rig.files import load_setups
 from master.rig.setup import RigSetup
@@ -57,7 +57,6 @@ FIGURES = {
     "compile_cold_s": COLD,
     "start_warm_s": WARM,
 }
-ROOT = Path(__file__).resolve().parents[1]
 _POSES, _TURN = 320, 10  # the first turn warms up
 _SCENE, _SEED = "grasp", 7
 _KEY, _MASTER, _BROADCAST = bytes(range(32)), ("10.0.0.1", 47801), ("10.0.0.255", 47800)
@@ -166,7 +165,7 @@ def played(rig: str, stages: StageTimes) -> tuple[Played, Sequence[Any]]:
     cameras, rate_hz = (16, 90.0) if rig == "room" else (2, 60.0)
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
-    return Played(setups, stages), in_order(detections_of(setups[0], rate_hz))[: cameras * _POSES]
+    return Played(setups, stages), in_order(detections(setups[0], rate_hz))[: cameras * _POSES]
 
 
 def _since(message: Any, first_ns: int) -> Any:
@@ -255,17 +254,14 @@ def _spread(values: Any) -> str:
     return f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
-def main() -> None:
-    """Run by the command line."""
-    parser = argparse.ArgumentParser(
-        "python -m bench.pose_cost",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Compare with another checkout, or print functions."""
+    keep = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python -m bench pose_cost", description=__doc__, formatter_class=keep)
     parser.add_argument("--functions", choices=RIGS)
     parser.add_argument("--against", type=Path, metavar="DIR")
     parser.add_argument("--turns", choices=RIGS, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.against is not None:
         against(options.against)
     elif options.turns is not None:
@@ -281,9 +277,6 @@ def main() -> None:
         for message in messages:
             profile.runcall(one.take, *one.sent(message))
         pstats.Stats(profile).sort_stats("tottime").print_stats(50)
-    else:
-        for row in rows():
-            print(f"{row.name:50s} {row.value:10.3f} {row.unit:4s} {row.note}")
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
 """Reliability diagrams: what is stated against what is found, of markers, joints and IMU.
 
-.venv/bin/python -m bench.reliability --picture docs/images/reliability.png
+    python -m bench reliability --picture docs/images/reliability.png
 
 Markers: of all that is found with about a quality, the share that is a marker. Joints and IMU: of all regions of a
 probability, the share that the truth lies in; below the diagonal is too sure. PHALANX_DATASETS, and where they are
-yours PHALANX_PHOTOS and PHALANX_MOTION, are folders as in `bench.real_markers` and `bench.real_hands`; what is left out
-for want of them is said.
+yours PHALANX_PHOTOS and PHALANX_MOTION, are folders as in `bench.markers.photos` and `bench.hands.grasping`;
+parts left out for want of them are named.
 """
 
 import argparse
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -18,18 +17,17 @@ from typing import Final
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from bench import imu, joint_covariance, real_hands, real_markers
-from bench.marker_photos import DATASETS
+from bench import imu
+from bench.hands import certainty, grasping
+from bench.markers import real
+from bench.report import COLOURS, datasets, figure
 from common.arrays import Float
 from common.calibration import HandProfile, load
 
 LEVELS: Final = np.linspace(0.0, 1.0, 101)
-_SEEDS: Final = joint_covariance.SEEDS[:2]
-_COLOURS: Final = ("#14507a", "#b0473a", "#e0a030", "#3f8f5b", "#7a5ca8")
+_SEEDS: Final = certainty.SEEDS[:2]
 
 
 def found_in(chi_2: Float, degrees: int) -> Float:
@@ -40,22 +38,22 @@ def found_in(chi_2: Float, degrees: int) -> Float:
 
 def joints() -> dict[str, Float]:
     """Chi squares of joints, by what was looked at."""
-    profile = load(joint_covariance.HAND, HandProfile)
-    parts: dict[str, list[joint_covariance.Coverage]] = {}
+    profile = load(certainty.HAND, HandProfile)
+    parts: dict[str, list[certainty.Coverage]] = {}
     for seed in _SEEDS:
-        for _, model, motion in joint_covariance.motions(profile, seed):
-            run = joint_covariance.compared(model, motion, joint_covariance.NOISE_M["1 mm"], seed)
-            for kind, some in joint_covariance.kinds(run):
+        for _, model, motion in certainty.motions(profile, seed):
+            run = certainty.compared(model, motion, certainty.NOISE_M["1 mm"], seed)
+            for kind, some in certainty.kinds(run):
                 parts.setdefault(kind, []).append(some)
     out = {
-        f"simulated, {kind}": joint_covariance.joined(parts[kind]).chi_2
+        f"simulated, {kind}": certainty.joined(parts[kind]).chi_2
         for kind in ("visible", "hidden up to 300 ms")
     }
-    if files := real_hands.motion_files():
-        grasps = [real_hands.grasped(path, 1, half=True).chi2[:, 1:, 1] for path in files]
+    if files := grasping.motion_files():
+        grasps = [grasping.grasped(path, 1, half=True).chi2[:, 1:, 1] for path in files]
         out["real grasping, PIP joints"] = np.concatenate([chi_2.ravel() for chi_2 in grasps])
-    if (glove := real_hands.glove()) is not None:
-        _, hidden, seen = real_hands.hidden_tip(*glove, 0, 0.3)
+    if (glove := grasping.glove()) is not None:
+        _, hidden, seen = grasping.hidden_tip(*glove, 0, 0.3)
         out["real glove, thumb tip hidden"], out["real glove, tips that are seen"] = hidden, seen
     return out
 
@@ -86,22 +84,21 @@ def draw(
     Raises:
         OSError: The file cannot be written.
     """
-    figure = Figure(figsize=(13.0, 4.6), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, 3)
+    made = figure(13.0, 4.6)
+    panels = made.subplots(1, 3)
     stated, right, share = np.array(markers).T
     panels[0].bar(stated, share, 0.06, color="#c9d8e3", label="share of all that is found")
-    panels[0].plot(stated, right, "o-", color=_COLOURS[0], linewidth=1.4, label="is a marker")
+    panels[0].plot(stated, right, "o-", color=COLOURS[0], linewidth=1.4, label="is a marker")
     _finish(panels[0], "Markers", "stated quality", "share")
     for axes, title, chi_2s, degrees in (
         (panels[1], "Joints", hand, 3),
         (panels[2], "IMU, inclination", level, 2),
     ):
-        for (name, chi_2), colour in zip(chi_2s.items(), _COLOURS, strict=False):
+        for (name, chi_2), colour in zip(chi_2s.items(), COLOURS, strict=False):
             axes.plot(LEVELS, found_in(chi_2, degrees), color=colour, linewidth=1.4, label=name)
         _finish(axes, title, "stated probability of the region", "share of truths in it")
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file)
+    made.savefig(file)
 
 
 def _finish(axes: Axes, title: str, stated: str, found: str) -> None:
@@ -115,24 +112,19 @@ def _finish(axes: Axes, title: str, stated: str, found: str) -> None:
     axes.legend(fontsize=8, frameon=False, loc="best")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> None:
     """Measure and draw."""
     parser = argparse.ArgumentParser(
-        prog="python -m bench.reliability", description=(__doc__ or "").partition("\n")[0]
+        prog="python -m bench reliability", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("--picture", type=Path, required=True, metavar="FILE", help="PNG to write")
     options = parser.parse_args(arguments)
-    if not (DATASETS / "real_ball").is_dir():
-        parser.error(f"no data sets at {DATASETS}: set PHALANX_DATASETS")
+    if not (datasets() / "real_ball").is_dir():
+        parser.error(f"no data sets at {datasets()}: set PHALANX_DATASETS")
     for folder, what in (("PHALANX_PHOTOS", "your photographs"), ("PHALANX_MOTION", "grasping")):
         if folder not in os.environ:
             print(f"left out: {what}, for {folder} is not set")
     cv2.setNumThreads(1)
-    markers = real_markers.table_of(real_markers.looked_at(np.random.default_rng(real_markers.SEED)))
+    markers = real.table_of(real.looked_at(np.random.default_rng(real.SEED)))
     draw(options.picture, markers, joints(), tilts())
     print(f"{options.picture}: stated against found, of markers, joints and IMU")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

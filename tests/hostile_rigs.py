@@ -5,8 +5,8 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from bench.hostile_rig import STOLEN, HostileRig, Phase
-from bench.hostile_sender import HostileSender
+from bench.rigs.hostile import STOLEN, HostileRig, Phase
+from bench.rigs.hostile_sender import HostileSender
 from master.rig.files import load_setup
 from tests.network_helpers import PATIENCE_S, until
 
@@ -41,14 +41,14 @@ def losing(rig: HostileRig) -> float:
     end = rig.begin()
     time.sleep(1.0)
     phase = end()
-    return 1.0 if rig.ask(5.0) is None else phase.lost
+    return 1.0 if rig.report(5.0) is None else phase.lost
 
 
 @contextmanager
 def stolen(rig: HostileRig, name: str) -> Generator[HostileSender]:
     """A stolen device with a session whose clock is known."""
     setup = load_setup(rig.tree, STOLEN[name])
-    sender = HostileSender(name, bytes.fromhex(rig.key), rig.port, setup, rig.endpoint)
+    sender = HostileSender(name, bytes.fromhex(rig.key), rig.beacon_port, setup, rig.endpoint)
     try:
         assert sender.uplink.wait_for_start(PATIENCE_S)
         yield sender
@@ -77,7 +77,7 @@ def unharmed(rig: HostileRig) -> Generator[dict[str, int]]:
 
 def counts(rig: HostileRig) -> Mapping[str, int]:
     """What the master counted."""
-    report = rig.ask()
+    report = rig.report()
     assert report is not None, "it answers no more"
     return report.counts
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.local_rig import free_port
+from bench.rigs.local import free_port
 from common.messages import FINGER_COUNT, Health, MarkerDetections, WristDetections
 from master.run.ingest import Ingest
 

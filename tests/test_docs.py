@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bench.__main__ import SECTIONS
+from bench.__main__ import ALL
 from common.calibration import HandProfile, RigCalibration, parse
 from common.hand.model import FINGERS, JOINTS, HandModel
 from common.hand.profiles import generated_profile
@@ -87,6 +87,22 @@ def test_the_examples_of_a_hand_profile_load() -> None:
     assert models[2].spread_at_full_flexion.tolist() == [0.625] * 5
 
 
+def unknown_benchmarks(text: str) -> list[str]:
+    """Names behind `python -m bench` that it does not have; a module of its own, as by `-m bench.NAME`, is none."""
+    named = re.findall(r"python -m bench((?:\.| +)[a-z][\w.]*)", text)
+    return [name for one in named if (name := one.strip()) not in ALL]
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "Makefile"], ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_benchmark_named_on_a_page_exists(page: Path) -> None:
+    assert unknown_benchmarks(page.read_text()) == []
+
+
+def test_the_check_of_benchmarks_sees_what_does_not_exist() -> None:
+    text = "`python -m bench depth none`, `python -m bench.depth`, `python -m bench  none`, `python -m bench --help`"
+    assert unknown_benchmarks(text) == [".depth", "none"]
+
+
 def texts() -> Iterator[Path]:
     """Every text file of the project."""
     yield from (path for path in ROOT.iterdir() if path.suffix in TEXTS or path.name == "Makefile")
@@ -152,7 +168,7 @@ def unknown_in(command: str) -> list[str]:
     if program == "python":
         module, *sections = rest[1:]
         if module == "bench":
-            return [name for name in sections if name not in SECTIONS]
+            return [name for name in sections if name not in ALL]
         return [] if (ROOT / f"{module.replace('.', '/')}.py").exists() else [module]
     verbs = [word for word in rest if word.islower() and not word.startswith("-")][:1]
     known = help_of(program, *verbs)

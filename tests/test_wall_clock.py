@@ -16,8 +16,7 @@ WALL |= {"datetime": {"now", "utcnow", "today"}, "date": {"today"}}
 # Beside the line: what people set up, look at and keep, and what is sent on in the time of other programs.
 NOT_LIVE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/outputs/network/",
           "master/recording/export/",
-          "master/study/", "master/commands/keys.py", "master/commands/keys_folder.py",
-          "master/outputs/web/listening.py",
+          "master/commands/keys.py", "master/commands/keys_folder.py", "master/outputs/web/listening.py",
           "common/bus/certificates.py")  # fmt: skip
 REASONS = {
     "common/bus/refusal.py": "what the validity of certificates is judged by, in words about a refused connection",

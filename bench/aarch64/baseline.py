@@ -33,7 +33,7 @@ def read(file: Path = FILE) -> Baseline | None:
     try:
         return msgspec.json.decode(file.read_bytes(), type=Baseline)
     except msgspec.MsgspecError as error:
-        raise BaselineError(f"{file}: {error}; write it afresh with: count --record") from error
+        raise BaselineError(f"{file}: {error}; write it afresh with --record") from error
 
 
 def write(baseline: Baseline, file: Path = FILE) -> None:

@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench import seed_markers
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, read, read_strobed, without
 from bench.aarch64.parts import counted_parts
+from bench.markers import published
 from common.messages import Message, WristDetections, encode
 from master.run.link import MasterLink
 from slave.counters import DetectionCounters
@@ -159,7 +159,7 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         each(lambda k: found.append(detector.fresh().push(frames.image(k), 0)))
     elif case == "seed":
         ranges = [(frames.camera.markers or {})[name] for name in frames.names]
-        each(lambda k: digest.add(seed_markers.detect(frames.image(k), ranges)))
+        each(lambda k: digest.add(published.detect(frames.image(k), ranges)))
     elif case == "step":
         wire = _Wire(frames.camera.name)
         run(

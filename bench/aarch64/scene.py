@@ -7,15 +7,15 @@ import msgspec
 import numpy as np
 
 from bench.aarch64.frames import SIX, TWELVE, WRIST, MarkedFrames, StrobedFrames, write, write_strobed
+from bench.report import rig_files
 from common.arrays import Image
-from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
+from common.calibration import HsvRange
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import STROBE
 
-CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 OPEN_S = 20.0  # an open hand: all six markers in view
 FRAME_S = 1.0 / 60.0
 SEED = 7
@@ -26,9 +26,7 @@ SECOND_VALUE = 236  # HSV value from which a colour is the second hand's
 
 def rendered() -> dict[str, MarkedFrames]:
     """The sets SIX and TWELVE, from the standard scene and the rig `desk`."""
-    rig = load(CALIBRATION / "rigs/desk.json", RigCalibration)
-    cameras = {name: load(CALIBRATION / f"cameras/{name}.json", CameraCalibration) for name in rig.cameras}
-    hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
+    rig, cameras, hand = rig_files("desk")
     name = rig.cameras[0]
     renderer = Renderer(Scene.standard(rig, cameras, hand), name)
     images = [renderer.render(OPEN_S + FRAME_S * k) for k in range(COUNT)]
@@ -38,11 +36,10 @@ def rendered() -> dict[str, MarkedFrames]:
 
 def strobed() -> StrobedFrames:
     """Triples of a curl before the wrist device of the rig `wrist`."""
-    rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
+    rig, cameras, hand = rig_files("wrist")
     name = rig.cameras[0]
-    camera = load(CALIBRATION / f"cameras/{name}.json", CameraCalibration)
-    hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
-    renderer = WristRenderer(WristScene.by_name(CURL, rig, {name: camera}, hand, SEED), name)
+    camera = cameras[name]
+    renderer = WristRenderer(WristScene.by_name(CURL, rig, cameras, hand, SEED), name)
     images = [renderer.render(CURL_S + k / camera.frame_rate_hz, STROBE[k % 3]) for k in range(3 * COUNT)]
     return StrobedFrames(rig, camera, hand, images)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.local_rig import free_port
+from bench.rigs.local import free_port
 from common.bus.bus import Subscription
 from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock

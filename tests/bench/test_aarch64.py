@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from bench.aarch64 import baseline, scene, sysroot
-from bench.aarch64.__main__ import CASES, main
 from bench.aarch64.baseline import Baseline, BaselineError
+from bench.aarch64.command import CASES, main
 from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, forth_and_back, read, read_strobed, without
 from bench.aarch64.guest import Digest, Marks, run_case
@@ -225,16 +225,14 @@ def test_a_missing_tool_is_named_with_its_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["count", "six"]) == 2
+    assert main(["six"]) == 2
     output = capsys.readouterr().err
     assert "apt install" in output
     for package in ("mmdebstrap", "gcc", "tar"):
         assert package in output
 
 
-@pytest.mark.parametrize(
-    "arguments", [["count", "seven"], ["count", "six", "--record"], ["count", "--record", "--cpu", "max"]]
-)
+@pytest.mark.parametrize("arguments", [["seven"], ["six", "--record"], ["--record", "--cpu", "max"]])
 def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as refused:
         main(arguments)

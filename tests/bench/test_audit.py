@@ -7,8 +7,19 @@ from typing import Any
 import pytest
 from cyclonedx.model.bom import Bom
 
-from bench.audit import KNOWN, NONE_KNOWN, NOT_ASKED, Package, Vulnerability, bill_of_materials, judge
-from bench.pinned import closure, locked, scopes, wanted
+from bench.audit import (
+    KNOWN,
+    NONE_KNOWN,
+    NOT_ASKED,
+    Package,
+    Vulnerability,
+    bill_of_materials,
+    closure,
+    judge,
+    locked,
+    scopes,
+    wanted,
+)
 from common.errors import PhalanxError
 
 TWO = {"good": "1.0", "bad": "2.0"}

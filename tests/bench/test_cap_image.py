@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.cap_image import Cap, Occluder, Patch, draw, segment
+from bench.markers.cap_image import Cap, Occluder, Patch, draw, segment
 
 WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.depth import AWAY_M, SETTLING, static
+from bench.cameras.depth import AWAY_M, SETTLING, static
 from master.rig.files import load_setup
 
 

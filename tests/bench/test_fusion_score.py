@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bench.fusion_scene import Both, Shown, Sight
-from bench.fusion_score import Figures, Sighted, ratios
-from bench.fusion_solved import RejectedPeer, Solved
+from bench.both.scene import Both, Shown, Sight
+from bench.both.score import Figures, Sighted, ratios
+from bench.both.solved import RejectedPeer, Solved
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bench.gesture_recorded import agrees
-from bench.recognised_poses import RecognisedPoses
+from bench.gestures.poses import agrees
+from bench.gestures.recognised import RecognisedPoses
 from common.geometry.transforms import axis_rotation
 from common.sim.motion import POSES
 from tests.hand_helpers import LEFT, RIGHT
@@ -11,14 +11,14 @@ from tests.master.gestures.shown_hands import posture
 
 
 def test_frames_count_from_the_third_of_a_held_pose_on() -> None:
-    recognised = RecognisedPoses()
+    found = RecognisedPoses()
     truth = [None, "pinch", "pinch", "pinch", "pinch", None, "pointing", "pointing", "pointing"]
-    recognised.add(truth, [None, None, None, "pinch", None, "open_palm", None, None, "pinch"])
-    assert dict(recognised.frames) == {("pinch", "pinch"): 1, ("pinch", "none"): 1, ("pointing", "pinch"): 1}
-    assert (recognised.episodes, recognised.in_time) == (2, 1)
-    assert recognised.passing == 1  # the open palm between the two
-    assert recognised.right == 100.0 / 3.0
-    assert recognised.wrong == 100.0 / 3.0
+    found.add(truth, [None, None, None, "pinch", None, "open_palm", None, None, "pinch"])
+    assert dict(found.frames) == {("pinch", "pinch"): 1, ("pinch", "none"): 1, ("pointing", "pinch"): 1}
+    assert (found.episodes, found.in_time) == (2, 1)
+    assert found.passing == 1  # the open palm between the two
+    assert found.right == 100.0 / 3.0
+    assert found.wrong == 100.0 / 3.0
 
 
 def test_the_rule_for_recorded_joints_agrees_with_its_own_pose() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.gesture_truth import GestureTruth
-from bench.gestures import Score, recognised_in, seen_poses
+from bench.gestures.actions import Score, recognised, seen_poses
+from bench.gestures.truth import GestureTruth
 from bench.played import START_NS
 from common.calibration.gesture_settings import default_gestures
 from common.messages import Gesture
@@ -33,22 +33,24 @@ def truth(setup: RigSetup) -> GestureTruth:
     return GestureTruth.of(scene.motion, scene.model, SETTINGS, 14.0)
 
 
-def test_a_dial_is_reported_in_time_and_as_far_as_it_was_turned(setup: RigSetup, truth: GestureTruth) -> None:
+def test_a_dial_is_recognised_in_time_and_as_far_as_it_was_turned(
+    setup: RigSetup, truth: GestureTruth
+) -> None:
     scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, SEED)
     poses = seen_poses(setup, "gestures", SEED, SECONDS)
-    recognised = recognised_in(poses, scene.model, SETTINGS)
-    assert {one.kind for one in recognised} == {"dial"}
+    found = recognised(poses, scene.model, SETTINGS)
+    assert {one.kind for one in found} == {"dial"}
     event = next(one for one in truth.events if one.kind == "dial")
-    begins = [1e-9 * (one.t_ns - START_NS) for one in recognised if one.phase == "begin"]
+    begins = [1e-9 * (one.t_ns - START_NS) for one in found if one.phase == "begin"]
     assert len(begins) == 1
     assert -3 / 60 <= begins[0] - event.begin_s <= 3 / 60
     score = Score()
-    score._values(recognised, truth, SECONDS)
+    score._values(found, truth, SECONDS)
     assert np.degrees(abs(truth.motion.dial_rad(SECONDS))) > 20.0
     assert np.percentile(np.abs(score.dial_deg), 95) < 3.0
 
 
-def test_everything_that_is_said_is_in_the_truth_in_that_order(truth: GestureTruth) -> None:
+def test_every_gesture_made_is_in_the_truth_in_that_order(truth: GestureTruth) -> None:
     annotations = [one for one in truth.motion.annotations if one.stop_s < 13.0]
     assert [(one.kind, one.name) for one in truth.events] == [(one.kind, one.name) for one in annotations]
     for event, one in zip(truth.events, annotations, strict=True):
@@ -58,7 +60,7 @@ def test_everything_that_is_said_is_in_the_truth_in_that_order(truth: GestureTru
     assert gap == pytest.approx(-0.0005, abs=2e-3)  # skin on skin
 
 
-def test_what_nobody_made_is_false_and_what_was_not_reported_is_missed(truth: GestureTruth) -> None:
+def test_a_gesture_not_made_is_false_and_one_not_recognised_is_missed(truth: GestureTruth) -> None:
     event = next(one for one in truth.events if one.kind == "pinch")
     nan = np.full(3, np.nan)
     right = Gesture(
@@ -82,12 +84,12 @@ def test_what_nobody_made_is_false_and_what_was_not_reported_is_missed(truth: Ge
     assert score.late["pinch begin"] == pytest.approx([1.0])
     unheard = Score()
     unheard.add([], truth)
-    assert unheard.missed == unheard.annotations
-    assert sum(unheard.annotations.values()) == len(truth.events) > 3
+    assert unheard.missed == unheard.made
+    assert sum(unheard.made.values()) == len(truth.events) > 3
 
 
 def _later(one: Gesture, seconds: float) -> Gesture:
-    """The same of another finger a moment later, said by nobody."""
+    """The same of another finger a moment later, that nobody made."""
     shift = round(seconds * 1e9)
     return Gesture(
         hand=one.hand,

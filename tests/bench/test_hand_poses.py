@@ -5,11 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import hand_poses
-from bench.hand_draws import BACK, FACING_ROTATION, MARKERS, Draw, Noise, bench_model, draw, posed, seen
-from bench.hand_poses import CLOSED, PAPER, SCENARIOS, WHOLE, batch, scenario_rows
-from bench.hand_score import score
-from bench.peers_paper import finger_solvers, fixed_palm, tips_in_palm
+from bench.hands import poses
+from bench.hands.draws import (
+    BACK,
+    FACING_ROTATION,
+    MARKERS,
+    Draw,
+    Noise,
+    bench_model,
+    draw,
+    posed,
+    score,
+    seen,
+)
+from bench.hands.peers import finger_solvers, fixed_palm, tips_in_palm
+from bench.hands.poses import CLOSED, PAPER, SCENARIOS, WHOLE, batch, scenario_rows
 from common.arrays import Float
 
 MODEL = bench_model()
@@ -149,5 +159,5 @@ def test_rows_report_violations_and_hands_that_were_not_found() -> None:
 
 def test_the_number_of_poses_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        hand_poses.main(["3"])
+        poses.main(["3"])
     assert "at least 10" in capsys.readouterr().err

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.marker_colours import camera_file, marker_rgb
-from bench.marker_frames import STEP_NS, expose, frames_of, generator, sequences
-from bench.marker_kinds import KINDS
-from bench.marker_scene import CLEAR, make_scene
-from bench.seed_markers import detect
+from bench.markers.frames import STEP_NS, expose, frames_of, generator, sequences
+from bench.markers.kinds import KINDS, camera_file, paints
+from bench.markers.published import detect
+from bench.markers.scene import CLEAR, make_scene
 from common.sim.light import bgr_bytes
 from slave.markers.classify import in_range
 
@@ -81,7 +80,7 @@ def test_noise_at_mid_grey_is_one_and_a_half_to_two_levels_and_doubles() -> None
 @pytest.mark.parametrize("count", [6, 12, 24])
 def test_every_paint_lies_in_its_own_range_only(count: int) -> None:
     ranges = camera_file(count, (640, 480)).markers or {}
-    for name, colour in marker_rgb(count).items():
+    for name, colour in paints(count).items():
         pixel = np.array([[bgr_bytes(np.array(colour))]], np.uint8)
         hsv = np.asarray(cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV), np.uint8)
         assert [other for other, r in ranges.items() if in_range(hsv, r).all()] == [name]
@@ -92,7 +91,7 @@ def test_every_paint_lies_in_its_own_range_only(count: int) -> None:
 
 def test_an_unknown_number_of_paints_is_refused() -> None:
     with pytest.raises(ValueError, match="7 paints"):
-        marker_rgb(7)
+        paints(7)
 
 
 def test_things_on_the_table_have_marker_colours_and_keep_their_distance() -> None:

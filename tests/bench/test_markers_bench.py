@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.marker_kinds import KINDS
-from bench.markers import Timed, interleaved
+from bench.markers.kinds import KINDS
+from bench.markers.speed import Timed, interleaved
 from slave.markers.detector import Detections
 
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import oracle_scenes, oracle_wrist
 from bench.__main__ import main
-from bench.oracle_compare import ALL, compare, judged, table
-from bench.oracle_freeze import Piece, calibration_files, freeze
-from bench.oracle_recorded import Replayed
-from bench.oracle_scenes import CALIBRATION, DESK, shown_piece
-from bench.oracle_score import Solved, figures, samples_of
-from bench.oracle_solve import run
-from bench.oracle_truth import Truth, sets_of, truths_of
-from bench.real_motion import recordings
+from bench.hands.motion import recordings
+from bench.oracle import scenes, wrist
+from bench.oracle.compare import ALL, compare, judged, table
+from bench.oracle.freeze import Piece, calibration_files, freeze
+from bench.oracle.recorded import Replayed
+from bench.oracle.scenes import CALIBRATION, DESK, shown_piece
+from bench.oracle.score import Solved, figures, samples_of
+from bench.oracle.solve import run
+from bench.oracle.truth import Truth, sets_of, truths_of
 from common.arrays import Float
 from common.errors import RecordingError
 from common.recording.npz import read_npz, write_npz
@@ -208,8 +208,8 @@ def test_without_the_data_the_simulated_sets_are_frozen(
         yield piece()
 
     for name in ("scenes", "held", "in_room"):
-        monkeypatch.setattr(oracle_scenes, name, short)
-    monkeypatch.setattr(oracle_wrist, "fused", short)
+        monkeypatch.setattr(scenes, name, short)
+    monkeypatch.setattr(wrist, "fused", short)
     monkeypatch.setenv("PHALANX_DATASETS", str(tmp_path / "nowhere"))
     assert main(["oracle", "freeze", "--out", str(tmp_path)]) == 0
     assert "only the simulated sets" in capsys.readouterr().out

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from bench import reliability
 from bench.reliability import LEVELS, draw, found_in, main
 
 
@@ -29,7 +28,7 @@ def test_three_diagrams_are_drawn(tmp_path: Path) -> None:
 def test_absent_data_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(reliability, "DATASETS", tmp_path)
+    monkeypatch.setenv("PHALANX_DATASETS", str(tmp_path))
     with pytest.raises(SystemExit):
         main(["--picture", str(tmp_path / "r.png")])
     assert "set PHALANX_DATASETS" in capsys.readouterr().err

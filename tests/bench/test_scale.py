@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.scale import cost_per_camera, summary
-from bench.scale_page import into_page
-from bench.scale_rig import ROOM, detections_of, dome, room
-from bench.scale_run import ScaleRun
+from bench.rigs.rooms import ROOM, detections, dome, room
+from bench.rigs.scale import ScaleRun, cost_per_camera, summary
+from bench.rigs.scale_page import into_page
 from master.rig.files import load_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
@@ -31,10 +30,10 @@ def test_the_cameras_of_a_room_all_see_the_hand(tmp_path: Path, cameras: int) ->
     for pose in dome(cameras):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
-    frames = detections_of(setup, 10.0)
+    frames = detections(setup, 10.0)
     assert list(frames) == list(setup.camera_names)
-    for name, detections in frames.items():
-        uv = np.array([one.uv for one in detections])
+    for name, sent in frames.items():
+        uv = np.array([one.uv for one in sent])
         assert np.isfinite(uv[..., 0]).mean() == pytest.approx(0.95, abs=0.03)
         inside = (uv >= 0.0) & (uv < [setup.cameras[name].width_px, setup.cameras[name].height_px])
         assert inside[np.isfinite(uv)].mean() > 0.9

@@ -8,10 +8,19 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from bench.processes import Footprint, footprint
-from bench.soak_monitor import Minute, SoakHistory, judged
-from bench.soak_steps import Mapping, grown, mapped, steps_of
-from bench.soak_verdict import judge, latency_slope, memory_slope, slope
+from bench.rigs.local import Footprint, footprint, losses
+from bench.rigs.soak_verdict import (
+    Mapping,
+    Minute,
+    SoakHistory,
+    grown,
+    judge,
+    latency_slope,
+    mapped,
+    memory_slope,
+    slope,
+    steps_of,
+)
 from common.messages import Health
 
 _EVERY_S, _HOUR_S = 5.0, 3600.0
@@ -88,7 +97,7 @@ def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
                                      "refused.stale": 4, "would_block": 1}, {})  # fmt: skip
     left = Health("left", 1, 1, {"send_failed": 2, "sent": 100}, {})
     expected = {"lost": 3, "skipped": 5, "dropped": 3, "refused": 4, "blocked": 3}
-    assert judged({"master": master, "left": left}) == expected
+    assert losses({"master": master, "left": left}) == expected
 
 
 def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> SoakHistory:

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.sync_hands import derivatives
-from bench.sync_rig import CALIBRATION, MOTIONS, Shooting, centroids, outcome
+from bench.cameras.unsynchronised import CALIBRATION, MOTIONS, Shooting, centroids, outcome
 from master.rig.files import load_setup
 
 RATES_HZ = (30.0, 60.0, 90.0)
@@ -82,11 +81,3 @@ def test_each_centroid_is_where_its_own_row_saw_it() -> None:
     # 20 m/s^2 over an exposure of 10 ms: the mean lags behind the middle by a T^2 / 24 at most.
     blurred = centroids(camera, motion, starts, exposure_s=0.01)
     assert 0.01 < np.abs(blurred - uv).max() < 1.3 * 994.0 * 20.0 * 0.01**2 / 24.0
-
-
-def test_derivatives_of_a_sine_are_those_of_calculus() -> None:
-    t = np.arange(0.0, 4.0, 0.009)
-    turn, amplitude = 2.0 * np.pi, 0.1
-    places = amplitude * np.sin(turn * t)[:, None, None] * np.ones((1, 2, 3))
-    expected = amplitude * turn ** np.arange(1, 4) / np.sqrt(2.0)
-    np.testing.assert_allclose(derivatives(t, places), expected, rtol=0.05)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.real_motion import floor_m, recordings
+from bench.hands.motion import floor_m, recordings
 from common.arrays import Float
 from common.calibration import HandProfile
 from common.errors import CalibrationError

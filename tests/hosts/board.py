@@ -15,7 +15,7 @@ from typing import cast
 
 import pytest
 
-from bench.processes import cpu_s
+from bench.rigs.local import cpu_s
 from tests.hosts.board_image import NETWORK, Image, board_image, pc_image, run
 from tests.hosts.fleet import Fleet
 from tests.hosts.measured import Measured

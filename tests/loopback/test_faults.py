@@ -1,8 +1,8 @@
 """Faults on real processes, each once: steady and right poses again within two seconds of its end, counted, none false.
 
-`python -m bench.faults` brings all of them about, several times, and prints the table of docs/faults.md: the goal is
+`python -m bench faults` brings all of them about, several times, and prints the table of docs/faults.md: the goal is
 judged there. Here are those that no test of the link alone can show, on a machine that may have other things to do, by
-the same measure (`bench.faults_measured`).
+the same measure.
 """
 
 import time
@@ -10,15 +10,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from bench.faults_flood import Capture, flood, hostile, targets
-from bench.faults_links import Fault, of_links
-from bench.faults_measured import LEAST_HZ, Run, false, measured
-from bench.faults_ports import assault
-from bench.faults_poses import Pace
-from bench.faults_rig import UP_S, FaultRig
-from bench.local_rig import until
+from bench.rigs.faults import LEAST_HZ, Fault, FaultRig, Run, cut, measured, of_links
+from bench.rigs.local import UP_S, until
+from bench.rigs.poses import Pace
+from tests.hostile_datagrams import Capture, assault, flood, hostile, targets
 
-FAULTS = {fault.name: fault for fault in of_links(long=False)}
+FAULTS = {fault.name: fault for fault in of_links(seconds=1.5)}
 # Loss, reordering, duplicates, a cut, restarts and twins are in simulated time, or over sockets, in the tests beside.
 LIVE = ("step_ahead", "slave_stopped", "master_stopped")
 
@@ -69,13 +66,7 @@ def test_after_a_pause_no_pose_is_as_old_as_the_pause(rig: FaultRig) -> None:
     """A frame still waited for its partner's when the cable was pulled: nobody asks for that pose any more."""
     out_s = 3.0
 
-    def cut(rig: FaultRig) -> float:
-        rig.relay.cut = True
-        time.sleep(out_s)
-        rig.relay.cut = False
-        return time.monotonic()
-
-    run = over(rig, Fault("short cut", "", "", cut))
+    run = over(rig, Fault("short cut", "", "", cut(out_s)))
     assert run.oldest_s < 0.8 * out_s
 
 
@@ -97,7 +88,7 @@ def _replay(rig: FaultRig, capture: Capture) -> None:
     before, began = rig.counts(), time.monotonic()
     frames = capture.to_master[-4000:]
     flood(frames, [("127.0.0.1", rig.master_port)], len(frames), per_s=2000.0)
-    slaves = [*rig.relay.slaves(), ("127.255.255.255", rig.port)]
+    slaves = [*rig.relay.slaves(), ("127.255.255.255", rig.beacon_port)]
     for slave in slaves:
         flood(capture.to_slaves, [slave], len(capture.to_slaves), per_s=2000.0)
     assert well_again(rig, time.monotonic())
@@ -108,7 +99,7 @@ def _replay(rig: FaultRig, capture: Capture) -> None:
         assert after.get(name, 0) == before.get(name, 0), name
     received = rig.poses.since(began)
     assert len(received) > 0.25 * rig.pace.rate_hz * (received[-1].came_s - began)
-    assert not any(false(one) for one in received)
+    assert not any(one.false for one in received)
 
 
 def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(rig: FaultRig) -> None:
@@ -123,7 +114,7 @@ def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(r
     after = rig.counts()
     received = rig.poses.since(began, ended)
     assert received
-    assert not any(false(one) for one in received)
+    assert not any(one.false for one in received)
     rise = {name: after[name] - before.get(name, 0) for name in after if name.startswith("refused.")}
     assert {"refused.foreign", "refused.forged", "refused.stale", "refused.cut"} <= set(rise)
     assert min(rise.values()) >= 0
@@ -162,7 +153,11 @@ def test_what_was_captured_is_not_taken_again_by_either_side(rig: FaultRig) -> N
     capture.end()
     before = rig.counts()
     flood(capture.to_master, [("127.0.0.1", rig.master_port)], len(capture.to_master), per_s=2000.0)
-    flood(capture.to_slaves, [*rig.relay.slaves(), ("127.255.255.255", rig.port)], len(capture.to_slaves) * 3)
+    flood(
+        capture.to_slaves,
+        [*rig.relay.slaves(), ("127.255.255.255", rig.beacon_port)],
+        len(capture.to_slaves) * 3,
+    )
     # And to the side that said it.
     flood(capture.to_slaves, [("127.0.0.1", rig.master_port)], len(capture.to_slaves), per_s=2000.0)
     began = time.monotonic()
@@ -173,17 +168,17 @@ def test_what_was_captured_is_not_taken_again_by_either_side(rig: FaultRig) -> N
     for name in ("left.restarts", "right.restarts", "left.clock_steps", "right.clock_steps"):
         assert after.get(name, 0) == before.get(name, 0)
     received = rig.poses.since(began - 1.0)
-    assert not any(false(one) for one in received)
+    assert not any(one.false for one in received)
 
 
 def test_strangers_at_the_bus_neither_stop_the_hand_nor_cost_memory(rig: FaultRig) -> None:
-    memory_mb, began = rig.anonymous_mb(), time.monotonic()
+    memory_mb, began = rig.footprint().anonymous_mb, time.monotonic()
     became = assault(("127.0.0.1", rig.bus_port), 150, 60, 2.0)
     ended = time.monotonic()
     assert became["open"] > 10
     received = rig.poses.since(began, ended)
     assert received
-    assert not any(false(one) for one in received)
+    assert not any(one.false for one in received)
     assert well_again(rig, ended)
-    assert rig.report().source == "master"
-    assert rig.anonymous_mb() - memory_mb < 20.0
+    assert rig.ask().source == "master"
+    assert rig.footprint().anonymous_mb - memory_mb < 20.0

@@ -1,7 +1,7 @@
 """Whoever has a device's own key says what he likes to a real master: it goes on, and so do all others.
 
 One hand before two honest cameras; a third camera of it, a tracker, and a second hand's wrist device are stolen
-(`bench.hostile_rig`). `python -m bench.hostile` is the same with ten times as many messages.
+(`bench.rigs.hostile`). `python -m bench hostile` is the same with ten times as many messages.
 """
 
 import json
@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from bench.hostile import Limits, all_attacked, row
-from bench.hostile_rig import ROOT, STOLEN, HostileRig
-from bench.scale_rig import ROOM
+from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
+from bench.rigs.rooms import ROOM
 from common.link.session import EchoAnswer
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from tests.hostile_rigs import (
@@ -90,7 +89,7 @@ def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
     edited = {name: other[name] for name in ("hand", "markers")}
     path.write_text(json.dumps(json.loads(path.read_text()) | edited))
     place = ["--name", "cam02", "--camera", "synthetic", "--rig", ROOM, "--calibration", str(own)]
-    link = ["--bind", "127.0.0.1", "--beacon-port", str(rig.port)]
+    link = ["--bind", "127.0.0.1", "--beacon-port", str(rig.beacon_port)]
     with unharmed(rig) as rise, (tmp_path / "slave.log").open("w") as log:
         slave = subprocess.Popen(
             [sys.executable, "-m", "slave", "run", *place, *link],

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 import zenoh
 
-from bench.hostile_rig import ROOT, HostileRig
-from bench.hostile_sender import raw_bus
+from bench.rigs.hostile import ROOT, HostileRig
+from bench.rigs.hostile_sender import raw_bus
 from common.messages import Command, Health, encode
 from tests.hostile_rigs import Rigs, counts, unharmed
 from tests.network_helpers import PATIENCE_S

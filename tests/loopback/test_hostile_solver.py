@@ -12,10 +12,10 @@ import msgspec
 import pytest
 from msgspec import Struct
 
-from bench.hostile_examples import Speaker, own_kinds
-from bench.hostile_messages import Attack, all_attacks
-from bench.hostile_rig import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
-from bench.scale_rig import ROOM, detections_of
+from bench.rigs.fuzz import Attack, all_attacks
+from bench.rigs.fuzz_examples import Speaker, own_kinds
+from bench.rigs.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
+from bench.rigs.rooms import ROOM, detections
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
 from common.link.session import EchoAnswer, Started
 from common.messages import HandPose, decode, encode
@@ -55,7 +55,7 @@ class Room:
         self.slaves = {name: self.wires.new_slave(name) for name in (*cameras, "imu", "tracker")}
         assert self.wires.run(4.0, self.wires.all_started)
         self.wires.run(1.0)
-        self._frames, self._seq = detections_of(load_setup(tree, ROOM), RATE_HZ), 0
+        self._frames, self._seq = detections(load_setup(tree, ROOM), RATE_HZ), 0
         self._speaker, self._stolen = Speaker(device, self.setup), self.slaves[device]
 
     def honest(self) -> None:

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from bench.udp_relay import Impairment, UdpRelay
+from bench.rigs.relay import Impairment, UdpRelay
 from common.clock import Clock, SkewedClock, SystemClock
 from common.link.clock_offset import ClockEstimate
 from common.messages import MarkerDetections

@@ -13,7 +13,6 @@ from master.calibrate.depth.recording import Pairs, by_truth
 from master.evaluation.object_score import load_object_truth
 from master.evaluation.score import load_truth
 from master.evaluation.wrist_score import load_wrist_truth
-from master.study.trials import held_in
 from tests.common.hostile_npz import MIB, member, write_bomb, write_members
 from tests.master.test_wrist_score import N, recording, truth, write_truth
 
@@ -27,7 +26,6 @@ READERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "wrist": (lambda folder: load_wrist_truth(recording(folder, N), "wrist"), "t_ns"),
     "object": (lambda folder: load_object_truth(folder, "cube"), "t_ref"),
     "depth": (lambda folder: by_truth(recording(folder, N), PAIRS), "depth"),
-    "study": (lambda folder: held_in(folder, truth()), "label"),
 }
 
 
@@ -113,13 +111,11 @@ def test_a_wrist_whose_arrays_do_not_fit_is_refused(changed: str, strange: str, 
 
 
 @pytest.mark.parametrize("strange", STRANGE)
-def test_an_object_or_a_label_that_does_not_fit_is_refused(strange: str, tmp_path: Path) -> None:
+def test_an_object_that_does_not_fit_is_refused(strange: str, tmp_path: Path) -> None:
     array = STRANGE[strange]
-    np.savez(tmp_path / "truth.npz", t_ref=array, object_cube=np.zeros((2, 4, 4)), label=array)
+    np.savez(tmp_path / "truth.npz", t_ref=array, object_cube=np.zeros((2, 4, 4)))
     with pytest.raises(RecordingError, match=r"truth\.npz: object_cube"):
         load_object_truth(tmp_path, "cube")
-    with pytest.raises(RecordingError, match="nothing says which pose was held when"):
-        held_in(tmp_path, truth())
 
 
 def test_distances_that_are_no_numbers_are_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.local_rig import free_port
+from bench.rigs.local import free_port
 from master.commands.keys_folder import make
 from master.commands.service_unit import UNIT
 from tests.master.user_manager import user_manager, why_not

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from bench import faults_wall_clock
-from bench.faults_flood import Capture, Watch, flood, hostile, memory_mb, targets
-from bench.faults_measured import false
-from bench.faults_ports import assault
-from bench.faults_rig import ROOT, FaultRig, end
-from bench.local_rig import free_port, until
+from bench.report import ROOT
+from bench.rigs.faults import FaultRig
+from bench.rigs.local import end, free_port, until
+from tests.hostile_datagrams import Capture, Watch, assault, flood, hostile, memory_mb, targets
+from tests.nightly import wall_clock
 from tests.programs import needs
 
 MILLION = 1_000_000
@@ -52,7 +51,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, small_d
         assert recovery_s is not None
         assert recovery_s < 2.0
         received = rig.poses.since(began)
-        assert not any(false(one) for one in received)
+        assert not any(one.false for one in received)
         assert rig.processes["master"].poll() is None
     finally:
         rig.close()
@@ -61,10 +60,10 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, small_d
 
 def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
     """Of a slave and of the master, ten seconds ahead and back, while the hand is tracked."""
-    needs("cc")  # for bench/wall_clock.c
-    for runs in faults_wall_clock.measure(tmp_path, 2).values():
+    needs("cc")  # for wall_clock.c
+    for runs in wall_clock.measure(tmp_path, 2).values():
         assert not any(one.rise[name] for one in runs for name in one.rise)
-        assert max(one.share for one in runs) > faults_wall_clock.LEAST_SHARE
+        assert max(one.share for one in runs) > wall_clock.LEAST_SHARE
 
 
 def test_a_million_hostile_datagrams_cost_nothing_that_lasts(tmp_path: Path) -> None:
@@ -84,7 +83,7 @@ def test_a_million_hostile_datagrams_cost_nothing_that_lasts(tmp_path: Path) -> 
         watch = Watch(rig)
         time.sleep(3.0)
         after = watch.end()
-        assert not any(false(one) for one in during.received)
+        assert not any(one.false for one in during.poses)
         assert during.lost < 0.5
         assert after.master_cpu < 1.3 * before.master_cpu + 0.05
         assert after.slave_cpu < 1.3 * before.slave_cpu + 0.05
@@ -115,7 +114,7 @@ def test_strangers_at_the_console_do_not_reach_the_hand(tmp_path: Path) -> None:
         assert until(up, 2.0)
         assert console.poll() is None
         assert rig.steady_after(ended) is not None
-        assert not any(false(one) for one in rig.poses.since(began))
+        assert not any(one.false for one in rig.poses.since(began))
     finally:
         end(console)
         rig.close()

@@ -9,7 +9,7 @@ from tests.aarch64.machine import ROOT, sysroot_or_skip
 def test_instructions_per_frame_are_those_of_the_record() -> None:
     sysroot_or_skip()
     counted = subprocess.run(
-        [sys.executable, "-m", "bench.aarch64", "count"],
+        [sys.executable, "-m", "bench", "instructions"],
         capture_output=True,
         text=True,
         cwd=ROOT,

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.marker_frames import sequences
-from bench.marker_kinds import KINDS
-from bench.marker_score import clicks
+from bench.markers.accuracy import clicks
+from bench.markers.frames import sequences
+from bench.markers.kinds import KINDS
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.errors import PhalanxError

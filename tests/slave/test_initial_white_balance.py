@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.light import standard_scene
 from common.arrays import Float, Image
 from common.geometry.srgb import gain_tables
 from common.sim.grasp import Grasp
@@ -17,6 +16,7 @@ from common.sim.scene import Scene, view_centre
 from slave.markers.classify import ColourTable
 from slave.markers.initial_white_balance import OTHER, initial_white_balance, lights
 from tests.slave import painted
+from tests.slave.light_courses import standard_scene
 from tests.slave.painted import NAMES, SKIN, Disc, linear, marker_hsv
 
 TABLE = ColourTable([painted.RANGES[name] for name in NAMES])

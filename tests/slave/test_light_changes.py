@@ -1,6 +1,6 @@
 """Colours calibrated once, then another light: no marker is taken for another one, none is lost unwarned.
 
-Whole detector, rendered frames, exact truth; the scene, its courses of light and the judge are those of `bench.light`.
+Whole detector, rendered frames, exact truth; the scene, its courses of light and the judge are in `light_courses`.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench.light import (
+from common.sim.illuminant import LightSchedule
+from common.sim.render import Renderer
+from slave.markers.detector import MarkerDetector
+from slave.markers.light_adaptive import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
+from slave.markers.white_balance import apart
+from slave.markers.workers import Inline
+from tests.slave import painted
+from tests.slave.light_courses import (
     CANDLE,
     EXPOSURES,
     OPEN_S,
@@ -27,13 +34,6 @@ from bench.light import (
     outcome,
     standard_scene,
 )
-from common.sim.illuminant import LightSchedule
-from common.sim.render import Renderer
-from slave.markers.detector import MarkerDetector
-from slave.markers.light_adaptive import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
-from slave.markers.white_balance import apart
-from slave.markers.workers import Inline
-from tests.slave import painted
 
 T = TypeVar("T")
 MARKERS = load_rig().markers

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.light import standard_scene
-from bench.marker_frames import sequences
-from bench.marker_kinds import KINDS
-from bench.marker_score import clicks
+from bench.markers.accuracy import clicks
+from bench.markers.frames import sequences
+from bench.markers.kinds import KINDS
 from common.arrays import Image
 from common.recording.frame_recording import open_recording
 from common.sim.illuminant import LightSchedule
@@ -28,6 +27,7 @@ from slave.markers.roi import Window
 from slave.markers.scan import STRIPS, Scanner, merged
 from slave.markers.workers import Inline
 from slave.offline import calibrate_colours, camera_of
+from tests.slave.light_courses import standard_scene
 from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 
 STEP_NS = 16_666_667

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.joint_covariance import NOISE_M, Coverage, compared, joined, kinds
+from bench.hands.certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, PALM, TIPS, HandModel

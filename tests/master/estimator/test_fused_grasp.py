@@ -5,9 +5,9 @@ Frames are rendered and both slaves look at them: what the object does to tips a
 
 import pytest
 
-from bench.fusion_outcome import Outcome
-from bench.fusion_scene import Both
-from bench.fusion_watched import watched
+from bench.both.fusion import Outcome
+from bench.both.scene import Both
+from bench.both.watched import watched
 
 SECONDS, SEED = 6.0, 44
 

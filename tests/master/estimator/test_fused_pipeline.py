@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bench.fusion_scene import Both, Observed
-from bench.fusion_shown import shown
-from bench.fusion_solved import Solved, solve
+from bench.both.scene import Both, Observed
+from bench.both.shown import shown
+from bench.both.solved import Solved, solve
 from bench.played import START_NS
 from common.arrays import Bool
 from common.hand.model import CHAINS

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from bench.study.people import participant
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration, load
 from common.calibration.gesture_settings import GestureSettings, HoldSettings, default_gestures
@@ -15,7 +16,6 @@ from common.messages import Gesture, HandPose
 from common.sim.motion import POSES, REST, angles_of, smooth_step
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import PoseRecogniser
-from master.study.participant import participant
 from tests.hand_helpers import LEFT, RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, LARGE, OPEN, PINCH, POINT, SMALL, TWO, posture, shown
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.object_views import Where, wander
+from bench.objects.views import Where, wander
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench.object_views import HIDES, Noise, Where, detections, wander
+from bench.objects.views import HIDES, Noise, Where, detections, wander
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile

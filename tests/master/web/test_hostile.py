@@ -9,9 +9,9 @@ from contextlib import ExitStack, suppress
 import pytest
 from websockets.sync.client import connect
 
-from bench.faults_ports import assault
 from master.outputs.web import server as web_server
 from master.outputs.web.server import CLIENTS, WebServer
+from tests.hostile_datagrams import assault
 
 WAIT_S = 60.0
 RATE_HZ = 50.0

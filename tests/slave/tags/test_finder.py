@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.tag_images import Look, tag_picture
-from bench.tags import clutter
+from bench.objects.tag_images import Look, tag_picture
+from bench.objects.tags import clutter
 from common.calibration import CameraCalibration, load
 from common.calibration.object_profile import ObjectProfile, Tag, TagFamily, Tags
 from common.errors import CalibrationError

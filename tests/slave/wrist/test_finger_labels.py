@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bench.fusion_scene import Both
+from bench.both.scene import Both
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.wrist_strobe import Shown, rendered
+from bench.wrist.strobe import Shown, rendered
 from common.arrays import Bool, Image
 from slave.wrist.illumination import LED_LEAST, Evidence, brighter, coarse, evidence, unlit
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.wrist_strobe import RATE_HZ, Delivered, Score, Shown, deliver, recorded, rendered, score
+from bench.wrist.strobe import RATE_HZ, Delivered, Score, Shown, deliver, recorded, rendered, score
 from common.arrays import Image
 from common.recording.frame_recording import Illumination
 from slave.sources import Frame

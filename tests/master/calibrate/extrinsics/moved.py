@@ -6,13 +6,14 @@ from functools import cache
 import numpy as np
 from msgspec.structs import replace
 
-from bench.wrist_extrinsics import Both, both_of
+from bench.both.scene import Both
 from common.calibration import RigCalibration
 from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
 from common.imu.fusion import OrientationFilter
 from common.messages import HandPose, ImuSample, WristDetections
 from common.sim.imu import InertialPart, SimulatedImu
 from master.calibrate.cameras.lens_files import matrix_of
+from tests.master.calibrate.extrinsics.worn import both_of
 
 SECONDS, PACE, HAND_HZ, CYCLE_HZ = 6.4, 2.0, 60.0, 20.0
 ZERO_NS = 1_000_000_000

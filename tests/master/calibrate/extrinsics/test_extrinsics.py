@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replaced
 
-from bench.wrist_extrinsics import errors
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import quaternion_to_matrix
@@ -21,6 +20,7 @@ from master.calibrate.extrinsics.unknown import UNKNOWN
 from master.rig.setup import RigSetup
 from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
+from tests.master.calibrate.extrinsics.worn import errors
 from tests.master.test_solve_both import write_detections
 
 CERTAIN = {

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.object_views import Noise, detections, wander
+from bench.objects.views import Noise, detections, wander
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import Bead, ObjectProfile
 from common.geometry.camera_model import CameraModel

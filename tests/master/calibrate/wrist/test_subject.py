@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bench.wrist_subjects import CALIB, Person, knuckles
+from bench.report import CALIBRATION
+from bench.wrist.wearers import Person, knuckles
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
@@ -190,7 +191,7 @@ def test_what_determines_nothing_or_is_false_is_refused(
     elif what == "fists":
         cycles = cycles[40:] + cycles[40:]
     elif what == "hand":
-        hand = load(CALIB / "hands" / "default-left.json", HandProfile)
+        hand = load(CALIBRATION / "hands" / "default-left.json", HandProfile)
     else:
         assert rig.laser_plane is not None
         rotated = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
@@ -214,7 +215,7 @@ def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -
 
 @pytest.mark.parametrize(("key", "value"), [("ringfinger", "1.1"), ("ring", "0.1"), ("ring", '"thick"')])
 def test_a_thickness_that_is_none_is_refused_with_its_key(key: str, value: str) -> None:
-    raw = (CALIB / "hands" / "default-right.json").read_text()
+    raw = (CALIBRATION / "hands" / "default-right.json").read_text()
     wrong = raw.replace('"version": 1,', f'"version": 1, "palmar_scale": {{"{key}": {value}}},', 1)
     with pytest.raises(CalibrationError, match=r"me\.json.*palmar_scale"):
         parse(wrong.encode(), HandProfile, "me.json")

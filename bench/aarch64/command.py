@@ -1,0 +1,138 @@
+"""`make instructions`: aarch64 instructions of the slave per frame, held against the recorded baseline.
+
+    python -m bench instructions                  every case
+    python -m bench instructions six lost         some of: step six twelve lost windows search numba numba-windows
+                                                  wrist wrist-numba seed
+    python -m bench instructions six --parts      and the parts of the detector, six markers
+    python -m bench instructions --record         every case, and what was counted is the new baseline
+
+Exit code: 0 within the gate, 1 outside it or detected otherwise than on this machine, 2 cannot be counted here.
+"""
+
+import argparse
+import platform
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+from bench.aarch64 import baseline, scene
+from bench.aarch64.count import CPU, Counted, counted, native
+from bench.aarch64.guest import MACHINE_CODE
+from bench.aarch64.sysroot import CACHE, PYTHON, NotPossibleError, fast_wheels, prepare
+
+CASES = {
+    "step": "whole step, six markers: detect, message, encode, seal",
+    "six": "detection, six markers",
+    "twelve": "detection, twelve markers",
+    "lost": "detection, six markers, all sought anew in every frame",
+    "windows": "detection in windows alone, six markers",
+    "search": "the same, one of them lost: a strip in every frame",
+    "numba": "detection, six markers, by machine code",
+    "numba-windows": "the same in windows alone",
+    "wrist": "triple of a wrist device: strobe, seams, laser, tips, message",
+    "wrist-numba": "the same, by machine code",
+    "seed": "published pipeline rebuilt, six markers",
+}
+LONGEST = 30  # parts shown
+RATIOS = (
+    ("seed", "six", "published / ours"),
+    ("six", "windows", "whole frame / windows"),
+    ("search", "six", "windows and one marker lost / whole frame"),
+    ("wrist", "wrist-numba", "wrist, numpy / machine code"),
+    ("numba", "numba-windows", "whole frame / windows, machine code"),
+    ("twelve", "six", "12 markers / 6 markers"),
+    ("lost", "six", "every marker sought anew / tracked"),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Count, compare, record if wanted; return the exit code."""
+    keep = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        "python -m bench instructions", description=__doc__, formatter_class=keep
+    )
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{' '.join(CASES)} (default: all)")
+    parser.add_argument("--parts", action="store_true", help="count the parts of the detector as well")
+    parser.add_argument("--record", action="store_true", help="write the baseline")
+    parser.add_argument("--cpu", default=CPU, help="QEMU's name of the processor (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    cases = cast(list[str], options.cases) or list(CASES)
+    if unknown := sorted(set(cases) - CASES.keys()):
+        parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
+    if options.record and (options.cpu != CPU or set(cases) != CASES.keys()):
+        parser.error(f"the baseline holds every case on {CPU}: --record goes with no CASE and no --cpu")
+    try:
+        return _count(cases, parts=options.parts, record=options.record, cpu=options.cpu)
+    except (NotPossibleError, baseline.BaselineError) as error:
+        print(f"instructions: {error}", file=sys.stderr)
+        return 2
+
+
+def _count(cases: list[str], *, parts: bool, record: bool, cpu: str) -> int:
+    old = baseline.read() if cpu == CPU and not record else None
+    sysroot = prepare(_print)
+    fast = fast_wheels(_print) if set(cases) & set(MACHINE_CODE) else None
+    with tempfile.TemporaryDirectory(dir=CACHE, prefix="frames-") as folder:
+        scene.write_all(Path(folder))
+        equal = [case for case in cases if case not in MACHINE_CODE]  # whose sums may be in any order
+        here = native(Path(folder), equal)
+        found = counted(sysroot, Path(folder), [*cases, "parts"] if parts else cases, cpu, fast)
+    print(f"aarch64 instructions per frame, 640x480, {cpu}, QEMU {sysroot.versions['qemu']}")
+    _print_table(cases, found, old)
+    new = baseline.Baseline(cpu, {case: round(found.per_frame[case]) for case in cases}, sysroot.versions)
+    good = _same_everywhere(equal, found.hashes, here)
+    if record:
+        baseline.write(new)
+        print(f"  recorded in {baseline.FILE}")
+    elif old is not None:
+        good &= _within_gate(new, old)
+    return 0 if good else 1
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _print_table(cases: list[str], found: Counted, old: baseline.Baseline | None) -> None:
+    for case in cases:
+        value = found.per_frame[case]
+        note = "" if old is None else baseline.compared(value, old.instructions.get(case))
+        print(f"  {case:13s} {value * 1e-6:9.3f} Minstr  {CASES[case]:56s} {note}")
+    for top, bottom, text in RATIOS:
+        if {top, bottom} <= set(cases):
+            print(f"  {'':13s} {found.per_frame[top] / found.per_frame[bottom]:9.2f} x       {text}")
+    for name, (calls, spent) in sorted(found.parts.items(), key=lambda item: -item[1][1])[:LONGEST]:
+        print(f"    {name:32s} {spent * 1e-6:8.3f} Minstr in {calls:6.2f} calls")
+
+
+def _same_everywhere(cases: list[str], there: dict[str, str], here: dict[str, str]) -> bool:
+    """Print whether both architectures detected the same bits; False if they did not, though they should."""
+    other = [case for case in cases if there[case] != here[case]]
+    for case in cases:
+        verdict = "NOT EQUAL" if case in other else "equal"
+        print(
+            f"  {case:13s} sha256 {there[case][:16]} on aarch64, {here[case][:16]} on {platform.machine()}: {verdict}"
+        )
+    if other and not platform.python_version().startswith(f"{PYTHON}."):
+        print(
+            f"  not judged: Python {platform.python_version()} here, {PYTHON} there; 3.12 adds floats otherwise"
+        )
+        return True
+    return not other
+
+
+def _within_gate(new: baseline.Baseline, old: baseline.Baseline) -> bool:
+    for line in baseline.other_versions(new.versions, old.versions):
+        print(f"  note: {line}")
+    outside = [
+        case
+        for case, value in new.instructions.items()
+        if not baseline.within(value, old.instructions.get(case))
+    ]
+    if outside:
+        print(
+            f"  outside the gate of ±{100 * baseline.GATE:g} %: {', '.join(outside)}; if that is meant: --record"
+        )
+    return not outside

@@ -1,0 +1,1 @@
+"""One hand before marker cameras and with a wrist device: scenes, messages, scores."""

@@ -1,0 +1,1 @@
+"""Benchmarks of a rig of marker cameras: time, depth, covariance, occlusion."""

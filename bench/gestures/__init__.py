@@ -1,0 +1,1 @@
+"""Benchmarks of recognised poses and actions of the hand."""

@@ -1,0 +1,188 @@
+"""The six study poses as the master recognises them: simulated people before rigs, and recorded hands.
+
+**Rigs**: people with their own bones, solved with bones as a calibration measures them; a wrist device sits a little
+otherwise than its file says, by the error of `calibrate wrist extrinsics` (docs/calibrate.md). Rendered at 30 Hz; hands
+turn by up to 35 degrees and hide their fingers. One rendering serves two rigs: two cameras are half of four, and
+markers are half of what is fused. **Wrist**: trials of the study (`bench.study`). A frame is right if the pose held in
+truth is recognised, from the third frame after it was formed on; an episode is right if it is recognised by then.
+**leapjs**: an event is wrong if the recorded joints contradict it by a rule of their own: which fingers are stretched
+(bends below 50 degrees together) and which are bent (above 85), and where thumb and index are.
+
+    python -m bench gesture_poses --people 20 21 22
+"""
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from bench.both.scene import Both, Observed, in_order, orientations
+from bench.both.solved import solve
+from bench.both.watched import cycles_of
+from bench.gestures.recognised import RecognisedPoses, pose_of, recognised
+from bench.hands.motion import SIGMA_M, Recorded, recordings, track
+from bench.played import START_NS, found_by, times_of
+from bench.report import CALIBRATION, Row, datasets, rig_files, show, skipped
+from bench.study.people import Participant, participant, rotated
+from bench.study.trials import Task, performed
+from common.arrays import Float
+from common.geometry.transforms import matrix_to_quaternion
+from common.hand.model import HandModel
+from common.messages import HandPose
+from common.sim.motion import POSES
+from common.sim.poses import StudyPoses
+from common.sim.scene import Scene, view_centre
+from common.sim.together import FlexedWrist
+from common.sim.wrist.scene import WristScene
+from master.rig.files import load_setup
+from master.rig.setup import RigSetup
+
+PEOPLE = (20,)  # a minute or two each; more by the command line
+_RATE_HZ, _SECONDS = 30.0, 15.0  # one round of the six poses
+_SEED, _MOTION, _STUDY_SEED, _WRIST_PEOPLE = 1, 100, 31, 3
+_ROTATION_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, the error of a calibrated mounting
+_STRETCHED_DEG, _BENT_DEG = 50.0, 85.0  # bends of the recorded joints, MCP and PIP together
+_PINCHED_M, _GRASPED_M = 0.075, 0.045  # from the thumb's tip joint to that of the index: at most, at least
+
+
+def rows(people: Sequence[int] = PEOPLE) -> Iterator[Row]:
+    """Measure a table of confusions for each rig, of these people together; a wrist device; recorded hands."""
+    every: dict[str, RecognisedPoses] = {}
+    for number in people:
+        for rig, one in (*_by_markers(number).items(), *_by_both(number).items()):
+            every.setdefault(rig, RecognisedPoses()).join(one)
+    for rig, one in every.items():
+        goal = "no goal: fingers hide" if rig == "desk" else "goal 98"
+        yield from one.rows(f"{rig}, people: {len(people)}", goal)
+    yield from _worn().rows(f"wrist device, {_WRIST_PEOPLE} people")
+    yield from _leap_rows()
+
+
+def _by_markers(number: int) -> dict[str, RecognisedPoses]:
+    """One person before four cameras, and before two of them."""
+    four = _setup("desk4")
+    who = _person(number, four)
+    motion = StudyPoses(HandModel.of(who.hand), view_centre(four.rig), _MOTION + number)
+    messages = _monitored(Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number))
+    return {name: _found(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
+
+
+def _by_both(number: int) -> dict[str, RecognisedPoses]:
+    """One person before two cameras with three markers on the back, without and with a wrist device."""
+    marked, worn = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    who = _person(number, marked)
+    model, seed = HandModel.of(who.hand), _MOTION + number
+    motion = FlexedWrist(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
+    scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
+    rng = np.random.default_rng([number, 77])
+    true = replace(worn.rig, T_camera_palm=who.rig.T_camera_palm)
+    file = rotated(true, rng.normal(0.0, _ROTATION_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
+    device = WristScene(true, worn.cameras, model, motion, seed=seed, reflectance=who.reflectance)
+    alone = _known(marked, who)
+    both = Both("both-poses", seed, scene, device, alone, RigSetup.of(file, worn.cameras, alone.hand))
+    markers = _monitored(scene)
+    messages = in_order([*markers, *orientations(both, _SECONDS), *cycles_of(both, _SECONDS)[0]])
+    return {
+        "desk-back3": _found(alone, markers, posed),
+        "desk-back3 + wrist-back3": _found(both.fused, messages, posed),
+    }
+
+
+def _monitored(scene: Scene) -> list[Observed]:
+    times = {camera: times_of(scene, camera, _SECONDS, _RATE_HZ) for camera in scene.rig.cameras}
+    return in_order([m for camera, t in times.items() for m in found_by(scene, camera, t)])
+
+
+def _found(setup: RigSetup, messages: Sequence[Observed], motion: StudyPoses) -> RecognisedPoses:
+    poses, out = solve(setup, messages), RecognisedPoses()
+    out.add([motion.held(1e-9 * (pose.t_ns - START_NS)) for pose in poses], recognised(poses, setup.hand))
+    return out
+
+
+def _setup(rig: str) -> RigSetup:
+    """A shipped rig at the bench's rate."""
+    setup = load_setup(CALIBRATION, rig)
+    slower = {name: replace(one, frame_rate_hz=_RATE_HZ) for name, one in setup.cameras.items()}
+    return RigSetup.of(setup.rig, slower, setup.hand)
+
+
+def _known(setup: RigSetup, who: Participant) -> RigSetup:
+    """The rig with somebody's bones as measured."""
+    return RigSetup.of(setup.rig, setup.cameras, HandModel.of(who.measured))
+
+
+def _person(number: int, setup: RigSetup) -> Participant:
+    """Somebody with the markers of the rig's hand."""
+    return participant(_SEED, number, rig_files("wrist")[0], setup.hand.profile)
+
+
+def _worn() -> RecognisedPoses:
+    """Trials of the study before a wrist device."""
+    rig, cameras, hand = rig_files("wrist")
+    task, out = Task(rig, cameras[rig.cameras[0]], hand, _STUDY_SEED, blocks=1), RecognisedPoses()
+    for number in range(1, _WRIST_PEOPLE + 1):
+        with tempfile.TemporaryDirectory() as folder:
+            done = performed(task, number, Path(folder))
+        poses = [done.poses.pose(k) for k in range(len(done.poses))]
+        truth = [next((t.pose for t in done.held if t.from_ns <= p.t_ns <= t.to_ns), None) for p in poses]
+        out.add(truth, recognised(poses, HandModel.of(done.hand)))
+    return out
+
+
+def _leap_rows() -> Iterator[Row]:
+    """leapjs: events, and those that the recorded joints contradict."""
+    folder = datasets() / "leapjs"
+    if not folder.is_dir():
+        yield skipped("leapjs", folder)
+        return
+    wrong, count, seconds = 0, 0, 0.0
+    for seed, recorded in enumerate(recordings(folder)):
+        found = recognised(_poses_of(recorded, recorded.model(), seed), recorded.model())
+        begun = [
+            k for k in range(len(found)) if found[k] is not None and (k == 0 or found[k] != found[k - 1])
+        ]
+        wrong += sum(not agrees(str(found[k]), recorded.fingers_m[k]) for k in begun)
+        count, seconds = count + len(begun), seconds + 1e-9 * float(recorded.t_ns[-1])
+    yield Row("leapjs: wrong poses recognised", float(wrong), "", f"goal 0; of {count} in {seconds:.0f} s")
+
+
+def _poses_of(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:
+    """A recording through estimator and filter."""
+    points, towards = recorded.caps(model)
+    noise = np.random.default_rng([seed, 17]).normal(0.0, SIGMA_M, points.shape)
+    _, shown = track(model, recorded.t_ns, points + noise, towards)
+    return [
+        pose_of(model, t, one.joints.position_m, matrix_to_quaternion(one.joints.rotation), one.angles_rad)
+        for t, one in zip(recorded.t_ns.tolist(), shown, strict=True)
+    ]
+
+
+def agrees(name: str, fingers_m: Float) -> bool:
+    """Return whether joints (5, 4, 3) [m], palm frame, may be such a pose, by bends and the gap of thumb and index."""
+    bone = np.diff(fingers_m[1:], axis=1)
+    bone = bone / np.linalg.norm(bone, axis=2, keepdims=True)
+    # Fingers spread to the side are no less stretched: of the first bone only what it leaves the palm's plane by.
+    lowered = np.arctan2(-bone[:, 0, 1], bone[:, 0, 2])
+    bends = np.degrees(lowered + np.arccos(np.clip((bone[:, 0] * bone[:, 1]).sum(axis=-1), -1.0, 1.0)))
+    stretched, bent = bends < _STRETCHED_DEG, bends > _BENT_DEG
+    gap = float(np.linalg.norm(fingers_m[0, 3] - fingers_m[1, 3]))
+    rules = {
+        "open_palm": stretched.all(),
+        "counting_two": stretched[:2].all() and bent[2:].all(),
+        "pointing": stretched[0] and bent[1:].all(),
+        "small_grasp": bent.all(),
+        "large_grasp": not stretched.all() and gap > _GRASPED_M,
+        "pinch": gap < _PINCHED_M and not stretched[0],
+    }
+    assert set(rules) == set(POSES)
+    return bool(rules[name])
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the rows of some people."""
+    parser = argparse.ArgumentParser(prog="python -m bench gesture_poses", description=__doc__)
+    parser.add_argument("--people", nargs="+", type=int, default=list(PEOPLE), metavar="N")
+    show(rows(parser.parse_args(arguments).people))

@@ -1,0 +1,1 @@
+"""Benchmarks of the hand solver on points, and its peers."""

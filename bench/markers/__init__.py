@@ -1,0 +1,1 @@
+"""Benchmarks of marker detection on generated frames and real pictures."""

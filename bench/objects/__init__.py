@@ -1,0 +1,1 @@
+"""Benchmarks of tracked objects: beads, tags, trackers."""

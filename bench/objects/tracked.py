@@ -1,0 +1,150 @@
+"""Where tracked objects are: rendered frames, detectors of the slaves, line of the master, exact truth of the scene.
+
+The scene is `object` (`common/sim/travel`): the object wanders and turns, goes to and fro, turns wholly, and is partly
+hidden by a card and by a hand. Seeds are others than served to tune it. What a feature shows is the renderer's own
+truth; a feature *faces* a camera where it lies in its image, turned to it and large enough to be found nearly always.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.played import START_NS, message_of, times_of
+from bench.report import CALIBRATION, Row, rig_files
+from common.arrays import Float
+from common.calibration import load
+from common.calibration.object_profile import ObjectProfile
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
+from common.messages import MarkerDetections, ObjectPose, TagDetections
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+from common.sim.scenes import scene_by_name
+from master.objects.features import Features
+from master.objects.line import ObjectLine
+from slave.markers.light_adaptive import detector_for
+from slave.markers.workers import Inline
+from slave.tags.finder import TagFinder
+
+OBJECTS = {"wand": "beads", "cube": "tags"}
+SEEDS = (11, 12)
+PARTS = {"seen": ((2.0, 4.0), (16.0, 4.0), (24.0, 4.0)), "partly hidden": ((38.5, 3.0), (47.0, 3.0))}
+_HIDDEN, _WHOLE = 0.5, 0.93  # share that a feature shows which is hidden, and which is not at all
+Seen = dict[str, list[tuple[int, Float]]]
+"""Camera -> when its rows were exposed [ns] and which shares of the features (F,) it sees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """One stretch: errors [mm], [deg] and squares of errors in sigmas of what was tracked; right flags and all."""
+
+    frames: int
+    mm: Float
+    deg: Float
+    sigmas_2: Float
+    flagged: tuple[int, int]
+    clear: tuple[int, int]
+
+
+def rows() -> Iterable[Row]:
+    """Errors and flags, for each object and part of the scene."""
+    for name, kind in OBJECTS.items():
+        for part, stretches in PARTS.items():
+            found = [stretch(name, seed, start, length) for seed in SEEDS for start, length in stretches]
+            yield from _rows_of(f"{name} of {kind}, {part}", found)
+
+
+def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
+    mm, deg, sigmas = (
+        np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg", "sigmas_2")
+    )
+    frames = sum(one.frames for one in found)
+    for what, values, unit, goal in (("place", mm, "mm", 3), ("turn", deg, "deg", 2)):
+        if len(values):  # a stretch in which it is never tracked has no error
+            most, middle = np.percentile(values, [95, 50])
+            note = f"median {middle:.2f}; goal {goal}"
+            yield Row(f"{title}: {what}, 95 % of frames", float(most), unit, note)
+    within = 100.0 * float(((mm <= 3.0) & (deg <= 2.0)).sum()) / frames
+    yield Row(f"{title}: tracked and within both", within, "%", f"of {frames} frames")
+    if len(sigmas):
+        middle = float(np.sqrt(np.median(sigmas)))
+        yield Row(f"{title}: error by stated sigma", middle, "", "median; goal 1")
+    for what, pairs in (
+        ("hidden and flagged", [one.flagged for one in found]),
+        ("not hidden and flagged", [one.clear for one in found]),
+    ):
+        yes, all_of = (sum(pair[k] for pair in pairs) for k in (0, 1))
+        yield Row(f"{title}: {what}", float(yes), "frames", f"of {all_of}")
+
+
+def stretch(name: str, seed: int, start_s: float, seconds: float) -> Outcome:
+    """Render, detect and solve a stretch of the scene."""
+    rig, cameras, hand = rig_files(f"desk-{name}")
+    profile = load(CALIBRATION / f"objects/{name}.json", ObjectProfile)
+    models = {c: CameraModel.of(file, rig.camera_pose(c)) for c, file in cameras.items()}
+    scene = scene_by_name("object", rig, cameras, hand, seed, {name: profile})
+    messages, seen = _monitored(scene, profile, start_s, seconds)
+    line = ObjectLine(profile, rig, models)
+    poses = [solved.pose for message in messages for solved in line.push(message)]
+    poses += [solved.pose for solved in line.flush()]
+    return _judged(poses, scene, Features.of(profile, rig.markers), models, seen, name)
+
+
+def _monitored(
+    scene: Scene, profile: ObjectProfile, start_s: float, seconds: float
+) -> tuple[list[MarkerDetections | TagDetections], Seen]:
+    """What the slaves of all cameras would send, in order, and what there was to be seen."""
+    rig, messages, seen = scene.rig, list[MarkerDetections | TagDetections](), Seen()
+    for camera in rig.cameras:
+        own = scene.cameras[camera]
+        renderer, seen[camera] = Renderer(scene, camera), []
+        detector = detector_for(own, rig.markers, Inline(), free=rig.free_markers)
+        finder = None if profile.tags is None else TagFinder(own, [profile])
+        half_ns = round(0.5 * own.height_px * own.row_time_us * 1e3)
+        for seq, t in enumerate(times_of(scene, camera, seconds, own.frame_rate_hz, start_s).tolist()):
+            t_ns = START_NS + round(t * 1e9)
+            image, view = renderer.observe(t)
+            seen[camera].append((t_ns + half_ns, view.objects[profile.name].visible))
+            messages.append(message_of(camera, seq, t_ns, detector.push(image, t_ns)))
+            if finder is not None:
+                tags = finder.push(image, t_ns)
+                messages.append(TagDetections(camera, 1, seq, t_ns, t_ns, tags.ids, tags.uv, tags.sigma_px))
+    return sorted(messages, key=lambda m: (m.t_ns, isinstance(m, TagDetections))), seen
+
+
+def _judged(
+    poses: list[ObjectPose],
+    scene: Scene,
+    features: Features,
+    models: dict[str, CameraModel],
+    seen: Seen,
+    name: str,
+) -> Outcome:
+    mm, deg, sigmas = list[float](), list[float](), list[float]()
+    flags = {True: [0, 0], False: [0, 0]}
+    for pose in poses:
+        T = scene.truth((pose.t_ns - START_NS) * 1e-9).objects[name]
+        shares = [
+            np.where(features.expected(T, model), _near(seen[camera], pose.t_ns), 1.0)
+            for camera, model in models.items()
+        ]
+        least = float(np.min(shares))
+        if least < _HIDDEN or least > _WHOLE:
+            flags[least < _HIDDEN][0] += pose.occluded
+            flags[least < _HIDDEN][1] += 1
+        if not pose.tracked:
+            continue
+        rotation = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
+        off = np.concatenate([T[:3, 3] - pose.position_m, rotation])
+        mm.append(1e3 * float(np.linalg.norm(off[:3])))
+        deg.append(float(np.degrees(np.linalg.norm(rotation))))
+        sigmas.append(float(off @ np.linalg.solve(pose.cov, off)) / 6.0)
+    (hidden, of_hidden), (clear, of_clear) = flags[True], flags[False]
+    arrays = (np.array(mm), np.array(deg), np.array(sigmas))
+    return Outcome(len(poses), *arrays, (hidden, of_hidden), (clear, of_clear))
+
+
+def _near(seen: list[tuple[int, Float]], t_ns: int) -> Float:
+    """Shares (F,) in the frame nearest to an instant."""
+    return min(seen, key=lambda frame: abs(frame[0] - t_ns))[1]

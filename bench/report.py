@@ -1,0 +1,97 @@
+"""Rows of a benchmark and how they are printed; where the project's files and the recordings lie."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from common.arrays import Float
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+
+ROOT = Path(__file__).resolve().parents[1]
+CALIBRATION = ROOT / "calib_json"
+REGION = 7.815  # 95 % quantile of chi square with three degrees of freedom
+COLOURS = ("#14507a", "#b0473a", "#e0a030", "#3f8f5b", "#7a5ca8")  # of lines in pictures
+
+
+class Row(NamedTuple):
+    """One measurement: name, value, unit, and what it is compared with (goal, baseline, spread)."""
+
+    name: str
+    value: float
+    unit: str
+    note: str = ""
+
+
+def datasets() -> Path:
+    """Return the folder of recordings, by the environment variable PHALANX_DATASETS."""
+    return Path(os.environ.get("PHALANX_DATASETS", ROOT / "../shared/datasets")).resolve()
+
+
+def skipped(what: str, folder: Path) -> Row:
+    """Return the row of a part whose recordings are absent."""
+    return Row(f"{what}: skipped", 0.0, "", f"no recordings at {folder}: set PHALANX_DATASETS")
+
+
+def rig_files(name: str) -> tuple[RigCalibration, dict[str, CameraCalibration], HandProfile]:
+    """Load a shipped rig with its cameras and its hand."""
+    rig = load(CALIBRATION / f"rigs/{name}.json", RigCalibration)
+    cameras = {c: load(CALIBRATION / f"cameras/{c}.json", CameraCalibration) for c in rig.cameras}
+    return rig, cameras, load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
+
+
+def command(module: str, *arguments: object) -> None:
+    """Run a command of the project, for example `command("slave", "colours", ...)`.
+
+    Raises:
+        subprocess.CalledProcessError: It failed.
+    """
+    words = [sys.executable, "-m", module, *map(str, arguments)]
+    subprocess.run(words, check=True, capture_output=True, cwd=ROOT)
+
+
+def show(rows: Iterable[Row]) -> list[Row]:
+    """Print rows as they are measured; return them."""
+    out: list[Row] = []
+    for row in rows:
+        out.append(row)
+        number = f"{row.value:.4g}" if abs(row.value) < 1e4 else f"{row.value:.0f}"
+        print(f"  {row.name:58s} {number:>10s} {row.unit:8s} {row.note}", flush=True)
+    return out
+
+
+def write_json(file: Path, tables: Mapping[str, Sequence[Row]]) -> None:
+    """Write rows by section; null stands for a value that could not be measured."""
+    plain = {
+        name: [
+            row._asdict() | {"value": float(row.value) if math.isfinite(row.value) else None} for row in rows
+        ]
+        for name, rows in tables.items()
+    }
+    file.write_text(json.dumps(plain, indent=1, allow_nan=False))
+
+
+def figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size [inch] that needs no screen."""
+    made = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(made)
+    return made
+
+
+def rms(values: Float | Sequence[float]) -> float:
+    """Return the root mean square of all finite values; NaN: there is none."""
+    finite = np.asarray(values)[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(finite)))) if finite.size else float("nan")
+
+
+def inside(chi2: Float) -> float:
+    """Return the share of squared errors (N,), in units of covariance, inside the 95 % region [%]."""
+    return 100.0 * float((chi2 < REGION).mean())

@@ -1,0 +1,1 @@
+"""Rigs of real processes on this machine: faults, attacks, many cameras, an hour."""

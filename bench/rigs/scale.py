@@ -1,0 +1,358 @@
+"""2, 4, 8, 16 simulated cameras before real masters: what each costs, what is lost, how late the poses are.
+
+As one room round a hand, and as a building of desks with a master each. Cameras send exact projections, so that this
+machine is the masters' alone; datagrams are sealed and go over real UDP. What others do on the machine shows in
+latencies: each figure has the load beside it. `--page` writes the measurement into docs/scale.html, which computes
+rooms and buildings from it, and its table into docs/scale.md.
+"""
+
+import argparse
+import json
+import os
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from math import nan
+from pathlib import Path
+from statistics import median
+from typing import cast
+
+import numpy as np
+
+from bench.report import CALIBRATION
+from bench.rigs.hop import hop_ms
+from bench.rigs.local import UP_S, Rig, RigError, cpu_s, losses, until
+from bench.rigs.rooms import DESK, ROOM, detections, in_order, room, slower
+from bench.rigs.scale_page import into_page
+from common.link.datagram import OVERHEAD
+from common.link.session import MAX_CAMERAS
+from common.messages import HandPose, encode
+from common.messages.streams import MASTER
+from master.rig.files import load_setup, load_setups
+from master.run.dispatcher import Dispatcher
+from master.run.stages import StageTimes
+from master.run.tuning import LivePipeline
+
+BUILDING = "building"
+PER_HAND = (
+    "hand",
+    "filter",
+    "fabrik",
+    "gestures",
+)  # stages whose cost does not depend on the number of cameras
+SETTLE_S = 3.0
+_WORST = ("lost", "dropped", "blocked", "refused")
+_POSES, _WARM = 200, 20
+_HEAD = (
+    "  cameras  cores  a camera  without hand  poses/s  shed   sent    lost  dropped  skipped   p50 ms   p99 ms"
+    "  ingest  load"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleRun:
+    """What one run of so many cameras came to.
+
+    Attributes:
+        layout: `room`, one master of all cameras, or `building`, a master for each two.
+        cameras, masters: How many.
+        rate_hz: Of each camera.
+        seconds: How long was measured.
+        sent, received: Messages in that time, by the clock of each end.
+        lost, dropped, refused, blocked, skipped: As the masters count them; `skipped`: the sender was too late.
+        shed: Instants that were not solved, for newer ones waited.
+        poses_hz: Of one master.
+        latency_p50_ms, latency_p99_ms: From the sending of the last frame of a pose to its publication.
+        cores: Processor time of all masters together, seconds a second.
+        threads: The same by thread of a master: `solve`, `ingest`, `bus`, `others`.
+        pose_bytes: Of a pose on the bus, with all of its fields.
+        sender_late_p99_ms: By how much the simulated cameras were late themselves.
+        load: Load average of the machine at the end.
+    """
+
+    layout: str
+    cameras: int
+    masters: int
+    rate_hz: float
+    seconds: float
+    sent: int
+    received: int
+    lost: int
+    dropped: int
+    refused: int
+    blocked: int
+    skipped: int
+    dropped_epochs: int
+    poses_hz: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    cores: float
+    threads: dict[str, float]
+    pose_bytes: float
+    sender_late_p99_ms: float
+    load: float
+
+
+@dataclass(slots=True)
+class _Received:
+    """Poses of one master."""
+
+    latency_ms: list[float] = field(default_factory=list[float])
+    pose_bytes: int = 0
+
+    def keep(self, message: object) -> None:
+        if isinstance(message, HandPose):
+            self.latency_ms.append(message.latency_ns * 1e-6)
+            self.pose_bytes = self.pose_bytes or len(encode(message))
+
+
+def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: float) -> ScaleRun:
+    """Run it once.
+
+    Args:
+        folder: For files of this run; a new one.
+        layout: `room` or `building`.
+        cameras: How many, an even number in a building.
+        rate_hz: Of each.
+        seconds: How long is measured, after some seconds in which all settles.
+
+    Raises:
+        BusError: A master does not come up.
+        RigError: The simulated cameras did not start.
+    """
+    masters = 1 if layout == ROOM else cameras // 2
+    folder.mkdir(parents=True)
+    name = ROOM if layout == ROOM else DESK
+    if layout == ROOM:
+        tree = room(folder, cameras, rate_hz)
+    else:
+        tree = slower(
+            folder, dict.fromkeys(load_setup(CALIBRATION, DESK).camera_names, rate_hz), row_time_us=0.0
+        )
+    with ExitStack() as stack:
+        rigs, received = list[Rig](), list[_Received]()
+        for k in range(masters):
+            rig = Rig(folder / f"master{k}")
+            stack.callback(rig.close)
+            rig.start_master(tree, [name])
+            rig.join()
+            rigs.append(rig)
+            received.append(_Received())
+            rig.read("hand", received[-1].keep)
+        epoch_ns = time.monotonic_ns()
+        for rig in rigs:
+            place = [str(tree), name, str(rate_hz), str(rig.beacon_port), str(epoch_ns)]
+            rig.start("cameras", "bench.rigs.sender", *place, ready="sending")
+        time.sleep(SETTLE_S)
+        before, cpu, began = _sums(rigs), _threads(rigs), time.monotonic()
+        for one in received:
+            one.latency_ms.clear()
+        time.sleep(seconds)
+        took, after, spent = time.monotonic() - began, _sums(rigs), _threads(rigs)
+        latencies_ms, load = [list(one.latency_ms) for one in received], os.getloadavg()[0]
+        late_ms = [_late_p99_ms(rig) for rig in rigs]
+    threads = {one: (spent[one] - cpu[one]) / took for one in spent}
+    latencies = [np.percentile(one, [50, 99]) for one in latencies_ms if one] or [np.array([nan, nan])]
+    p50, p99 = np.median(latencies, axis=0)
+    return ScaleRun(
+        layout=layout,
+        cameras=cameras,
+        masters=masters,
+        rate_hz=rate_hz,
+        seconds=took,
+        sent=round(rate_hz * cameras * took),
+        poses_hz=median(len(one) for one in latencies_ms) / took,
+        latency_p50_ms=float(p50),
+        latency_p99_ms=float(p99),
+        cores=sum(threads.values()),
+        threads=threads,
+        pose_bytes=median(one.pose_bytes for one in received),
+        sender_late_p99_ms=max(late_ms),
+        load=load,
+        **{one: after[one] - before[one] for one in after},
+    )
+
+
+def _late_p99_ms(rig: Rig) -> float:
+    """End its cameras; return by how much they were late.
+
+    Raises:
+        RigError: They do not end.
+    """
+    process = rig.processes["cameras"]
+    assert process.stdin is not None
+    process.stdin.close()
+    if not until(lambda: process.poll() is not None, UP_S):
+        raise RigError("the simulated cameras do not end")
+    return float(json.loads((rig.folder / "cameras.log").read_text().splitlines()[-1])["late_p99_ms"])
+
+
+def _sums(rigs: Sequence[Rig]) -> dict[str, int]:
+    """Return counts of all masters and their cameras."""
+    out: dict[str, int] = {}
+    for health in (rig.ask() for rig in rigs):
+        counts = losses({MASTER: health})
+        for name, end in (("received", ".received"), ("shed", "instants_shed")):
+            counts[name] = sum(n for key, n in health.counts.items() if key.endswith(end))
+        out = {name: out.get(name, 0) + number for name, number in counts.items()}
+    return out
+
+
+def _threads(rigs: Sequence[Rig]) -> dict[str, float]:
+    """Return the processor time of all masters by thread since they began [s].
+
+    Python's threads have the name of the process, those of the bus names of their own. Of the former the main one
+    solves and publishes; the busiest other one is that of ingest.
+    """
+    out: dict[str, float] = dict.fromkeys(("solve", "ingest", "bus", "others"), 0.0)
+    for pid in (rig.processes[MASTER].pid for rig in rigs):
+        own: list[float] = []
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            spent_s = cpu_s(pid, f"task/{task.name}")
+            if task.name == str(pid):
+                out["solve"] += spent_s
+            elif re.match(r"python|phalanx", (task / "comm").read_text()):
+                own.append(spent_s)
+            else:
+                out["bus"] += spent_s
+        own.sort()
+        out["ingest"] += own[-1] if own else 0.0
+        out["others"] += sum(own[:-1])
+    return out
+
+
+def solve_us(cameras: int, rate_hz: float) -> dict[str, float]:
+    """Return the processor time of a pose by stage [us], and `all` of it, for a room: no socket, no second thread."""
+    with tempfile.TemporaryDirectory() as name:
+        setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
+    messages = in_order(detections(setups[0], rate_hz))
+    stages = StageTimes(time.thread_time_ns)
+    dispatcher = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+    warm, last = _WARM * cameras, (_WARM + _POSES) * cameras
+    for message in messages[:warm]:
+        list(dispatcher.push(message))
+    before, poses = stages.total_us(), dispatcher.counts["poses"]
+    begun_ns = time.thread_time_ns()
+    for message in messages[warm:last]:
+        list(dispatcher.push(message))
+    spent_us = (time.thread_time_ns() - begun_ns) * 1e-3
+    count = dispatcher.counts["poses"] - poses
+    by_stage = {name: (total - before.get(name, 0.0)) / count for name, total in stages.total_us().items()}
+    return by_stage | {"all": spent_us / count}
+
+
+def summary(runs: Sequence[ScaleRun], stages: dict[int, dict[str, float]]) -> dict[str, dict[str, object]]:
+    """Return all that was measured, and the model that the page computes with.
+
+    Processor time of a master is `pose_ms` for each pose and `message_ms` for each message of a camera: the line of
+    least squares through the runs of a room.
+    """
+    rooms = [one for one in runs if one.layout == ROOM]
+    model: dict[str, object] = {"max_senders": MAX_CAMERAS, "datagram_bytes": datagram_bytes()}
+    if len(rooms) > 1:
+        a = np.array([[one.poses_hz, one.received / one.seconds] for one in rooms])
+        cores = np.array([one.cores for one in rooms])
+        fit, *_ = np.linalg.lstsq(a, cores, rcond=None)
+        off = np.abs(a @ fit / cores - 1.0)
+        model |= {
+            "pose_ms": round(1e3 * float(fit[0]), 3),
+            "message_ms": round(1e3 * float(fit[1]), 4),
+            "off_line_percent": round(100.0 * float(off.max()), 1),
+            "pose_bytes": round(median(one.pose_bytes for one in rooms)),
+            "latency_p50_ms": {str(one.cameras): round(one.latency_p50_ms, 1) for one in rooms},
+            "latency_p99_ms": {str(one.cameras): round(one.latency_p99_ms, 1) for one in rooms},
+        }
+    all_runs: dict[str, object] = {
+        f"{one.layout} {one.cameras}": asdict(one)
+        | {"without_hand": cost_per_camera(one, stages.get(one.cameras, {}))}
+        for one in runs
+    }
+    return {
+        "machine": {
+            "machine": platform.machine(),
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+        },
+        "model": model,
+        "runs": all_runs,
+        "stages_us": {str(count): dict(us) for count, us in stages.items()},
+    }
+
+
+def datagram_bytes() -> int:
+    """Return the length of a sealed datagram of six markers, all of them seen."""
+    frames = detections(load_setup(CALIBRATION, DESK), 10.0)
+    return OVERHEAD + max(len(encode(one)) for one in next(iter(frames.values())))
+
+
+def cost_per_camera(run: ScaleRun, stages: dict[str, float]) -> float:
+    """Return the processor time of each camera [cores]: all but the hand's fit, its filter and gestures."""
+    hand_us = sum(stages.get(name, 0.0) for name in PER_HAND)
+    return (run.cores - run.masters * run.poses_hz * hand_us * 1e-6) / run.cameras
+
+
+def _row(run: ScaleRun, stages: dict[str, float]) -> str:
+    alone = f"{cost_per_camera(run, stages):12.3f}" if stages else " " * 12
+    return (
+        f"  {run.cameras:7d} {run.cores:6.2f} {run.cores / run.cameras:9.3f}  {alone} {run.poses_hz:8.1f}"
+        f" {run.dropped_epochs:5d} {run.sent:6d} {run.lost:7d} {run.dropped:8d} {run.skipped:8d}"
+        f" {run.latency_p50_ms:8.1f} {run.latency_p99_ms:8.1f} {run.threads['ingest']:7.2f} {run.load:5.1f}"
+    )
+
+
+def _median(layout: str, cameras: int, rate_hz: float, seconds: float, repeat: int) -> ScaleRun:
+    """Return the run of median cost; of what must not happen the worst of all."""
+    with tempfile.TemporaryDirectory() as name:
+        found = [measure(Path(name) / str(k), layout, cameras, rate_hz, seconds) for k in range(repeat)]
+    worst = {name: max(cast(int, getattr(one, name)) for one in found) for name in _WORST}
+    return replace(sorted(found, key=lambda one: one.cores)[len(found) // 2], **worst)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run it; 1 where a message was lost."""
+    parser = argparse.ArgumentParser("python -m bench scale", description=__doc__)
+    counts = parser.add_argument("--cameras", type=_counts, default=(2, 4, 8, 16), metavar="N,N")
+    counts.help = "how many (default: 2,4,8,16)"
+    parser.add_argument(
+        "--hz", type=float, default=90.0, help="of each camera of a room (default: %(default)s)"
+    )
+    hz = parser.add_argument("--building-hz", type=float, default=15.0)
+    hz.help = "of each camera of a building, whose masters share this machine (default: %(default)s)"
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each run (default: %(default)s)")
+    parser.add_argument("--repeat", type=int, default=1, help="runs, of which the median counts (default: 1)")
+    parser.add_argument("--only", choices=(ROOM, BUILDING), help="default: both")
+    parser.add_argument("--out", type=Path, default=Path("out/scale"), help="folder (default: %(default)s)")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the measurement into this page")
+    options = parser.parse_args(arguments)
+    layouts = [one for one in (ROOM, BUILDING) if options.only in (None, one)]
+    runs: list[ScaleRun] = []
+    python = platform.python_version()
+    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {python}; {options.seconds:g} s each")
+    stages = {count: solve_us(count, options.hz) for count in options.cameras} if ROOM in layouts else {}
+    for layout in layouts:
+        rate_hz = options.hz if layout == ROOM else options.building_hz
+        print(f"\n{layout}, {rate_hz:g} Hz\n{_HEAD}", flush=True)
+        for count in options.cameras:
+            runs.append(_median(layout, count, rate_hz, options.seconds, options.repeat))
+            print(_row(runs[-1], stages.get(count, {})), flush=True)
+    for count, us in stages.items():
+        by_stage = ", ".join(f"{name} {value:.0f}" for name, value in us.items())
+        print(f"  {count:2d} cameras, us of processor a pose: {by_stage}")
+    found = summary(runs, stages)
+    with tempfile.TemporaryDirectory() as name:
+        hops = hop_ms(Path(name))
+    found["model"] |= {"hop_p50_ms": round(hops[0], 2), "hop_p99_ms": round(hops[1], 2)}
+    print("\n" + "\n".join(f"{name}: {value}" for name, value in found["model"].items()))
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "scale.json").write_text(json.dumps(found, indent=1) + "\n")
+    if options.page is not None:
+        into_page(options.page, found)
+    return 1 if any(one.lost + one.dropped + one.blocked for one in runs) else 0
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    return tuple(int(one) for one in text.split(","))

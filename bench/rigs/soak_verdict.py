@@ -1,0 +1,292 @@
+"""The verdict of a soak: does memory grow or step, does latency grow, was anything lost?
+
+Memory and latency on a machine that others use as well are noisy, and noise has outliers: slopes are those of Theil and
+Sen (median of the slopes of all pairs, P. K. Sen, "Estimates of the regression coefficient based on Kendall's tau",
+1968), with Sen's interval of 95 %, widened where what is left is correlated. A process that keeps more and more raises
+the least, too, whoever else is busy: of latency the quietest minute of every five is judged.
+
+Memory that rises at once and stays is hardly seen by such a slope: steps are found for themselves, and the mapping of
+the process in which they came. A step is what a buffer makes that comes late, or memory that is freed and kept by the C
+library.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from math import nan, sqrt
+from pathlib import Path
+
+import numpy as np
+
+from bench.rigs.local import Footprint
+from common.arrays import Float
+
+MB_PER_H = 1.0
+GROWS_MS, GROWS_SHARE = (
+    1.0,
+    0.05,
+)  # latency that grew by less over the run, or by less of itself, did not grow
+WARM_UP_S, WARM_UP_SHARE = 300.0, 1.0 / 6.0
+BLOCK_S, QUIET_MINUTES = 60.0, 5
+LEAST_S = 600.0  # after the warm-up; a shorter run cannot tell 1 MB/h from the last arenas that are filled
+_Z95 = 1.96
+_FEWEST = 4
+STEP_MB = 2.0
+LEAST_MINUTES = 3
+_SHOWN_MB = 0.5
+_MOST_SHOWN = 3
+_KIB = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Minute:
+    """What a minute was like.
+
+    Attributes:
+        t_s: Its end, since the start of the soak.
+        poses_hz: Poses of hands.
+        p50_ms, p99_ms: Latency: from the hand-over of the last frame that contributed to publication.
+        load: Load average of the machine, which others may use as well.
+        cores: Process -> processor time in seconds a second.
+        counts: What the master counted since the start: lost, skipped, dropped, refused, blocked.
+        clock_offset_us: Sender -> by how much its clock is ahead of the master's.
+        clock_sigma_us: Sender -> how sure the master is of that.
+        grown: Process -> mapping -> by how much that one has grown in this minute [MB].
+    """
+
+    t_s: float
+    poses_hz: float
+    p50_ms: float
+    p99_ms: float
+    load: float
+    cores: dict[str, float]
+    counts: dict[str, int]
+    clock_offset_us: dict[str, float]
+    clock_sigma_us: dict[str, float]
+    grown: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
+
+
+@dataclass(slots=True)
+class SoakHistory:
+    """All that was measured: times since the start [s], footprints by process, minutes."""
+
+    times_s: list[float] = field(default_factory=list[float])
+    footprints: dict[str, list[Footprint]] = field(default_factory=dict[str, list[Footprint]])
+    minutes: list[Minute] = field(default_factory=list[Minute])
+    counts: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])
+
+    def series(self, process: str, quantity: str) -> list[float]:
+        """Return a quantity of a `Footprint`, of each reading."""
+        return [float(getattr(one, quantity)) for one in self.footprints[process]]
+
+    def plain(self) -> dict[str, object]:
+        """Return it for JSON; arrays by process and quantity."""
+        quantities = Footprint.__dataclass_fields__
+        return {
+            "t_s": self.times_s,
+            "footprint": {name: {q: self.series(name, q) for q in quantities} for name in self.footprints},
+            "minutes": [asdict(one) for one in self.minutes],
+            "counts": self.counts,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A rise of resident memory: minute in which it came, and how much [MB = 1e6 bytes]."""
+
+    minute: int
+    mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """Addresses from `start` to before `end`, `ADDRESS NAME`, and how much of it is resident [MB]."""
+
+    start: int
+    end: int
+    name: str
+    mb: float
+
+
+def steps_of(times_s: Sequence[float] | Float, mb: Sequence[float] | Float) -> list[Step] | None:
+    """Return rises of more than `STEP_MB` from the median of one minute to that of the next; None: too short to say.
+
+    Rises in minutes that follow each other are one step. In the first minute files are read and tables filled: the
+    second is held against the most that it had.
+
+    Args:
+        times_s: (N,) readings [s].
+        mb: (N,) resident memory [MB].
+    """
+    times, values = np.asarray(times_s, np.float64), np.asarray(mb, np.float64)
+    block = (times // BLOCK_S).astype(np.int64)
+    minutes = [int(k) for k in np.unique(block)]
+    if len(minutes) < LEAST_MINUTES:
+        return None
+    medians = [float(np.median(values[block == k])) for k in minutes]
+    medians[0] = float(values[block == minutes[0]].max())
+    found: list[Step] = []
+    for minute, before, after in zip(minutes[1:], medians, medians[1:], strict=False):
+        rise = after - before
+        if rise <= STEP_MB:
+            continue
+        if found and minute == found[-1].minute + 1:
+            found[-1] = Step(minute, found[-1].mb + rise)
+        else:
+            found.append(Step(minute, rise))
+    return found
+
+
+def mapped(pid: int) -> list[Mapping]:
+    """Return what a process has mapped, and how much of each is resident.
+
+    Raises:
+        OSError: There is no such process, or it belongs to somebody else.
+    """
+    found: list[Mapping] = []
+    for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
+        first, _, rest = line.partition(" ")
+        if not first.endswith(":"):  # a mapping begins: addresses, rights, offset, device, inode, name
+            start, _, end = first.partition("-")
+            fields = rest.split(maxsplit=4)
+            name = Path(fields[4]).name if len(fields) > 4 else "anonymous"
+            found.append(Mapping(int(start, 16), int(end, 16), f"{start} {name}", 0.0))
+        elif first == "Rss:":
+            found[-1] = replace(found[-1], mb=float(rest.split()[0]) * _KIB * 1e-6)
+    return found
+
+
+def grown(before: Sequence[Mapping], after: Sequence[Mapping]) -> dict[str, float]:
+    """Return mapping -> by how much it has grown [MB], the largest first; those that grew by little are left out.
+
+    The kernel joins neighbours and grows them at either end: a mapping is held against all that lay where it lies.
+    """
+    more = {
+        one.name: one.mb - sum(old.mb for old in before if old.start < one.end and one.start < old.end)
+        for one in after
+    }
+    kept = sorted((one for one in more.items() if one[1] > _SHOWN_MB), key=lambda one: -one[1])
+    return dict(kept[:_MOST_SHOWN])
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """Change per hour, with the interval that holds it with 95 %; NaN: too short to say."""
+
+    per_h: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the verdict. `ok` None: too short a run to say."""
+
+    what: str
+    value: str
+    limit: str
+    ok: bool | None
+
+
+def slope(times_s: Sequence[float] | Float, values: Sequence[float] | Float) -> Slope:
+    """Return Theil and Sen's slope of `values` (N,) over times (N,) [s]; NaN values are left out."""
+    t, y = np.asarray(times_s, np.float64) / 3600.0, np.asarray(values, np.float64)
+    t, y = t[np.isfinite(y)], y[np.isfinite(y)]
+    n = len(t)
+    if n < _FEWEST:
+        return Slope(nan, nan, nan)
+    one, other = np.triu_indices(n, 1)
+    pairs = np.sort((y[other] - y[one]) / (t[other] - t[one]))
+    middle = float(np.median(pairs))
+    left = y - middle * t
+    left -= left.mean()
+    power = float(left @ left)
+    r = float(left[1:] @ left[:-1]) / power if power > 0 else 0.0
+    wider = sqrt((1.0 + max(r, 0.0)) / (1.0 - min(max(r, 0.0), 0.95)))
+    spread = _Z95 * wider * sqrt(n * (n - 1) * (2 * n + 5) / 18.0)
+    low = round((len(pairs) - spread) / 2.0)
+    high = round((len(pairs) + spread) / 2.0)
+    return Slope(middle, float(pairs[max(low, 0)]), float(pairs[min(high, len(pairs) - 1)]))
+
+
+def warm_up_s(length_s: float) -> float:
+    """What is left out at the beginning of a run: files are read, tables and rings filled, learners settle."""
+    return min(WARM_UP_S, WARM_UP_SHARE * length_s)
+
+
+def memory_slope(course: SoakHistory, process: str, quantity: str = "rss_mb") -> Slope:
+    """Of a process, by medians of minutes, after the warm-up [MB/h]."""
+    times, values = np.array(course.times_s), np.array(course.series(process, quantity))
+    if not len(times) or times[-1] - warm_up_s(times[-1]) < LEAST_S:
+        return Slope(nan, nan, nan)
+    block = (times // BLOCK_S).astype(np.int64)
+    late = times >= warm_up_s(times[-1])
+    blocks = [k for k in np.unique(block) if (late & (block == k)).any()]
+    chosen = [late & (block == k) for k in blocks]
+    return slope(
+        [float(np.median(times[which])) for which in chosen],
+        [float(np.median(values[which])) for which in chosen],
+    )
+
+
+def latency_slope(minutes: Sequence[Minute], quantity: str) -> Slope:
+    """Of `p50_ms` or `p99_ms`, by the quietest minute of every five, after the warm-up [ms/h]."""
+    if not minutes or minutes[-1].t_s - warm_up_s(minutes[-1].t_s) < LEAST_S:
+        return Slope(nan, nan, nan)
+    late = [one for one in minutes if one.t_s > warm_up_s(minutes[-1].t_s)]
+    size = QUIET_MINUTES if len(late) >= _FEWEST * QUIET_MINUTES else 1
+    groups = [late[k : k + size] for k in range(0, len(late) - size + 1, size)]
+    least = [min(group, key=lambda one: getattr(one, quantity)) for group in groups]
+    return slope([one.t_s for one in least], [getattr(one, quantity) for one in least])
+
+
+def judge(course: SoakHistory, ended: Sequence[str]) -> list[Finding]:
+    """Return the verdict; `ended` are processes that ended by themselves."""
+    findings = [Finding("processes that ended", ", ".join(ended) or "none", "none", not ended)]
+    for process in course.footprints:
+        found = memory_slope(course, process)
+        findings.append(
+            Finding(
+                f"memory of {process}",
+                "too short to say"
+                if np.isnan(found.per_h)
+                else f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})",
+                f"{MB_PER_H:g} MB/h",
+                None if np.isnan(found.per_h) else found.per_h <= MB_PER_H,
+            )
+        )
+    findings += [_steps(course, process) for process in course.footprints]
+    findings += [_latency(course.minutes, name) for name in ("p50", "p99")]
+    counts = course.minutes[-1].counts if course.minutes else {}
+    for what in ("lost", "dropped", "refused", "blocked"):
+        findings.append(
+            Finding(what, str(counts.get(what, 0)), "0", counts.get(what, 0) == 0 if counts else None)
+        )
+    return findings
+
+
+def _steps(course: SoakHistory, process: str) -> Finding:
+    found, what = steps_of(course.times_s, course.series(process, "rss_mb")), f"steps of {process}"
+    limit = f"none of {STEP_MB:g} MB"
+    if found is None:
+        return Finding(what, "too short to say", limit, None)
+    where = "; ".join(_where(course, process, step) for step in found)
+    return Finding(what, where or "none", limit, not found)
+
+
+def _where(course: SoakHistory, process: str, step: Step) -> str:
+    """Return by how much, when, and where: what grew in that minute or the one before, for a median is late."""
+    near = [one for one in course.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
+    where = [f"{name} +{mb:.1f}" for one in near for name, mb in one.grown.get(process, {}).items()]
+    places = ", ".join(where) or "mapping not known"
+    return f"+{step.mb:.1f} MB in minute {step.minute} ({places})"
+
+
+def _latency(minutes: Sequence[Minute], name: str) -> Finding:
+    found = latency_slope(minutes, f"{name}_ms")
+    if np.isnan(found.per_h):
+        return Finding(f"latency {name}", "too short to say", "does not grow", None)
+    hours = minutes[-1].t_s / 3600.0
+    typical = float(np.nanmedian([getattr(one, f"{name}_ms") for one in minutes]))
+    grew = found.low > 0.0 and found.per_h * hours > max(GROWS_MS, GROWS_SHARE * typical)
+    value = f"{typical:.1f} ms, {found.per_h:+.2f} ms/h ({found.low:+.2f} ... {found.high:+.2f})"
+    return Finding(f"latency {name}", value, "does not grow", not grew)

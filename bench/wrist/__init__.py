@@ -1,0 +1,1 @@
+"""Benchmarks of the wrist device: strobe cycles, tips, joint angles, calibration."""

@@ -1,0 +1,161 @@
+"""Errors of the calibration of a wrist device against exact truth: its laser plane, palm and knuckles of the subject.
+
+Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
+board. Wearers are those of `bench.wrist.wearers`, each seed another person.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from msgspec.structs import replace
+
+from bench.report import Row, rig_files, rms
+from bench.wrist.wearers import Person
+from common.arrays import Float
+from common.calibration import CameraCalibration, RigCalibration
+from common.calibration.wrist import LaserPlane
+from common.errors import FitError
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import rotation_vector_to_matrix
+from common.hand.model import HandModel
+from common.recording.frame_recording import Illumination
+from common.sim.wrist_board import WristBoardRenderer, WristBoardScene, board_poses
+from master.calibrate.cameras.boards import Checkerboard
+from master.calibrate.wrist.laser_command import lines_of
+from master.calibrate.wrist.lit_views import LitView
+from master.calibrate.wrist.plane import PlaneFit, fit_plane
+from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.estimator.wrist_pipeline import WristPipeline
+from master.rig.wrist import WristSetup
+
+_SEEDS = range(100, 120)
+_LASERS = _SEEDS[:12]  # rendered views take a third of a second each
+_VIEWS = (3, 4, 6, 10)
+_CURLED = 6  # people whose curl is solved, with three tables each
+_BOARD = Checkerboard(9, 6, 0.015)
+_LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: of a calibration from a dozen board views
+_LIT = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+
+
+def rows() -> Iterator[Row]:
+    """Measure laser planes: normal [deg], offset [mm]; and subjects: palm [deg], knuckles [mm], PIP [deg]."""
+    rig, cameras, _ = rig_files("wrist")
+    yield from _planes(cameras["wrist"], rig)
+    yield from _subjects()
+
+
+def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
+    exact: dict[int, list[tuple[PlaneFit, LaserPlane]]] = {count: [] for count in _VIEWS}
+    wrong_lens: list[tuple[PlaneFit, LaserPlane]] = []
+    refused = dict.fromkeys(_VIEWS, 0)
+    for seed in _LASERS:
+        plane = _plane_of(seed)
+        scene, views = _shown(camera, rig, plane, max(_VIEWS), seed)
+        seen = lines_of(views, _BOARD, scene.optics())
+        for count in _VIEWS:
+            try:
+                fit = fit_plane(tuple(line for line in seen.lines if int(line.name) < count))
+            except FitError:
+                refused[count] += 1
+            else:
+                exact[count].append((fit, plane))
+        wrong_lens.append((fit_plane(lines_of(views, _BOARD, _wrong_lens(camera, seed)).lines), plane))
+    for count in _VIEWS:
+        note = f"{len(exact[count])} of {len(_LASERS)} seeds; {refused[count]} refused: board missed"
+        yield from _errors(f"laser plane, {count} views", exact[count], note)
+    name = f"laser plane, {max(_VIEWS)} views, lens as measured"
+    yield from _errors(name, wrong_lens, "lens off by its sigma")
+
+
+def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> Iterator[Row]:
+    rotation = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
+    sigma_deg = np.median([np.degrees(fit.normal_sigma_rad) for fit, _ in found])
+    sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
+    stated = f"largest {max(rotation):.4f}, stated sigma {sigma_deg:.4f}; goal 0.1; {note}"
+    yield Row(f"{name}: normal, median", float(np.median(rotation)), "deg", stated)
+    stated = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
+    yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", stated)
+
+
+def _subjects() -> Iterator[Row]:
+    """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
+    rotation: list[tuple[Float, Float]] = []
+    knuckle: list[tuple[Float, Float]] = []
+    unlikely: list[Float] = []
+    people: list[tuple[Person, Subject]] = []
+    for person in map(Person.of, _SEEDS):
+        try:
+            found = calibrate_subject(person.detected("subject")[0], person.rig, person.camera, person.hand)
+        except FitError:
+            continue
+        before, after = person.errors(person.rig, person.hand), person.errors(found.rig, found.hand)
+        rotation.append((before[0], after[0]))
+        knuckle.append((before[1], after[1]))
+        unlikely.append(1e-3 * after[1] / found.knuckle_sigma_m)
+        people.append((person, found))
+    note = f"{len(people)} of {len(_SEEDS)} people; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
+    for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):
+        was, now = (rms([one[side][k] for one in rotation]) for side in (0, 1))
+        yield Row(f"subject: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
+    for k, axis in enumerate(("across", "away from the lens, down", "away from the lens, ahead")):
+        was, now = (rms(np.array([one[side][:, k] for one in knuckle])) for side in (0, 1))
+        yield Row(f"subject: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
+    yield Row("subject: knuckles by stated sigma, rms", rms(np.array(unlikely)), "sigma", "goal 1")
+    errors = [_pip_errors(person, found) for person, found in people[:_CURLED]]
+    for k, name in enumerate(("files as they were", "calibrated", "true files")):
+        value = rms(np.concatenate([one[k] for one in errors]))
+        yield Row(
+            f"subject: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
+        )
+
+
+def _pip_errors(person: Person, found: Subject) -> list[Float]:
+    """Errors [deg] with the old, the new and the true files."""
+    cycles, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
+    files = (person.rig, person.hand), (found.rig, found.hand), (person.true_rig, person.true_hand)
+    out: list[Float] = []
+    for rig, hand in files:
+        line = WristPipeline(WristSetup.of(rig, person.camera, HandModel.of(hand)), continuous=False)
+        angles = np.array([line.push(cycle)[0].pose.angles_rad for cycle in cycles])
+        out.append(np.degrees(angles[:, 1:, 2] - true[:, 1:, 2]))
+    return out
+
+
+def _plane_of(seed: int) -> LaserPlane:
+    """A laser tilted by up to 6 degrees, 26 to 34 mm from the camera."""
+    rng = np.random.default_rng([seed, 1])
+    x, y, z = rotation_vector_to_matrix(np.radians(rng.uniform(-6.0, 6.0, 3)))[:, 1].tolist()
+    return LaserPlane(normal=(x, y, z), offset_m=0.03 + float(rng.uniform(-0.004, 0.004)))
+
+
+def _shown(
+    camera: CameraCalibration, rig: RigCalibration, plane: LaserPlane, count: int, seed: int
+) -> tuple[WristBoardScene, tuple[LitView, ...]]:
+    """A board before the device and its rendered views."""
+    own = replace(rig, laser_plane=plane, laser=None)
+    size = (_BOARD.columns, _BOARD.rows, _BOARD.square_m)
+    poses = board_poses(CameraModel.of(camera, np.eye(4)), *size, plane, count, seed)
+    scene = WristBoardScene(own, camera, *size, poses, seed=seed)
+    renderer = WristBoardRenderer(scene)
+    views: list[LitView] = []
+    for pose in range(count):
+        images = {lit: renderer.render(pose, lit) for lit in _LIT}
+        views.append(LitView(str(pose), {lit: lambda image=image: image for lit, image in images.items()}))
+    return scene, tuple(views)
+
+
+def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
+    """The camera with a lens that is off as a measured one is."""
+    lens = camera.intrinsics
+    assert lens is not None
+    rng = np.random.default_rng([seed, 2])
+    focal = float(rng.normal(0.0, _LENS_SIGMA_PX[0]))
+    u, v = rng.normal(0.0, _LENS_SIGMA_PX[1], 2).tolist()
+    fx, fy, cx, cy = lens.fx_px + focal, lens.fy_px + focal, lens.cx_px + u, lens.cy_px + v
+    off = replace(lens, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
+    return CameraModel.of(replace(camera, intrinsics=off), np.eye(4))
+
+
+def _angle_deg(a: Float, b: Float) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

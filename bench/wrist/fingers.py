@@ -1,0 +1,143 @@
+"""Joint angles of five fingers by a wrist device alone, from its frames: by level, and in every light; exact truth.
+
+Recordings, hands of a mesh (`bench.wrist_mesh`) whose joints are independent, and the six poses of the Digits study,
+simulated from dark to sun. Every cycle is an unrelated pose, found by the slave's detector; the device knows its palm
+and the bones, not the skin. Errors are of valid fingers, those of TRACKED ones beside them; *false* are TRACKED fingers
+whose PIP is off by 20 degrees or more. Baseline of the recordings: the cubic that the paper prints.
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Self
+
+import cv2
+import numpy as np
+from msgspec.structs import replace as changed
+
+from bench.oracle.recorded import angles_of
+from bench.report import Row, datasets, rig_files, skipped
+from bench.wrist.frames import RECORDINGS, drawn, recorded
+from bench.wrist_mesh.sets import set_named, write_set
+from common.arrays import Bool, Float
+from common.hand.model import CHAINS
+from common.messages import WristDetections
+from common.sim.wrist.scene import AMBIENTS, WristScene
+from master.estimator.wrist_pipeline import WristPipeline
+from master.rig.wrist import WristSetup
+from slave.wrist.detector import find
+from slave.wrist.strobe import StrobeCycle
+from slave.wrist.view import WristView
+
+_POSES, _SEEDS = 24, (301, 302, 303)
+_MESHES, _TRIPLES, _MESH_SEED = ("random", "left_random"), 30, 303
+_FALSE_DEG = 20.0
+_CYCLE_NS = 33_333_333
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Messages of a device of N poses, and their true angles (N, 5, 4) [rad]."""
+
+    setup: WristSetup
+    messages: Sequence[WristDetections]
+    truth_rad: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Errors (N, 5) [deg] of PIPs, of the thumb its MCP, NaN: not valid; and which fingers are TRACKED (N, 5)."""
+
+    off_deg: Float
+    tracked: Bool
+
+    @classmethod
+    def of(cls, seen: Seen, level: Literal["fk", "ik", "auto"] = "auto", *, cubic: bool = False) -> Self:
+        """Solve, each pose by itself."""
+        line = WristPipeline(replace(seen.setup, level=level, cubic=cubic), continuous=False)
+        poses = [one.pose for message in seen.messages for one in line.push(message)]
+        off = np.array([pose.angles_rad for pose in poses]) - seen.truth_rad
+        tracked = np.array([pose.tracked[CHAINS[:, 2]] for pose in poses])
+        return cls(np.degrees(np.abs(off[..., 2])), tracked)
+
+    @property
+    def pip_deg(self) -> float:
+        """Mean error of valid PIPs of index to little."""
+        return float(np.nanmean(self.off_deg[:, 1:]))
+
+    def row(self, name: str, note: str = "") -> Row:
+        """Return the row of the table."""
+        off, tracked = self.off_deg[:, 1:], self.tracked[:, 1:]
+        known = np.isfinite(off)
+        sure = off[tracked & known]
+        thumb = self.off_deg[np.isfinite(self.off_deg[:, 0]), 0]
+        mean, of_thumb = (float(one.mean()) if len(one) else np.nan for one in (sure, thumb))
+        text = (
+            f"valid {100.0 * known.mean():.0f} %; TRACKED {100.0 * tracked.mean():.0f} %, off by {mean:.1f}, false"
+            f" {int((sure >= _FALSE_DEG).sum())} of {len(sure)}; thumb {of_thumb:.1f}, TRACKED"
+            f" {100.0 * self.tracked[:, 0].mean():.0f} %"
+        )
+        return Row(name, self.pip_deg, "deg", f"{text}; {note}" if note else text)
+
+
+def rows() -> Iterator[Row]:
+    """Measure recordings, meshes, and every light."""
+    cv2.setNumThreads(1)
+    data = datasets()
+    if (data / "wrist").is_dir():
+        for name in RECORDINGS:
+            seen = of_recording(data / "wrist" / name, data / "hands")
+            yield Found.of(seen).row(f"{name}, recorded: PIP")
+            yield Found.of(seen, "ik").row("  laser and tip (ik)")
+            yield Found.of(seen, "fk").row("  laser alone, natural (fk)")
+            yield Found.of(seen, "fk", cubic=True).row("  the printed cubic", "baseline")
+        with tempfile.TemporaryDirectory() as folder:
+            for name in _MESHES:
+                there = Path(folder) / name
+                write_set(set_named(name, data, _TRIPLES, _MESH_SEED), data, there, _MESH_SEED)
+                yield Found.of(of_recording(there, data / "hands")).row(f"{name}, mesh: PIP")
+    else:
+        yield skipped("recordings", data / "wrist")
+    found = {light: _joined([Found.of(simulated(light, seed)) for seed in _SEEDS]) for light in AMBIENTS}
+    for light, one in found.items():
+        yield one.row(
+            f"six poses, {light}: PIP", f"{one.pip_deg / found['indoor'].pip_deg:.2f} x indoor, goal 1.2"
+        )
+
+
+def _joined(found: Sequence[Found]) -> Found:
+    off, tracked = (np.concatenate([getattr(one, key) for one in found]) for key in ("off_deg", "tracked"))
+    return Found(off, tracked)
+
+
+def of_recording(folder: Path, hands: Path) -> Seen:
+    """Detect in a recording with truth; `hands` is a folder of hand files."""
+    read = recorded(folder, hands)
+    messages = _messages(read.cycles, read.view, read.camera.name)
+    return Seen(
+        WristSetup.of(read.rig, read.camera, read.view.model), messages, angles_of(read.truth["angles"])
+    )
+
+
+def simulated(light: str, seed: int) -> Seen:
+    """Render and detect some moments of the six poses."""
+    rig, cameras, hand = rig_files("wrist")
+    camera = cameras[rig.cameras[0]]
+    scene, view = (
+        WristScene.by_name(f"poses@{light}", rig, cameras, hand, seed),
+        WristView.of(rig, camera, hand),
+    )
+    times = (np.arange(_POSES) + 0.5) * scene.period_s / _POSES
+    angles = np.array([scene.truth(float(t)).angles_rad for t in times])
+    messages = _messages(drawn(scene, camera.name, times), view, camera.name)
+    return Seen(WristSetup.of(rig, camera, view.model), messages, angles)
+
+
+def _messages(cycles: Sequence[StrobeCycle], view: WristView, camera: str) -> list[WristDetections]:
+    """The detector's messages, with times one after another."""
+    found = [find(cycle, view).message(camera, session=1) for cycle in cycles]
+    times = [(k + 1) * _CYCLE_NS for k in range(len(found))]
+    return [
+        changed(m, seq=3 * k, t_ns=t, ready_t_ns=t) for k, (m, t) in enumerate(zip(found, times, strict=True))
+    ]

@@ -1,0 +1,131 @@
+"""Fingertips of the wrist device: error, share found, share of something else, and how honest sigma is.
+
+On the recordings, where they are, and on simulated hands and palm poses of other seeds in every light. A tip counts as
+found within 6 px of the end of its finger; false is a report more than 25 px from it, or of an end that is not seen.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bench.report import Row, datasets, rig_files, skipped
+from bench.wrist.frames import RECORDINGS, differences, drawn, other_palm, recorded
+from common.arrays import Bool, Float
+from common.hand.profiles import generated_profile
+from common.sim.wrist.scene import AMBIENTS, WristScene
+from slave.wrist.fingers import separate
+from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
+from slave.wrist.laser import laser_lines
+from slave.wrist.strobe import StrobeCycle
+from slave.wrist.view import WristView
+
+_MOTIONS = ("standard", "curl", "poses", "spread", "random")
+_LENGTHS_M = (0.17, 0.185, 0.2)  # of hands, one for each seed
+_SEEDS, _POSES = (201, 202, 203), 14
+_FOUND_PX, _ELSEWHERE_PX = 6.0, 25.0
+_TOUCHING_PX, _EDGE_PX = 45.0, 40.0  # between the ends of two fingers: a diameter; to the edge of the image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """One strobe cycle with the true ends of fingers (5, 2) [px], and which are seen (5,)."""
+
+    view: WristView
+    cycle: StrobeCycle
+    truth_px: Float
+    seen: Bool
+
+
+def rows() -> Iterator[Row]:
+    """Measure the recordings, and each light."""
+    cv2.setNumThreads(1)
+    data = datasets()
+    if (data / "wrist").is_dir():
+        read = [recorded(data / "wrist" / name, data / "hands") for name in RECORDINGS]
+        shown = [
+            Shown(one.view, *row)
+            for one in read
+            for row in zip(one.cycles, one.truth["tip_uv"], one.truth["tip_visible"], strict=True)
+        ]
+        yield from _scored("recordings", shown)
+    else:
+        yield skipped("recordings", data / "wrist")
+    for ambient in AMBIENTS:
+        people = list(zip(_SEEDS, _LENGTHS_M, strict=True))
+        shown = [one for m in _MOTIONS for person in people for one in simulated(f"{m}@{ambient}", *person)]
+        yield from _scored(f"simulated, {ambient}", shown)
+
+
+def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
+    """Render poses of a generated hand before a palm that lies a little differently."""
+    rig, cameras, _ = rig_files("wrist")
+    hand = generated_profile(f"{hand_length_m:.3f} m", "right", hand_length_m)
+    rig = other_palm(rig, np.random.default_rng([seed, 6]))
+    scene = WristScene.by_name(name, rig, cameras, hand, seed)
+    view, times = (
+        WristView.of(rig, cameras[rig.cameras[0]], hand),
+        np.arange(_POSES) * scene.period_s / _POSES,
+    )
+    truths = [scene.truth(t) for t in times.tolist()]
+    cycles = drawn(scene, rig.cameras[0], times)
+    return [Shown(view, one, now.tip_uv, now.tip_visible) for one, now in zip(cycles, truths, strict=True)]
+
+
+def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
+    found = [_found(one) for one in shown]
+    truth = np.array([one.truth_px for one in shown])
+    off = np.array([tips.uv for tips in found]) - truth
+    sigma, seen = np.array([tips.sigma_px for tips in found]), np.array([one.seen for one in shown])
+    reported, distance = np.isfinite(off[..., 0]), np.linalg.norm(off, axis=2)
+    four, count = seen & (np.arange(5) > 0), max(int(reported.sum()), 1)
+    elsewhere = 100.0 * float((reported & (distance > _ELSEWHERE_PX)).sum() / count)
+    unseen = f"goal <= 5; of an end that is not seen {100.0 * float((reported & ~seen).sum() / count):.1f}"
+    within = 100.0 * float((distance[four] <= _FOUND_PX).mean())
+    yield Row(
+        f"{name}: median", float(np.median(distance[four & reported])), "px", f"{four.sum()} seen, no thumbs"
+    )
+    yield Row(f"{name}: found within 6 px", within, "%", "goal 90, no thumbs")
+    yield Row(f"{name}: of something else", elsewhere, "%", unseen)
+    thumb, shows = reported[:, 0], seen[:, 0]
+    if shows.any():
+        yield Row(f"{name}: thumbs found", 100.0 * float(thumb[shows].mean()), "%", f"of {shows.sum()} seen")
+    yield Row(f"{name}: thumbs that are not seen", float((thumb & ~shows).sum()), "", "goal 0")
+    for kind, some in _kinds(truth, shown[0].cycle.led.image.shape, reported, seen).items():
+        pull = np.abs(off[some] / sigma[some][:, None])
+        if len(pull):
+            note = f"goal 95; {len(pull)} tips, median sigma {float(np.median(sigma[some])):.1f} px"
+            yield Row(f"{name}: within 1.96 sigma, {kind}", 100.0 * float((pull < 1.96).mean()), "%", note)
+    swapped = 1000.0 * float(_swapped(off + truth, truth).sum() / count)
+    yield Row(f"{name}: given to another finger", swapped, "per 1000", "goal 0")
+
+
+def _found(one: Shown) -> Fingertips:
+    laser, led = differences(one.cycle)
+    fingers = separate(led, one.view)
+    if not fingers.palm_pose.straight:
+        return NO_TIPS
+    return fingertips(led, one.cycle.led.image, laser_lines(laser, fingers, one.view).uv, one.view)
+
+
+def _kinds(truth: Float, shape: tuple[int, ...], reported: Bool, seen: Bool) -> dict[str, Bool]:
+    """Which reports (N, 5) are of ends in the clear, beside another end, near the image's edge, or not seen."""
+    apart = np.linalg.norm(truth[:, :, None] - truth[:, None], axis=-1) + 1e9 * np.eye(5)
+    touching = apart.min(axis=2) < _TOUCHING_PX
+    edge = (np.minimum(truth, [shape[1], shape[0]] - truth) < _EDGE_PX).any(axis=2)
+    both = reported & seen
+    return {
+        "clear": both & ~touching & ~edge,
+        "touching": both & touching & ~edge,
+        "near the edge": both & edge,
+        "not seen": reported & ~seen,
+    }
+
+
+def _swapped(at: Float, truth: Float) -> Bool:
+    """Which reports (N, 5) lie on the end of another finger than their own."""
+    distance = np.linalg.norm(at[:, :, None] - truth[:, None], axis=-1)
+    own = np.diagonal(distance, axis1=1, axis2=2)
+    others = (distance + 1e9 * np.eye(5)).min(axis=2)
+    return (others < own) & (others < _TOUCHING_PX / 3.0)
