@@ -145,12 +145,12 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
     Attributes:
         source: Process name: "master".
         t_ns: When that message was there [ns], master's clock.
-        reject: How many epochs of each hand are skipped, at most, between two that are solved; 0: none.
+        skip: How many epochs of each hand are skipped, at most, between two that are solved; 0: none.
     """
 
     source: Name
     t_ns: TimeNs
-    reject: Annotated[int, Meta(ge=0, le=64)]
+    skip: Annotated[int, Meta(ge=0, le=64)]
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):

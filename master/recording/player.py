@@ -213,7 +213,7 @@ class Player:
                     load_shedding = LoadShedding()
                     dispatcher = world_of(self._setups, load_shedding)
             if isinstance(one.message, Backlog):
-                load_shedding.reject = one.message.reject
+                load_shedding.skip = one.message.skip
             results = self._results_of(dispatcher, one)
             if not silent:
                 self._write(results, digest)

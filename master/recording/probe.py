@@ -71,7 +71,7 @@ class Probe:
         self._until_ns = self._clock.now_ns() + LEASE_NS
         self._start()
 
-    def show(self, message: Message, reject: int = 0) -> None:
+    def show(self, message: Message, skip: int = 0) -> None:
         """Queue a message for publishing, if somebody taps.
 
         Before it publishes the number of dropped epochs, if that has changed.
@@ -82,9 +82,9 @@ class Probe:
             if self._clock.now_ns() >= self._until_ns:
                 self._until_ns = 0
                 return
-        if reject != self._rejected or (self._again and reject):
-            self._rejected = reject
-            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), reject))
+        if skip != self._rejected or (self._again and skip):
+            self._rejected = skip
+            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), skip))
         self._again = False
         self._put(message)
 
@@ -180,4 +180,4 @@ class Tapped(Generic[ReceivedT]):
         """At the end: the last message, too."""
         last, self._last = self._last, None
         if last is not None:
-            self._probe.show(last, self._load_shedding.reject)
+            self._probe.show(last, self._load_shedding.skip)

@@ -9,7 +9,7 @@ queue, and every other camera has one there that is not older. So what is droppe
 what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
-How much waits is looked at once for each message, and nothing but `LoadShedding.reject` comes of it: with the
+How much waits is looked at once for each message, and nothing but `LoadShedding.skip` comes of it: with the
 messages and that number, what is solved can be solved again bit for bit (`master.recording`).
 """
 
@@ -74,7 +74,7 @@ class LoadShedding:
 
     Attributes:
         waiting: Camera -> when its frames are that have come and were not taken yet [ns].
-        reject: How many epochs are dropped between two that are solved, of each hand; 0: none.
+        skip: How many epochs are dropped between two that are solved, of each hand; 0: none.
     """
 
     def __init__(self, setups: Sequence[RigSetup] = ()) -> None:
@@ -83,7 +83,7 @@ class LoadShedding:
         Without hands it is as far behind as it is set.
         """
         self.waiting: Callable[[], Mapping[str, Span]] = dict[str, Span]
-        self.reject = 0
+        self.skip = 0
         self._newest_ns: dict[str, int] = {}
         self._cameras: dict[str, list[Cameras]] = {}
         for setup in setups:
@@ -105,7 +105,7 @@ class LoadShedding:
         behind = bool(waiting and monitored) and all(
             cameras.newer_waits(waiting, self._newest_ns, message.t_ns) for cameras in monitored or ()
         )
-        self.reject = MOST if behind else 0
+        self.skip = MOST if behind else 0
 
 
 class Shedding:
@@ -121,5 +121,5 @@ class Shedding:
 
     def __call__(self) -> bool:
         """Return whether the next epoch is skipped."""
-        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._load_shedding.reject else 0
+        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._load_shedding.skip else 0
         return self._in_a_row > 0

@@ -241,7 +241,7 @@ healths = st.builds(
     metrics=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
-backlogs = st.builds(Backlog, source=names, t_ns=times, reject=st.integers(0, 64))
+backlogs = st.builds(Backlog, source=names, t_ns=times, skip=st.integers(0, 64))
 previews = st.builds(
     Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: JPEG_HEAD + tail)
 )

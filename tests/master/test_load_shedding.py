@@ -180,7 +180,7 @@ def test_instants_are_left_out_while_a_newer_one_waits(waiting: dict[str, Span],
     load_shedding.look(detections("left", 1, 0, 0))
     load_shedding.waiting = lambda: waiting
     load_shedding.look(detections("right", 1, 0, 0))
-    assert load_shedding.reject == (MOST if behind else 0)
+    assert load_shedding.skip == (MOST if behind else 0)
 
 
 def test_nobody_waits_for_a_camera_that_is_silent() -> None:
@@ -188,9 +188,9 @@ def test_nobody_waits_for_a_camera_that_is_silent() -> None:
     load_shedding.look(detections("right", 1, 0, 0))
     load_shedding.waiting = lambda: waits(left=(21, 23))
     load_shedding.look(detections("left", 1, 11, 11 * PERIOD_NS))
-    assert load_shedding.reject == 0
+    assert load_shedding.skip == 0
     load_shedding.look(detections("left", 1, 13, 13 * PERIOD_NS))
-    assert load_shedding.reject == MOST
+    assert load_shedding.skip == MOST
 
 
 def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
@@ -198,14 +198,14 @@ def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
     load_shedding.waiting = lambda: waits(left=(1, 1), right=(1, 1))
     load_shedding.look(detections("third", 1, 0, 0))
     load_shedding.look(cycle("wrist", 1, 0, 0))
-    assert load_shedding.reject == 0
+    assert load_shedding.skip == 0
     load_shedding.look(detections("left", 1, 0, 0))
-    assert load_shedding.reject == MOST
+    assert load_shedding.skip == MOST
 
 
 def test_a_master_that_has_time_only_for_messages_solves_some_epochs() -> None:
     load_shedding = LoadShedding()
-    load_shedding.reject, shedding = MOST, Shedding(load_shedding)
+    load_shedding.skip, shedding = MOST, Shedding(load_shedding)
     assert [shedding() for _ in range(2 * MOST + 2)] == 2 * [*[True] * MOST, False]
 
 

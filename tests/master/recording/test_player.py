@@ -78,7 +78,7 @@ def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Pat
     (path, live), dropped_epochs = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
     output = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
-    assert [one.reject for one in output] == 4 * [MOST, 0]
+    assert [one.skip for one in output] == 4 * [MOST, 0]
     assert (dropped_epochs, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):

@@ -87,12 +87,12 @@ def test_a_tap_from_the_beginning_shows_everything_until_its_recorder_is_gone() 
 class Behind(LoadShedding):
     """So far behind, message by message."""
 
-    def __init__(self, reject: list[int]) -> None:
+    def __init__(self, skip: list[int]) -> None:
         super().__init__()
-        self._next = reject
+        self._next = skip
 
     def look(self, message: Message) -> None:
-        self.reject = self._next.pop(0)
+        self.skip = self._next.pop(0)
 
 
 def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() -> None:
@@ -107,7 +107,7 @@ def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() ->
         source.get(0.0)
     probe.drain()
     expected = [
-        (one.reject, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
+        (one.skip, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
         for one in iter(lambda: shown.get(0.01), None)
     ]
     at = [came_ns(one, 0) for one in frames(6)]
