@@ -11,7 +11,7 @@ from common.hand.model import FINGERS
 from slave.colour_sampler import ColourSampler
 from slave.counters import DetectionCounters
 from slave.light_report import LightReport
-from slave.markers.ambiguity import ambiguity_counts, ambiguity_gauges
+from slave.markers.ambiguity import ambiguity_counts, ambiguity_metrics
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
@@ -132,7 +132,7 @@ def _marker_line(
             | {"windows": choice.frames}
             | ambiguity_counts(detector.plain)
         ),
-        lambda: ambiguity_gauges(detector.plain),
+        lambda: ambiguity_metrics(detector.plain),
     )
     previews = Previews(name, sender.clock, MarkerOverlay(detector, rig.markers))
     light = show = None

@@ -130,7 +130,9 @@ def _usual(value: object) -> str:
 
 
 def board(command: ArgumentParser) -> None:
-    """Draw a board at true scale, with a ruler of 100 mm and the options to calibrate with it.
+    """Draw a calibration board at true scale.
+
+    Beside it are a ruler of 100 mm and the options to calibrate with it.
 
     Print at 100 %, measure the ruler, and glue the print on something flat.
 
@@ -164,7 +166,9 @@ def board(command: ArgumentParser) -> None:
 
 
 def intrinsics(command: ArgumentParser) -> None:
-    """Measure the lens of each camera by itself: focal length, centre and distortion, each with its uncertainty.
+    """Measure the lens of each camera by itself.
+
+    Focal length, centre and distortion, each with its uncertainty.
 
     Wrong pictures are rejected automatically, each with the reason. Nothing is written without --out.
 
@@ -183,7 +187,9 @@ def intrinsics(command: ArgumentParser) -> None:
 
 
 def stereo(command: ArgumentParser) -> None:
-    """Measure where all cameras of a rig stand, and their lenses, in one bundle; two cameras or more.
+    """Measure where all cameras of a rig stand, and their lenses, in one bundle.
+
+    Two cameras or more.
 
     Not every camera needs to see every view, as long as shared views link them all. The rig's frame stays that of its
     file. Nothing is written without --out.
@@ -212,7 +218,9 @@ def stereo(command: ArgumentParser) -> None:
 
 
 def capture(command: ArgumentParser) -> None:
-    """Keep a picture whenever the board is held still somewhere new; all running slaves of the rig at once.
+    """Keep a picture whenever the board is held still somewhere new.
+
+    All running slaves of the rig take it at once.
 
     This is the rig's master while it runs: end `phalanx run` first. Slaves whose cameras have no colours yet
     run with `--colours none`. Ctrl-C ends it early; what was kept stays.
@@ -235,7 +243,9 @@ def capture(command: ArgumentParser) -> None:
 
 
 def depth(command: ArgumentParser) -> None:
-    """Fit depth to disparity from a target at known distances: the power law D = k x^z, and x = a/D + x0.
+    """Fit depth to disparity from a target at known distances.
+
+    The power law D = k x^z, and x = a/D + x0.
 
     Examples:
       phalanx calibrate depth RECORDING --detections DIR --distances 1.00:0.20:-0.05 --out calib_json
@@ -278,7 +288,9 @@ def depth(command: ArgumentParser) -> None:
 
 
 def verify(command: ArgumentParser) -> None:
-    """Report how right a rig is: error of each depth model at known distances, and the budget of what to expect.
+    """Report how accurate a rig is.
+
+    Error of each depth model at known distances, and the budget of what to expect.
 
     Without a recording or a table only the budget and the off-axis errors of the rig are printed.
 
@@ -319,7 +331,9 @@ def verify(command: ArgumentParser) -> None:
 
 
 def time(command: ArgumentParser) -> None:
-    """Measure how much later a camera's frames are than their time stamps, from a hand that moves.
+    """Measure how much later a camera's frames are than their time stamps.
+
+    From a hand that moves.
 
     Offsets are against the first camera of the rig. The master adds them to the times of every frame.
 
@@ -344,7 +358,7 @@ def time(command: ArgumentParser) -> None:
 
 
 def hand(command: ArgumentParser) -> None:
-    """Make a hand file: from the hand's length, measured by a guided routine of 20 s, or from motion capture.
+    """Make a hand file: by length, a guided routine of 20 s, or motion capture.
 
     Examples:
       phalanx calibrate hand --length-mm 190 --side right --name me --out calib_json      a quick start

@@ -15,7 +15,9 @@ from master.commands.options import (
 
 
 def tracker(command: ArgumentParser) -> None:
-    """Find where a tracking system (Lighthouse) lies in the rig, and where its device sits on an object.
+    """Find where a tracking system lies in the rig and its device on an object.
+
+    For example a Vive tracker under Lighthouse.
 
     The device is fixed to an object that the cameras see by markers or tags. Turn it about all its axes, a quarter turn
     and back, and carry it to all sides for twenty seconds. Which way the system's own axes point does not matter. The
@@ -102,7 +104,9 @@ def cube(command: ArgumentParser) -> None:
 
 
 def object_options(command: ArgumentParser) -> None:
-    """Measure where the beads of a rigid object sit, from fifteen seconds of its being turned before the cameras.
+    """Measure where the beads of a rigid object sit.
+
+    From fifteen seconds of its being turned before the cameras.
 
     The rig lists the beads in markers and in free_markers, the camera files have their colours; the object's file is
     not needed. Its frame is that of --like, or of its own file where there is one; else: origin in the middle of the

@@ -19,7 +19,9 @@ def add_lit_views(command: ArgumentParser) -> None:
 
 
 def laser_plane(command: ArgumentParser) -> None:
-    """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses.
+    """Measure the plane of a wrist device's laser.
+
+    From ten views of a board that the laser crosses.
 
     Hold the board still for each view, at 15 to 35 cm, near and far and tilted every way, so that the line runs over
     it. Views with the line elsewhere are rejected, each with the reason. Nothing is written without --out.
@@ -38,7 +40,9 @@ def laser_plane(command: ArgumentParser) -> None:
 
 
 def flat_field(command: ArgumentParser) -> None:
-    """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper.
+    """Measure the flat field of a wrist device's LEDs.
+
+    From twenty views of a board on matt paper.
 
     Its white squares at known places show how bright paper looks in every part of the image. Show the board
     everywhere, in the corners too, its face to the camera, still, in a room that is not too bright. Nothing is written
@@ -58,7 +62,9 @@ def flat_field(command: ArgumentParser) -> None:
 
 
 def curl(command: ArgumentParser) -> None:
-    """Measure along which line the laser point of each finger moves, from a guided curl of ten seconds.
+    """Measure along which line the laser point of each finger moves.
+
+    From a guided curl of ten seconds.
 
     With the device on: open the hand flat, close it slowly to a fist, all fingers together, and open it again, twice.
     Fingers that did not move enough are named and keep what the rig had. Nothing is written without --out.
@@ -85,7 +91,9 @@ def curl(command: ArgumentParser) -> None:
 
 
 def palm(command: ArgumentParser) -> None:
-    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: subject.
+    """Measure where the palm is before the wrist camera, by a board on it.
+
+    Without a board: `calibrate wrist subject`.
 
     The board lies flat on palm and straight fingers, print to the camera, columns along the middle finger. Nothing is
     written without --out.
@@ -141,7 +149,9 @@ def palm(command: ArgumentParser) -> None:
 
 
 def subject(command: ArgumentParser) -> None:
-    """Measure who wears the device: palm pose, knuckles, thickness and lengths of fingers, from sixteen seconds.
+    """Measure the subject: palm pose, knuckles, thickness and lengths of fingers.
+
+    From sixteen seconds of guided motion.
 
     With the device on: open the hand flat; bend the straight fingers at their knuckles towards 90 degrees, and back;
     open it flat; close it to a fist, and open it again. Three seconds or more for each bend. It needs the laser plane,
@@ -176,7 +186,7 @@ def subject(command: ArgumentParser) -> None:
 
 
 def extrinsics(command: ArgumentParser) -> None:
-    """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are.
+    """Measure the extrinsics of a wrist device, its IMU, and how late its clocks are.
 
     With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers
     one by one and together, bend the wrist as far one way as the other, and turn the forearm about all its axes. It

@@ -1,4 +1,7 @@
-"""Options of `phalanx fleet status`, `keys` and `relay`; those of its other commands: `deploy.arguments`."""
+"""Options of `phalanx fleet status`, `keys` and `relay`.
+
+Those of its other commands stand in `deploy.arguments`.
+"""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -8,7 +11,9 @@ from master.commands.options import add_bus, add_calibration, add_link, add_rig,
 
 
 def status(command: ArgumentParser) -> None:
-    """Show each process of the rig: machine, version, temperature, clock, rate. A row for each camera, IMU and tracker
+    """Show each process of the rig: machine, version, temperature, clock, rate.
+
+    A row for each camera, IMU and tracker
     that has keys or reports itself; a dash where nothing is known.
 
     With --wait it waits until datagrams of these senders come: at the master that runs or, where none does, here; it
@@ -49,7 +54,9 @@ def status(command: ArgumentParser) -> None:
 
 
 def keys(command: ArgumentParser) -> None:
-    """The secrets of a rig: keys for its datagrams, certificates for its bus. docs/keys.md lists who has which.
+    """Make the secrets of a rig: keys for datagrams, certificates for its bus.
+
+    docs/keys.md lists who has which.
 
     Prints who has a certificate, what for, until when, and which device has no secret for its datagrams. --make
     makes a keys folder, or adds what is missing: what is there stays as it is. `phalanx fleet deploy` does that, and
@@ -88,7 +95,9 @@ def keys(command: ArgumentParser) -> None:
 
 
 def relay(command: ArgumentParser) -> None:
-    """Show several masters in one place, and let nothing reach down to them. Two of these programs work together:
+    """Show several masters in one place, and let nothing reach down to them.
+
+    Two of these programs work together:
 
     At that place, with --listen, a router: it passes on what several masters publish, each under the name of its site,
     and readers name the site. Routers that are connected are one: a reader at any of them sees every site. One that was

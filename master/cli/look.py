@@ -8,7 +8,9 @@ from master.commands.options import add_bus, add_calibration, add_hand, add_link
 
 
 def view(command: ArgumentParser) -> None:
-    """Show a running master in Rerun. A process of its own, which may come and go; it waits for the master.
+    """Show a running master in Rerun.
+
+    A process of its own, which may come and go; it waits for the master.
 
     Examples:
       phalanx view --rig desk
@@ -37,7 +39,9 @@ def view(command: ArgumentParser) -> None:
 
 
 def console(command: ArgumentParser) -> None:
-    """Serve the console: watch, tune, record and set up in a browser. A process of its own, which may come and go.
+    """Serve the console: watch, tune, record and set up in a browser.
+
+    A process of its own, which may come and go.
 
     Needs no master and no file: the page sets a rig up from nothing. --beacon, --bind and the key are those of the
     processes that the page starts.
@@ -80,7 +84,9 @@ def console(command: ArgumentParser) -> None:
 
 
 def check(command: ArgumentParser) -> None:
-    """Print what is not as it should be; exit code 1 if there is anything, 0 if all is well.
+    """Print what is not as it should be.
+
+    Exit code 1 if there is anything, 0 if all is well.
 
     What each line means, how it is measured and what to do: docs/checklist.md.
 
@@ -97,7 +103,9 @@ def check(command: ArgumentParser) -> None:
 
 
 def info(command: ArgumentParser) -> None:
-    """Show what is in a recording of messages: streams, rates, length, files, and what happened.
+    """Show what is in a recording of messages.
+
+    Streams, rates, length, files, and what happened.
 
     Examples:
       phalanx info out/wave.mcap

@@ -17,7 +17,9 @@ from master.commands.options import (
 
 
 def record(command: ArgumentParser) -> None:
-    """Record what a running master takes and solves, in one MCAP file with the rig's calibration. A process of its own:
+    """Record what a running master receives and solves, in one MCAP file.
+
+    The file carries the rig's calibration. A process of its own:
     it waits for the master, goes on when that was started again, and never slows the tracking.
 
     Ctrl-C ends the file. A disk that is full ends it too, with exit code 1; what was written is readable. A replay is
@@ -61,7 +63,9 @@ def record(command: ArgumentParser) -> None:
 
 
 def play(command: ArgumentParser) -> None:
-    """Play a recording: what the master took is solved again, with the files that it carries, and goes to the bus as
+    """Play a recording as if its master were live.
+
+    What the master received is solved again, with the files that it carries, and goes to the bus as
     from a live master. At the end stands a SHA-256 of all poses: it is the same at any speed.
 
     While it plays, the bus answers the commands pause, resume, seek and speed. After a jump, and with --from, the two
@@ -96,7 +100,9 @@ def play(command: ArgumentParser) -> None:
 
 
 def export(command: ArgumentParser) -> None:
-    """Write what was recorded of hands for other tools: tables, motion capture, an animated model, Rerun.
+    """Write recorded hands for other tools.
+
+    Tables, motion capture, an animated model, Rerun.
 
     Positions read back are those of the poses to 0.1 mm in every format. In tables what was not observed is empty; in a
     motion it stands still, and how often is reported. docs/export.md has columns, axes, and how to open the files in
@@ -187,7 +193,9 @@ def export(command: ArgumentParser) -> None:
 
 
 def send(command: ArgumentParser) -> None:
-    """Send hands, objects, contact and gestures to other programs: OSC, VMC, ROS 2, LSL, WebSocket.
+    """Send hands, objects, contact and gestures to other programs.
+
+    By OSC, VMC, ROS 2, LSL or WebSocket.
 
     A process of its own, which may come and go; it waits for the master. The file is followed while it runs.
 

@@ -8,7 +8,9 @@ from master.commands.options import add_bus, add_calibration, add_hand, add_link
 
 
 def run(command: ArgumentParser) -> None:
-    """Track live until Ctrl-C; hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
+    """Track live until Ctrl-C.
+
+    Hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
     and, if asked, to files.
 
     Several rigs of one hand are one hand: cameras that watch its markers and the device on its wrist are solved
@@ -79,7 +81,9 @@ def run(command: ArgumentParser) -> None:
 
 
 def replay(command: ArgumentParser) -> None:
-    """Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand of what all of them
+    """Make hands of recorded frames, detections, messages or your own videos.
+
+    Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand of what all of them
     see, scores it where there is a truth. Offline and deterministic: no clock, no network, the same bytes on every run.
 
     Cameras and wrist device of one hand make one poses.npz together. Of a second hand there is poses-HAND.npz. Beside

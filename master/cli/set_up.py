@@ -8,7 +8,9 @@ from master.commands.options import add_bus, add_calibration
 
 
 def camera(command: ArgumentParser) -> None:
-    """Show how a running camera is set, or set it otherwise: at once, read back, compared.
+    """Show how a running camera is set, or set it otherwise.
+
+    At once, read back, compared.
 
     What the camera does not take is refused by name, and it goes back to what it had.
 
@@ -50,7 +52,9 @@ def camera(command: ArgumentParser) -> None:
 
 
 def gestures(command: ArgumentParser) -> None:
-    """List the poses that a hand is known by, and what is asked of each; teach one, forget one, or list which gestures
+    """List the poses that a hand is known by, and what is asked of each.
+
+    Or teach one, forget one, or list which gestures
     a recorded hand makes, from when to when.
 
     To teach a pose, show it a few times before a running master, or give its time in a recorded run. The hand is

@@ -1,4 +1,7 @@
-"""The table of `phalanx`, which is also called `phalanx-master` where it runs as a service."""
+"""The table of commands of `phalanx`.
+
+It is called `phalanx-master` where it runs as a service.
+"""
 
 import sys
 from pathlib import Path

@@ -44,8 +44,8 @@ def summary_lines(summary: Mapping[str, object]) -> list[str]:
         if key in summary
     ]
     if "gestures_made" in summary:
-        told = f"{summary['gestures_right']}/{summary['gestures_made']}"
-        lines.append(f"{'gestures recognised':34s} {told:>9} ({summary['gestures_false']} false)")
+        counted = f"{summary['gestures_right']}/{summary['gestures_made']}"
+        lines.append(f"{'gestures recognised':34s} {counted:>9} ({summary['gestures_false']} false)")
     made = summary.get("gestures")
     if isinstance(made, dict):
         counts = cast(dict[str, int], made)

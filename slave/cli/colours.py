@@ -6,7 +6,9 @@ from pathlib import Path
 
 
 def colours(command: ArgumentParser) -> None:
-    """Finds the marker colours of a camera in a recording, writes its camera file, and reports what collides with
+    """Find the marker colours of a camera in a recording.
+
+    Writes its camera file, and reports what collides with
     what.
 
     Examples:

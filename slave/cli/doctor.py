@@ -1,4 +1,7 @@
-"""Options of `phalanx-slave doctor`; what is not passed is read from the files in /etc/phalanx."""
+"""Options of `phalanx-slave doctor`.
+
+What is not passed is read from the files in /etc/phalanx.
+"""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -9,7 +12,9 @@ from slave.drivers import SWITCHED_LIGHTS
 
 
 def doctor(command: ArgumentParser) -> None:
-    """Reports what of this device is well, what not: machine, clock, libraries, keys, devices, camera, service, and
+    """Report what of this device is well and what is not.
+
+    Machine, clock, libraries, keys, devices, camera, service, and
     whether its master is received; each line ok, warn or fail, with what mends it; exit 1 where something fails.
 
     With --lights it looks at laser and LEDs of a wrist device alone: what the strobe of a rig may do, and what share of

@@ -1,4 +1,4 @@
-"""Options that several commands of the slave have: rig, link, camera, simulated world."""
+"""Options of several commands: rig, link, camera, simulated world."""
 
 from argparse import ArgumentParser
 from collections.abc import Callable
@@ -13,7 +13,7 @@ _finite = number()
 
 
 def add_place(command: ArgumentParser, who: str, calibration: str = "calib_json", rig: str = "desk") -> None:
-    """Who this slave is, of which rig, and where its files are; the texts state the defaults."""
+    """Add who this slave is, of which rig, and where its files are."""
     command.add_argument("--name", metavar="NAME", help=who)
     command.add_argument("--rig", metavar="NAME", help=f"rig, a file in DIR/rigs (default: {rig})")
     command.add_argument(

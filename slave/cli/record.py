@@ -9,7 +9,9 @@ from slave.drivers import CAMERAS, IMU_UNITS, REAL_IMUS
 
 
 def record(command: ArgumentParser) -> None:
-    """Writes raw frames of a camera to disk, and a real IMU beside it, without master or network: one folder per
+    """Write raw frames of a camera to disk, and a real IMU beside it.
+
+    Without master or network: one folder per
     camera. Or makes a recording of those of several cameras (--join), of videos or pictures that other programs made
     (--from), or imu.csv of the table of an IMU (--imu-csv).
 

@@ -9,7 +9,9 @@ from slave.drivers import CAMERAS, IMUS, SCANS, TRACKERS
 
 
 def run(command: ArgumentParser) -> None:
-    """Detects markers, or fingers before a wrist device, in the frames of a camera, and sends where they are; or sends
+    """Send what a camera, an IMU or a tracker measures.
+
+    Detects markers, or fingers before a wrist device, in the frames of a camera, and sends where they are; or sends
     what an IMU measures, or where a tracker on an object is. It waits for the master's start; then one sealed datagram
     for each frame, sample or pose.
 

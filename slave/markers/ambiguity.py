@@ -98,7 +98,7 @@ def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
     )
 
 
-def ambiguity_gauges(detector: MarkerSource | None) -> dict[str, float]:
+def ambiguity_metrics(detector: MarkerSource | None) -> dict[str, float]:
     """Return the ambiguity metrics of `Health`.
 
     beside.<marker>.u and .v, where the other thing was last [px].

@@ -13,7 +13,7 @@ from common.errors import CameraError
 from slave.cameras.faulty import FaultyCamera
 from slave.cameras.synthetic import SyntheticCamera
 from slave.colours_in_use import in_use, overlap
-from slave.markers.ambiguity import ColourAmbiguityMonitor, ambiguity_counts, ambiguity_gauges
+from slave.markers.ambiguity import ColourAmbiguityMonitor, ambiguity_counts, ambiguity_metrics
 from slave.markers.blobs import Blob
 from slave.simulated import FrameClock, scene_of
 
@@ -100,4 +100,4 @@ def test_a_simulated_camera_is_spoiled_as_its_file_says_and_well_without(tmp_pat
 
 
 def test_nothing_is_reported_of_a_detector_that_is_not_there() -> None:
-    assert ambiguity_counts(None) == ambiguity_gauges(None) == {}
+    assert ambiguity_counts(None) == ambiguity_metrics(None) == {}

@@ -1,4 +1,7 @@
-"""`phalanx calibrate wrist extrinsics`: how a wrist device sits, by what marker rig and device both see."""
+"""`phalanx calibrate wrist extrinsics`: how a wrist device sits.
+
+Found by what marker rig and device both see.
+"""
 
 from argparse import Namespace
 from collections.abc import Sequence

@@ -32,7 +32,7 @@ from common.hand.model import HandModel
 from master.calibrate.extrinsics.hands import HandProblem, Hands
 from master.calibrate.extrinsics.lines_of_sight import FINGERS, SEEN, LinesOfSight
 from master.calibrate.extrinsics.normal import Normal
-from master.calibrate.extrinsics.seen import STRAYS, Fit, StrobeCycles
+from master.calibrate.extrinsics.seen import OUTLIER_SIGMAS, Fit, StrobeCycles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
 from master.calibrate.extrinsics.unknown import (
     CAMERA_IMU,
@@ -144,7 +144,7 @@ class Problem:
         whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
         place = self._hands.place(hands)
         far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
-        whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
+        whiten = whiten * ((1.0 + np.vecdot(far, far) / OUTLIER_SIGMAS**2) ** -0.5)[..., None, None]
         observed = [
             np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.acceleration_m_s2)
         ]
@@ -282,9 +282,9 @@ class Problem:
         shown, wrist_angles = self._shown(unknown, hands)
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
-        data = (STRAYS**2 * np.log1p(pairs / STRAYS**2)).sum()
+        data = (OUTLIER_SIGMAS**2 * np.log1p(pairs / OUTLIER_SIGMAS**2)).sum()
         chi2 = ((wrist_angles / self._wrist_sigma) ** 2).sum(axis=-1) * self._known
-        wrist = (STRAYS**2 * np.log1p(chi2 / STRAYS**2)).sum()
+        wrist = (OUTLIER_SIGMAS**2 * np.log1p(chi2 / OUTLIER_SIGMAS**2)).sum()
         markers = replace(self._hands, points_m=self._here(unknown).points_m)
         held = 2.0 * markers.cost(hands).sum()
         prior_residual = unknown.off(self._first) / self._prior_sigma
@@ -320,7 +320,7 @@ class Problem:
         )
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
-        root = np.repeat((1.0 + pairs / STRAYS**2) ** -0.5, 2, axis=-1)
+        root = np.repeat((1.0 + pairs / OUTLIER_SIGMAS**2) ** -0.5, 2, axis=-1)
         observed = np.isfinite(self._data) & np.isfinite(shown)
         by = by * (np.where(observed, root, 0.0) / self.sigma)[..., None]
         count, n = len(hands.x), hands.x.shape[1]
@@ -346,7 +346,7 @@ class Problem:
         """As `_line_of_sight_rows`, of flexion, deviation and twist."""
         wrist = self._wrists(unknown, hands, orientations)
         chi2 = wrist_rotation_angles(wrist) / self._wrist_sigma
-        root = (1.0 + np.vecdot(chi2, chi2) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
+        root = (1.0 + np.vecdot(chi2, chi2) / OUTLIER_SIGMAS**2) ** -0.5  # where the hand itself was mistaken
         weight = (self._known * root)[:, None] / self._wrist_sigma
         by_rotation = weight[..., None] * bends_by_rotation(wrist)
         forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)

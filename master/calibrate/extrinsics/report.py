@@ -8,7 +8,7 @@ from master.calibrate.extrinsics.seen import Fit
 from master.calibrate.extrinsics.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
 
 _ROTATION_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
-_MOST_RMS, _STRAYS = 1.8, 0.35
+_MOST_RMS, _MOST_OUTLIERS = 1.8, 0.35
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
@@ -39,10 +39,10 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
     Raises:
         FitError: With what to do.
     """
-    if fit.rms > _MOST_RMS or fit.strays > _STRAYS:
+    if fit.rms > _MOST_RMS or fit.outlier_share > _MOST_OUTLIERS:
         raise FitError(
             f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
-            f" {100 * fit.strays:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"
+            f" {100 * fit.outlier_share:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"
             " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
         )
     rotation = max(
@@ -74,7 +74,7 @@ def left_of(fit: Fit) -> dict[str, float]:
         "laser_mm": 1e3 * float(np.nanmedian(laser)),
         "tip_px": float(np.nanmedian(tip)),
         "marker_mm": 1e3 * fit.marker_m,
-        "strays": fit.strays,
+        "outlier_share": fit.outlier_share,
     }
 
 
@@ -92,7 +92,7 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
     flexed, aside = (f"{low:+.0f} ... {high:+.0f} deg" for low, high in wrist_angles.T)
     lines = [
         f"mounting from {len(fit.wrist_angles_rad)} of {count} triples, {seen}",
-        f"left: {what}; {100 * fit.strays:.0f} % stray",
+        f"left: {what}; {100 * fit.outlier_share:.0f} % stray",
         f"wrist bent {flexed}, aside {aside}; its mean is called straight",
         f"{'':24} {'found':>22} {'standard deviation':>20}",
     ]

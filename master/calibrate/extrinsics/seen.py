@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.calibrate.extrinsics.unknown import Unknown
 
-STRAYS = 2.5  # standard deviations from which an observation is down-weighted
+OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is down-weighted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +72,10 @@ class Fit:
     @property
     def rms(self) -> float:
         """Return the root mean square of `off`, with outliers clipped at their limit."""
-        return float(np.sqrt(np.nanmean(np.minimum(np.abs(self.off), 2.0 * STRAYS) ** 2)))
+        return float(np.sqrt(np.nanmean(np.minimum(np.abs(self.off), 2.0 * OUTLIER_SIGMAS) ** 2)))
 
     @property
-    def strays(self) -> float:
+    def outlier_share(self) -> float:
         """Share of the sights that are farther off than noise explains."""
         pairs = np.hypot(self.off[..., 0::2], self.off[..., 1::2])
-        return float((pairs > 2.0 * STRAYS).sum() / max(np.isfinite(pairs).sum(), 1))
+        return float((pairs > 2.0 * OUTLIER_SIGMAS).sum() / max(np.isfinite(pairs).sum(), 1))

@@ -32,7 +32,7 @@ _WINDOW_S = 0.25
 _RIGID_M = 2e-3
 _RIGID_SIGMAS = 0.5  # most of a sigma changes from frame to frame, or is a suspicion that does not come true
 _SURE, _IN_WINDOW, _WINDOWS = 4.0, 5, 8
-_STRAYS = 0.3
+_MOST_OUTLIERS = 0.3
 _SIGMA_M = 1e-3  # standard deviation of a bead, at most
 
 
@@ -67,7 +67,7 @@ class Measurement:
         return np.sqrt(np.nanmean(kept * (self.bundle.off_m**2).sum(axis=-1), axis=0))
 
     @property
-    def strays(self) -> Float:
+    def outlier_share(self) -> Float:
         """Return the share (B,) of each bead's observations that the body does not fit."""
         return self.bundle.outlier.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
 
@@ -88,11 +88,11 @@ def measure_object(seen: Seen) -> Measurement:
     variance = np.array([np.linalg.eigvalsh(size[b, :, b])[-1] for b in range(len(seen.names))])
     sigma = np.sqrt(variance * max(1.0, len(bundle.T) / min(looks, _LOOKS)))
     found = Measurement(bundle, own, looks, sigma)
-    strays = found.strays
-    worst = int(np.argmax(strays))
-    if strays[worst] > _STRAYS:
+    outlier_share = found.outlier_share
+    worst = int(np.argmax(outlier_share))
+    if outlier_share[worst] > _MOST_OUTLIERS:
         raise FitError(
-            f"{seen.names[worst]}: {100 * strays[worst]:.0f} % of what was seen of it is somewhere else than the other"
+            f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of what was seen of it is somewhere else than the other"
             " beads say: is its colour taught, is nothing else of that colour in sight, are the cameras calibrated?"
         )
     if looks < FEWEST_LOOKS or float(sigma.max()) > _SIGMA_M:

@@ -95,13 +95,13 @@ def report_lines(found: Measurement, profile: ObjectProfile, misses: Mapping[str
     whole = int(bundle.seen.known.all(axis=1).sum())
     lines = [
         f"{len(bundle.T)} instants, {whole} with all beads; turned and carried to {found.looks} ways",
-        f"{'bead':12} {'x':>8} {'y':>8} {'z':>8} {'+-':>6} {'left':>6} {'strays':>7}   [mm]",
+        f"{'bead':12} {'x':>8} {'y':>8} {'z':>8} {'+-':>6} {'left':>6} {'outlier_share':>7}   [mm]",
     ]
     for row, name in enumerate(found.names):
         x, y, z = (1e3 * value for value in profile.markers[name].position_m)
         lines.append(
             f"{name:12} {x:8.2f} {y:8.2f} {z:8.2f} {1e3 * found.sigma_m[row]:6.2f} {1e3 * found.rms_m[row]:6.2f}"
-            f" {100 * found.strays[row]:5.1f} %"
+            f" {100 * found.outlier_share[row]:5.1f} %"
             + (f"   {1e3 * misses[name]:.2f} from where the file had it" if name in misses else "")
         )
     lines.append(f"what is left is {bundle.spread:.2f} times what the covariances expect")
@@ -122,7 +122,7 @@ def report_json(found: Measurement, profile: ObjectProfile, misses: Mapping[str,
                 "position_mm": [_mm(value) for value in profile.markers[name].position_m],
                 "sigma_mm": _mm(found.sigma_m[row]),
                 "rms_mm": _mm(found.rms_m[row]),
-                "strays": round(float(found.strays[row]), 4),
+                "outlier_share": round(float(found.outlier_share[row]), 4),
                 "moved_mm": _mm(misses[name]) if name in misses else None,
             }
             for row, name in enumerate(found.names)

@@ -33,7 +33,7 @@ MOTION = (
 )
 _FEWEST = 60
 _SIGMA_M, _SIGMA_RAD, _LATE_S = 3e-3, np.radians(1.0), 5e-3  # standard deviations, at most
-_LEFT_M, _LEFT_RAD, _STRAYS = 0.012, np.radians(5.0), 0.4
+_LEFT_M, _LEFT_RAD, _MOST_OUTLIERS = 0.012, np.radians(5.0), 0.4
 # What is off in the same way all the time, a tag that sits a little aside, no leaving out of a part shows: of what is
 # left it counts as if it averaged out over so many looks only.
 _LOOKS = 24
@@ -106,7 +106,7 @@ def figures_of(fit: Fit) -> dict[str, float]:
     return {
         "position_mm": 1e3 * float(place),
         "rotation_deg": float(np.degrees(rotation)),
-        "strays": float(fit.outlier.mean()),
+        "outlier_share": float(fit.outlier.mean()),
         "position_sigma_mm": 1e3 * float(place_sigma),
         "rotation_sigma_deg": float(np.degrees(rotation_sigma)),
         "late_sigma_ms": 1e3 * late_sigma_s(fit),
@@ -132,11 +132,11 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         FitError: With what to do.
     """
     left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["rotation_deg"])
-    if figures["strays"] > _STRAYS or left_m > _LEFT_M or left_rad > _LEFT_RAD:
+    if figures["outlier_share"] > _MOST_OUTLIERS or left_m > _LEFT_M or left_rad > _LEFT_RAD:
         raise FitError(
             f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
             f" and {figures['rotation_deg']:.1f} deg"
-            f" are left, {100 * figures['strays']:.0f} % strays. Does the tracker sit firmly on this object, is it the"
+            f" are left, {100 * figures['outlier_share']:.0f} % strays. Does the tracker sit firmly on this object, is it the"
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []
@@ -159,9 +159,7 @@ def report_lines(fit: Fit, figures: dict[str, float], coverage: Coverage) -> tup
     placed = fit.placed
     system, device = (1e3 * T[:3, 3] for T in (placed.T_rig_tracking, placed.T_object_tracker))
     shown = {name: f"{value:.2f}" for name, value in figures.items()}
-    left = (
-        f"left: {shown['position_mm']} mm, {shown['rotation_deg']} deg; {100 * figures['strays']:.0f} % stray"
-    )
+    left = f"left: {shown['position_mm']} mm, {shown['rotation_deg']} deg; {100 * figures['outlier_share']:.0f} % stray"
     lag = f"its poses hold {1e3 * placed.late_s:+.1f} ms after their stamps"
     sure = f"{shown['position_sigma_mm']} mm, {shown['rotation_sigma_deg']} deg"
     return (

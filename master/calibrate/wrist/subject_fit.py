@@ -34,7 +34,7 @@ _ASIDE_RAD = np.radians(
 _ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
 _KNUCKLE_M = 3e-3  # against a hand of this size, per axis
 _INDEPENDENT = 4.0  # strobe cycles of a bend
-_STRAYS = 2.5  # standard deviations from which an observation is downweighted
+_OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is downweighted
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _GUESS_SIGMA = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
 _ROUGHEST = 3.0
@@ -204,7 +204,7 @@ class _Problem:
         """The result with what is left."""
         off = np.where(guess.used[..., None], self._off(x, guess.angles), np.nan)
         known = np.isfinite(off)
-        rms = float(np.sqrt(np.mean(np.minimum(np.abs(off[known]), 2.0 * _STRAYS) ** 2)))
+        rms = float(np.sqrt(np.mean(np.minimum(np.abs(off[known]), 2.0 * _OUTLIER_SIGMAS) ** 2)))
         laser, tip = (
             np.sqrt((part**2).sum(axis=-1)) for part in (off[..., :2], (off * self._sigma)[..., 2:])
         )
@@ -242,7 +242,7 @@ class _Problem:
     def _cost(self, x: Float, guess: _Guess) -> float:
         off = np.nan_to_num(self._off(x, guess.angles)) * guess.used[..., None]
         pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)])
-        data = (_STRAYS**2 * np.log1p(pairs / _STRAYS**2)).sum(axis=(0, 2))
+        data = (_OUTLIER_SIGMAS**2 * np.log1p(pairs / _OUTLIER_SIGMAS**2)).sum(axis=(0, 2))
         grid = (self._prior_rows(guess)[0] ** 2).sum(axis=(1, 2))
         return float((self._share * (data + grid)).sum() + ((x / self.prior_sigma) ** 2).sum())
 
@@ -250,7 +250,7 @@ class _Problem:
         """Build the normal equations at a point, with outliers down-weighted."""
         off = np.nan_to_num(self._off(x, guess.angles))
         pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)], axis=-1)
-        root = np.repeat((1.0 + pairs / _STRAYS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
+        root = np.repeat((1.0 + pairs / _OUTLIER_SIGMAS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
         root = np.where(np.isfinite(self._data), root, 0.0)
         by_x, by_angles = self._model.derivatives(x, guess.angles)
         prior_residual, prior_jacobian = self._prior_rows(guess)

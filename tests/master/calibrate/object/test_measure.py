@@ -42,8 +42,8 @@ def test_beads_that_are_seen_wrongly_for_a_while_cost_themselves(motion: Seen) -
     points[wrong, 1] += np.array([0.03, -0.02, 0.01])
     found = measure_object(replace(motion, points_m=points))
     assert off_mm(found).max() < 0.3
-    assert found.strays[1] == pytest.approx(0.125, abs=0.02)
-    assert found.strays[[0, 2]].max() < 0.02
+    assert found.outlier_share[1] == pytest.approx(0.125, abs=0.02)
+    assert found.outlier_share[[0, 2]].max() < 0.02
 
 
 def test_four_beads_of_which_one_is_missing_most_of_the_time() -> None:

@@ -88,7 +88,7 @@ def test_rendered_beads_are_measured_and_the_file_tracks(run: Run, recorded: Pat
     assert profile.provenance["markers"].residual["wand1_rms_mm"] < 3.0
     assert load(tree / "rigs" / "desk-wand.json", RigCalibration).objects == ("wand",)
     assert (tree / "wand.png").stat().st_size > 10_000
-    assert json.loads((tree / "report.json").read_text())["beads"]["wand1"]["strays"] < 0.1
+    assert json.loads((tree / "report.json").read_text())["beads"]["wand1"]["outlier_share"] < 0.1
 
     setup = load_setup(tree, "desk-wand")
     line = ObjectLine(profile, setup.rig, setup.models)

@@ -49,7 +49,7 @@ def test_over_seeds_it_is_right_and_as_sure_as_it_is_right() -> None:
         late_ms.append(1e3 * (found.fit.placed.late_s - motion.late_s) / found.figures["late_sigma_ms"])
         place_sigmas.append(mm / found.figures["position_sigma_mm"])
         rotation_sigmas.append(deg / found.figures["rotation_sigma_deg"])
-        assert 0.03 < found.figures["strays"] < 0.1
+        assert 0.03 < found.figures["outlier_share"] < 0.1
         assert 1.5 < found.figures["position_mm"] < 3.5  # the cameras' noise, nothing else
     assert max(millimetres) < 1.5
     assert max(degrees) < 0.25
