@@ -1,1 +1,1 @@
-"""Publish and subscribe: messages enter by stream and name, readers get them."""
+"""Publish and subscribe: messages enter by stream and name, leave to readers."""

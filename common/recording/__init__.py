@@ -1,1 +1,1 @@
-"""Recordings on disk: messages and frames enter, and are read back exactly."""
+"""Recordings on disk: messages and frames enter, and leave exactly as they were."""

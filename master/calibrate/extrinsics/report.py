@@ -42,7 +42,7 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
     if fit.rms > _MOST_RMS or fit.outlier_share > _MOST_OUTLIERS:
         raise FitError(
             f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
-            f" {100 * fit.outlier_share:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"
+            f" {100 * fit.outlier_share:.0f} % are outliers. Is the hand file that of this hand and side, the laser plane"
             " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
         )
     rotation = max(

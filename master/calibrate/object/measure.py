@@ -92,7 +92,7 @@ def measure_object(seen: Seen) -> Measurement:
     worst = int(np.argmax(outlier_share))
     if outlier_share[worst] > _MOST_OUTLIERS:
         raise FitError(
-            f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of what was seen of it is somewhere else than the other"
+            f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of what was seen of it is elsewhere than the other"
             " beads say: is its colour taught, is nothing else of that colour in sight, are the cameras calibrated?"
         )
     if looks < FEWEST_LOOKS or float(sigma.max()) > _SIGMA_M:

@@ -136,7 +136,7 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         raise FitError(
             f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
             f" and {figures['rotation_deg']:.1f} deg"
-            f" are left, {100 * figures['outlier_share']:.0f} % strays. Does the tracker sit firmly on this object, is it the"
+            f" are left, {100 * figures['outlier_share']:.0f} % outliers. Does the tracker sit firmly on this object, is it the"
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []

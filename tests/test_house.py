@@ -1,10 +1,12 @@
 """The house rules that a machine can check. Every guard is shown a planted violation first, so that it bites."""
 
 import ast
+import io
 import os
 import re
 import subprocess
 import sys
+import tokenize
 import tomllib
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
@@ -63,6 +65,71 @@ PC_ONLY = {
     "common/recording/mcap_file.py": frozenset({"mcap"}),
     "common/recording/mcap_chunk.py": frozenset({"mcap", "zstandard"}),
 }
+# Words of version 0.1 for what estimation, vision, robotics and networking have words for.
+PRIVATE = frozenset(
+    {
+        "told",
+        "foretold",
+        "tells",
+        "telling",
+        "belief",
+        "beliefs",
+        "believed",
+        "habit",
+        "habits",
+        "doubt",
+        "doubts",
+        "certainty",
+        "misfit",
+        "surprise",
+        "surprised",
+        "heir",
+        "warden",
+        "hurry",
+        "twin",
+        "twins",
+        "whereabouts",
+        "rival",
+        "rivals",
+        "wearer",
+        "sighting",
+        "sightings",
+        "instant",
+        "instants",
+        "afresh",
+        "peek",
+        "stray",
+        "strayed",
+        "valley",
+        "valleys",
+        "mind",
+        "worth",
+        "heard",
+        "hear",
+        "hears",
+        "says",
+        "said",
+        "stranger",
+        "strangers",
+        "tally",
+        "gauges",
+        "lesson",
+        "lessons",
+        "taught",
+        "lasting",
+        "corridor",
+        "corridors",
+        "relit",
+        "picker",
+        "picking",
+        "flesh",
+        "mounting",
+    }
+)
+FIRST_LINE, FILE_LINES = 79, 640
+SHARED = frozenset({"common"})  # nothing enters or leaves the language of both sides
+# No more than there are: each change leaves fewer.
+MODULE_CONSTANTS, PROTOCOLS = 2150, 45
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(
     {
@@ -207,6 +274,72 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
             yield from _executed(child)
 
 
+def private_words(path: str, text: str) -> set[str]:
+    """Identifiers with a word that the field has another word for."""
+    names = {
+        token.string
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type == tokenize.NAME
+    }
+    return {
+        name
+        for name in names
+        if PRIVATE & {part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
+    }
+
+
+def long_first_lines(path: str, text: str) -> set[str]:
+    """Docstrings whose first line is longer than 79 characters."""
+    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    documented = [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+    lines = [(ast.get_docstring(node) or "").partition("\n")[0] for node in documented]
+    return {line for line in lines if len(line) > FIRST_LINE}
+
+
+def too_long(path: str, text: str) -> set[str]:
+    """A file with more lines than a reader holds in mind."""
+    lines = text.count("\n")
+    return {f"{lines} lines"} if lines > FILE_LINES else set()
+
+
+def room_without_sentence(path: str, text: str) -> set[str]:
+    """A room whose `__init__` does not say what it is for, what enters and what leaves."""
+    if not path.endswith("__init__.py"):
+        return set()
+    sentence = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+    said = ":" in sentence and "enter" in sentence and ("leave" in sentence or "go to" in sentence)
+    return set() if said or path.removesuffix("/__init__.py") in SHARED else {sentence or "nothing"}
+
+
+def module_constants(text: str) -> int:
+    """How many names of a module are bound to plain numbers."""
+    count = 0
+    for node in ast.parse(text).body:
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+        if isinstance(node, ast.AnnAssign) and value is not None and _is_number(value):
+            count += 1
+        elif targets and value is not None and _is_number(value):
+            count += len(targets)
+        elif targets and isinstance(value, ast.Tuple) and isinstance(targets[0], ast.Tuple):
+            count += sum(map(_is_number, value.elts))
+    return count
+
+
+def _is_number(node: ast.expr) -> bool:
+    if isinstance(node, ast.UnaryOp):
+        return _is_number(node.operand)
+    if isinstance(node, ast.BinOp):
+        return _is_number(node.left) and _is_number(node.right)
+    return isinstance(node, ast.Constant) and type(node.value) in (int, float)
+
+
+def protocols(text: str) -> int:
+    """How many seams a file declares."""
+    classes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ClassDef)]
+    return sum(any("Protocol" in ast.unparse(base) for base in node.bases) for node in classes)
+
+
 Guard = Callable[[str, str], set[str]]
 
 # guard, file it is planted in, violation, and a neighbour that is allowed
@@ -259,6 +392,16 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (import_time_work, "slave/app.py", "for i in x:\n    f(i)", "for i in x:\n    y[i] = f(i)"),
     (import_time_work, "slave/app.py", "while x:\n    y = x.pop()", "y = [f(i) for i in x]"),
     (import_time_work, "slave/app.py", "if X:\n    with lock:\n        y = 1", "if X:\n    y = 1"),
+    (private_words, "master/x.py", "def f(told_at): ...", "def f(result_at): ..."),
+    (private_words, "master/x.py", "class HandBelief: ...", "class HandPrior: ..."),
+    (long_first_lines, "master/x.py", f'"""{80 * "x"}"""', f'"""{79 * "x"}\n\n{80 * "x"}"""'),
+    (too_long, "master/x.py", 641 * "\n", 640 * "\n"),
+    (
+        room_without_sentence,
+        "master/x/__init__.py",
+        '"""All of x."""',
+        '"""All of x: pixels enter, hands leave."""',
+    ),
 ]
 GUARDS: list[Guard] = list(dict.fromkeys(guard for guard, *_ in PLANTED))
 
@@ -293,6 +436,26 @@ def test_only_the_command_line_prints() -> None:
 def test_package_keeps_the_rule(guard: Guard, package: str) -> None:
     wrong = {path: bad for path, text in sources(package) if (bad := guard(path, text))}
     assert not wrong
+
+
+def test_numbers_at_the_top_of_files_and_seams_become_fewer() -> None:
+    texts = [text for package in PACKAGES for _, text in sources(package)]
+    assert module_constants("A = 1\nB, C = 2.0, -3 * 4\nD = f(5)\nE: int = 6") == 4
+    assert protocols("class A(Protocol): ...\nclass B(Generic[T]): ...") == 1
+    assert sum(map(module_constants, texts)) <= MODULE_CONSTANTS
+    assert sum(map(protocols, texts)) <= PROTOCOLS
+
+
+def test_the_page_of_the_architecture_has_the_sentence_of_every_room() -> None:
+    page = (ROOT / "docs/architecture.md").read_text()
+    rooms = {
+        path.removesuffix("__init__.py"): (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+        for package in PACKAGES
+        for path, text in sources(package)
+        if path.endswith("__init__.py")
+    }
+    assert len(rooms) > 40
+    assert not {room for room, sentence in rooms.items() if f"| `{room}` | {sentence} |" not in page}
 
 
 QUIET = """
