@@ -80,6 +80,6 @@ def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[],
     def run() -> None:
         work()
         if not stopped():
-            raise ThreadEndedError("it returned before it was told to stop")
+            raise ThreadEndedError("it returned before it was asked to stop")
 
     return run

@@ -64,7 +64,7 @@ def _add_scene(demo: ArgumentParser) -> None:
         action="append",
         metavar="NAME",
         help="once for each that runs; default: desk, for scenes of both kinds desk-back3 (three markers on the back "
-        "tell how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4; "
+        "determine how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4; "
         "desk-fabrik is desk with the card's line alone; desk-cube and desk-tracker track objects, too; "
         "--rig desk --rig wrist has one hand",
     )
@@ -219,7 +219,7 @@ def _keys(command: ArgumentParser, what: str) -> None:
 
 
 def _reach(command: ArgumentParser) -> None:
-    command.add_argument("--dry-run", action="store_true", help="write nothing, say what would be done")
+    command.add_argument("--dry-run", action="store_true", help="write nothing, print what would be done")
     command.add_argument(
         "--deadline", type=_seconds, default=_DEADLINE_S, metavar="S", help="for all (default: %(default)g)"
     )

@@ -62,7 +62,7 @@ class Failures:
         try:
             return dict(query())
         except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
-            self.log("does not say how it is", error)
+            self.log("does not report its state", error)
             return {}
 
     def close(self, close: Callable[[], None]) -> None:

@@ -214,7 +214,9 @@ def _shift_ns(first: FrameRecording, part: FrameRecording, by_wall_clock: bool) 
 
 def _clock(part: FrameRecording) -> RecordedClock:
     if part.manifest.clock is None:
-        raise RecordingError(f"{part.folder}/recording.json: clock: missing; nothing says how its times lie")
+        raise RecordingError(
+            f"{part.folder}/recording.json: clock: missing; the clock of its times is unknown"
+        )
     return part.manifest.clock
 
 

@@ -34,7 +34,7 @@ from slave.wrist.reloadable import view_of, wrist_changes
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
     "{}: markers: no reference_bgr_linear, so the colours do not follow the light; calibrate again with "
-    "`phalanx-slave colours`, or say --colours fixed"
+    "`phalanx-slave colours`, or give --colours fixed"
 )
 NO_COLOUR = (
     "{}: markers: no colour for {} yet, which cannot be seen: pick them in the console, or calibrate them with "

@@ -166,13 +166,13 @@ def _short(value: float) -> str:
 def _why_alone(counts: Mapping[str, int]) -> str:
     """What to look at when no master has answered, by what was refused."""
     if counts.get("refused.foreign", 0):
-        return "a master is heard, but of another rig key (or another program): compare the key files of both sides"
+        return "a master is received, but of another rig key (or another program): compare the key files of both sides"
     if counts.get("refused.version", 0):
-        return "a master is heard, but of another version of the wire: install the same version on both sides"
-    if counts.get("refused.secret", 0):
         return (
-            "a master is heard, but not with the secret of this device: phalanx fleet deploy brings what fits"
+            "a master is received, but of another version of the wire: install the same version on both sides"
         )
+    if counts.get("refused.secret", 0):
+        return "a master is received, but not with the secret of this device: phalanx fleet deploy brings what fits"
     if counts.get("refused.duplicate_sender", 0):
-        return "a master is heard, but it has somebody of this name already: two slaves of one name?"
-    return "no master heard yet: is it running, and does its --beacon reach this network and port?"
+        return "a master is received, but it has somebody of this name already: two slaves of one name?"
+    return "no master received yet: is it running, and does its --beacon reach this network and port?"

@@ -95,7 +95,7 @@ def test_the_check_sees_an_option_that_nobody_declared() -> None:
         (("export", "x.npz", "--rate", "fast"), "fast: must be a number"),
         (("calibrate", "verify", "--angles", "-90:90:10", "--sigma-px", "-x"), "--sigma-px: expected one"),
         (("view", "--web-port", "0"), "0: must be at least 1"),
-        (("fleet", "keys", "DIR", "--revoke"), "--revoke: say which device was lost"),
+        (("fleet", "keys", "DIR", "--revoke"), "--revoke: name the lost device"),
         (("run", "--dry-run"), "--dry-run is for --install"),
         (("fleet", "relay", "--site", "a"), "--router ENDPOINT"),
     ],

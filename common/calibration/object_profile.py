@@ -108,7 +108,7 @@ def check_object(profile: ObjectProfile, where: str) -> None:
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else (0, 0)
         if len(points) < 3 or spread[1] < 5e-3:
             raise CalibrationError(
-                f"{where}: markers: three or more that do not lie in one line tell how it is turned"
+                f"{where}: markers: its orientation needs three or more that are not collinear"
             )
     tags = () if profile.tags is None else profile.tags.tags
     numbers = [tag.id for tag in tags]

@@ -126,7 +126,7 @@ def check_strobe(strobe: StrobeCalibration | None, fan_rad: float | None, where:
         return
     if fan_rad is None:
         raise CalibrationError(
-            f"{where}: laser.fan_rad: missing; strobe needs it to tell how much of the line enters an eye"
+            f"{where}: laser.fan_rad: missing; strobe needs it to determine how much of the line enters an eye"
         )
     for limit in limits_of(strobe, fan_rad):
         if limit.share > 1.0 and not limit.fault:

@@ -369,7 +369,7 @@ def couplings_of(profile: HandProfile) -> Couplings:
     couplings = preset_couplings(couplings) if isinstance(couplings, str) else couplings
     if couplings.dip_per_pip is None and couplings.dip_spread_rad > 0.0:
         raise CalibrationError(
-            f"hand {profile.name!r}: couplings.dip_spread_rad: there is no ratio to stray from while"
+            f"hand {profile.name!r}: couplings.dip_spread_rad: there is no ratio to deviate from while"
             " dip_per_pip is null; give dip_per_pip a ratio, or leave dip_spread_rad out"
         )
     return couplings

@@ -93,7 +93,9 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
     else:
         ns, units[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
     if max(abs(ns[0]), abs(ns[-1])) >= _MOST_NS:
-        raise RecordingError(f"time: {times[-1]} {units[TIME]} is beyond any clock: say --time-unit")
+        raise RecordingError(
+            f"time: {times[-1]} {units[TIME]} is out of range for any clock: give --time-unit"
+        )
     measured = np.isfinite(np.column_stack((scaled[GYRO], scaled[ACCEL]))).all(axis=1)
     names = {
         what: ", ".join(columns[what, axis].name for axis in axes)
@@ -269,6 +271,6 @@ def _time_unit(times: Sequence[Decimal], named: str, given: str | None) -> tuple
     fits = [unit for unit, scale in UNITS[TIME].items() if low < 1e9 / (step * scale) <= high]
     if not (unit := named or given or next(iter(fits), "")):
         raise RecordingError(
-            f"time: a step of {step:g} fits no unit: say --time-unit {'|'.join(UNITS[TIME])}"
+            f"time: a step of {step:g} fits no unit: give --time-unit {'|'.join(UNITS[TIME])}"
         )
     return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not stated'})"

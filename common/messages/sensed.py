@@ -80,7 +80,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
             return
         refuse_parts(self, "alt_uv")
         if not np.isnan(self.alt_uv[np.isnan(self.uv[:, 0])]).all():
-            raise ValueError("alt_uv: a rival of a marker that is not seen")
+            raise ValueError("alt_uv: an alternative to a marker that is not seen")
 
     @property
     def has_alternatives(self) -> bool:

@@ -265,7 +265,7 @@ def record_wrist_board(
         cameras={scene.camera.name: scene.camera},
         rig=rig or scene.rig,
         continuous=False,
-        note=f"board of {scene.columns} x {scene.rows} inner corners, {1e3 * scene.square_m:g} mm; each triple a pose",
+        note=f"board of {scene.columns} x {scene.rows} inner corners, {1e3 * scene.square_m:g} mm; one pose per cycle",
     )
     writer = RecordingWriter(folder, manifest)
     try:

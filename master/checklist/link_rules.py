@@ -105,7 +105,7 @@ class LinkRules:
             "duplicate_sender",
             name,
             duplicate is not None,
-            f"Two processes say that they are {name}; the one at {host} is not taken while the other is well.",
+            f"Two processes send as {name}; the one at {host} is ignored while the other works.",
             "End one of them, or give it its own name (--name) and files.",
         )
         host, version = (None, None) if unknown_peer is None else unknown_peer
@@ -120,7 +120,7 @@ class LinkRules:
             "secret_mismatch",
             name,
             sender.unproven is not None,
-            f"Somebody at {sender.unproven and sender.unproven.host} says that he is {name}, and has not the secret"
+            f"Somebody at {sender.unproven and sender.unproven.host} claims to be {name}, without the secret"
             " that this master has for it.",
             f"phalanx fleet deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone."
             " If that machine is not yours: phalanx fleet keys --revoke.",
@@ -186,7 +186,7 @@ class LinkRules:
                 name,
                 True,
                 f"The slave of IMU {name} is there, but no sample comes.",
-                "Is the IMU plugged in and switched on? The slave opens it again by itself; its log says more.",
+                "Is the IMU plugged in and switched on? The slave opens it again by itself; see its log.",
             )
         return Verdict(
             "imu_silent",

@@ -80,12 +80,12 @@ def add_board_shape(command: ArgumentParser) -> None:
         "--flat-board",
         action="store_true",
         help="the board is exact and flat (glass, screen): do not estimate its shape (default: as views held "
-        "out say)",
+        "out show)",
     )
     command.add_argument(
         "--bent-board",
         action="store_true",
-        help="estimate the board's own shape (default: as views held out say)",
+        help="estimate the board's own shape (default: as views held out show)",
     )
 
 
@@ -382,7 +382,7 @@ def hand(command: ArgumentParser) -> None:
     command.add_argument(
         "--side",
         choices=("left", "right"),
-        help="which hand; default: right, of --from as names or geometry say",
+        help="which hand; default: right, with --from: from names or geometry",
     )
     command.add_argument(
         "--length-mm",
@@ -418,7 +418,7 @@ def hand(command: ArgumentParser) -> None:
         action="store_true",
         help="with three markers on the back; only with --length-mm alone",
     )
-    command.add_argument("--steps", action="store_true", help="only tell the steps of the routine")
+    command.add_argument("--steps", action="store_true", help="only print the steps of the routine")
     command.add_argument("--live", action="store_true", help="do the routine now, before the running master")
     add_bus(command)
     command.add_argument(
@@ -432,6 +432,6 @@ def hand(command: ArgumentParser) -> None:
     command.add_argument(
         "--unit",
         choices=("m", "cm", "mm"),
-        help="of length in --from; default: as it says, else by the size of the hand",
+        help="of length in --from; default: as the file says, else by the size of the hand",
     )
     command.add_argument("--rate", type=number(), metavar="HZ", help="of a --from table without times")

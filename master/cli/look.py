@@ -79,7 +79,7 @@ def console(command: ArgumentParser) -> None:
         "--password-file",
         type=Path,
         metavar="FILE",
-        help="ask for the password in the first line of this file (default: one is made and said once)",
+        help="ask for the password in the first line of this file (default: one is made and printed once)",
     )
 
 

@@ -171,7 +171,7 @@ def export(command: ArgumentParser) -> None:
     command.add_argument(
         "--unit",
         choices=("m", "cm", "mm"),
-        help="of length in a bvh, default cm (all others have metres); in --compare FILE, default as it says",
+        help="of length in a bvh, default cm (all others have metres); in --compare FILE, default as FILE says",
     )
     command.add_argument(
         "--up",

@@ -77,7 +77,7 @@ def gestures(command: ArgumentParser) -> None:
         "--poses",
         type=Path,
         metavar="FILE",
-        help="poses.npz of a run: what its hand says; with --teach, where the examples are, each in a "
+        help="poses.npz of a run: report its gestures; with --teach, where the examples are, each in a "
         "--range",
     )
     command.add_argument(

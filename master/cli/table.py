@@ -238,7 +238,7 @@ TABLE: tuple[Command | Family, ...] = (
     Command(
         "fleet status",
         "machines",
-        "how each process of the rig is, or whether it is heard",
+        "how each process of the rig is, or whether it is received",
         "master.cli.fleet:status",
         "master.commands.fleet:status",
     ),

@@ -26,7 +26,7 @@ def keys(options: Namespace) -> None:
         _make(folder, devices)
     elif options.revoke:
         if not devices:
-            raise UsageError("--revoke: say which device was lost, --device NAME")
+            raise UsageError("--revoke: name the lost device, --device NAME")
         _new(folder, renew(folder, _now(), devices))
     elif options.renew and devices:
         for device in devices:

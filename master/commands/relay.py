@@ -35,7 +35,7 @@ def relay(options: Namespace) -> None:
         _route(options.listen, options.connect)
         return
     if options.router is None:
-        raise UsageError("--site: say where the router is, --router ENDPOINT")
+        raise UsageError("--site: give the address of the router, --router ENDPOINT")
     if options.connect:
         raise UsageError("--connect is for --listen")
     stop = stop_on_signals()

@@ -29,7 +29,7 @@ ExecStart={command}
 # After a fault (a signal, the watchdog, exit code 70) it starts at once. After an error that its user has to mend, and
 # that the journal names (exit code 1, a program that is not there), the next try waits: nothing loops hot.
 ExecStopPost=/bin/sh -c 'case "$$EXIT_CODE$$EXIT_STATUS" in exited0|exited70) ;; exited*) exec sleep {wait_s} ;; esac'
-# One that was told to stop stays stopped.
+# A process that was asked to stop stays stopped.
 Restart=on-failure
 RestartSec=100ms
 # The loop itself feeds the watchdog.

@@ -79,7 +79,7 @@ class UserServices:
                 f"{UNIT} does not run: {words}; {_LOG} has more. It is tried again, every {ERROR_WAIT_S} s; "
                 "phalanx run --uninstall removes it"
             ) from error
-        return f"{UNIT} runs; `systemctl --user status {UNIT}` shows how it is, `{_LOG}` what it said"
+        return f"{UNIT} runs; `systemctl --user status {UNIT}` shows how it is, `{_LOG}` its log"
 
     def remove(self, dry_run: bool) -> str:
         """Stop the service, remove its unit and return one line that reports it.

@@ -119,7 +119,7 @@ def here(
     try:
         ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", _START_S, imus=imus, wrists=wrists)
     except BusError as error:
-        raise BusError(f"{error}; if a master runs here, say where: --bus ENDPOINT") from error
+        raise BusError(f"{error}; if a master runs here, give its address: --bus ENDPOINT") from error
     try:
         return _counted(ingest, names, seconds, stop)
     finally:

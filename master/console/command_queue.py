@@ -47,7 +47,7 @@ class CommandQueue(Generic[AnswerT]):
         """
         self._waiting[key, part] = value
         if not self.busy:
-            self._task = background_tasks.create(self._work(), name="telling")
+            self._task = background_tasks.create(self._work(), name="commands")
 
     async def _work(self) -> None:
         while self._waiting:

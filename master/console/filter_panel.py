@@ -39,7 +39,7 @@ _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ..
         30.0,
         1,
         True,
-        "how quickly a change of speed is believed",
+        "how quickly the filter follows a change of speed",
     ),
     (
         "jitter_m",

@@ -99,13 +99,13 @@ def kept_password(folder: Path, notify: Callable[[str], None]) -> PasswordHash:
     path = folder / HASH_FILE
     if path.exists():
         notify(
-            f"console: the password is the one that was said when {path} was made; forgotten: delete that file"
+            f"console: the password is the one that was printed when {path} was made; forgotten: delete that file"
         )
         return PasswordHash.parse(_text(path), str(path))
     password = new_password()
     kept = PasswordHash.of(password)
     write_private(path, kept.text().encode())
-    notify(f"console: the password is {password}   (said only now; its hash is kept in {path})")
+    notify(f"console: the password is {password}   (shown only now; its hash is kept in {path})")
     return kept
 
 

@@ -68,7 +68,7 @@ def output_panel(state: ConsoleState) -> None:
         rows = {name: _row(name, settings, change) for name in OUTPUTS}
         start = ui.button("Start sending", icon="play_arrow").props("outline").classes("q-mt-sm")
         start.on_click(begin)
-        log = ui.label("").classes("mono").props('role="log" aria-label="What the sending process says"')
+        log = ui.label("").classes("mono").props('role="log" aria-label="Output of the sending process"')
 
     def update() -> None:
         report = state.health.get(NAME)

@@ -154,7 +154,7 @@ def play_panel(state: ConsoleState) -> None:
             play = ui.button("Play", icon="play_circle").props("unelevated")
         error = ui.label("").classes("problem").props('role="alert"')
         controls = Controls(state, error.set_text)
-        log = ui.label("").classes("mono").props('role="log" aria-label="What the player says"')
+        log = ui.label("").classes("mono").props('role="log" aria-label="Messages of the player"')
 
     async def toggle() -> None:
         error.set_text("")

@@ -57,7 +57,7 @@ def principal_line(points_m: Float) -> FingerLine:
         )
     if residual > _STRAIGHT * (high - low):
         raise FitError(
-            f"finger line: the points stray {1e3 * residual:.1f} mm from a line of {1e3 * (high - low):.1f} mm:"
+            f"finger line: the points deviate {1e3 * residual:.1f} mm from a line of {1e3 * (high - low):.1f} mm:"
             " only this finger should move"
         )
     origin = mean + low * direction

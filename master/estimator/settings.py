@@ -55,7 +55,7 @@ class Settings(NamedTuple):
     free_pip_rad: Annotated[float, Range("rad", 0.1, 3.0, _HANDS)] = radians(40.0)
     free_pip_mean_rad: Annotated[float, Range("rad", 0.0, 1.5, _HANDS)] = radians(30.0)
     natural_prior_weight: Annotated[
-        float, Range("1", 0.01, 0.99, "small: habits that fit win by their narrowness")
+        float, Range("1", 0.01, 0.99, "small: posture priors that fit win by their narrowness")
     ] = 1.0 / 3.0
     posture_widened: Annotated[
         float, Range("1", 1.0, 10.0, "by which a measured posture is wider of a hand that defies it")
@@ -80,14 +80,14 @@ class Settings(NamedTuple):
     process_noise_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
     palm_process_noise_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_held_rad_s: Annotated[
-        float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little tells how the palm turns")
+        float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little determines how the palm turns")
     ] = 0.9
     palm_process_noise_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
     ] = 1e-3
     component_memory_s: Annotated[
-        float, Range("s", 0.0, 5.0, "how fast a hand may change from habits to none")
+        float, Range("s", 0.0, 5.0, "how fast a hand may change from posture priors to none")
     ] = 0.3
     # Fingers that nobody sees.
     coast_s: Annotated[float, Range("s", 0.01, 1.0, _COORDINATION)] = 0.16
@@ -128,7 +128,10 @@ class Settings(NamedTuple):
     ] = 1e-2
     # Covariance.
     claimed: Annotated[
-        float, Range("1", 0.1, 100.0, "observations that the widths of habits count as; Kass, Wasserman 1995")
+        float,
+        Range(
+            "1", 0.1, 100.0, "observations that the widths of posture priors count as; Kass, Wasserman 1995"
+        ),
     ] = 1.0
     straight_rad: Annotated[
         float, Range("rad", 0.0, 1.0, "a turn by less is 0.2 mm off the tangent at the far end of a hand")
@@ -156,7 +159,8 @@ class Settings(NamedTuple):
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.03
     tracked_cycle_s: Annotated[
-        float, Range("s", 0.0, 1.0, "the same where a wrist device told it, of which triples come at 30 Hz")
+        float,
+        Range("s", 0.0, 1.0, "the same where a wrist device measured it, whose strobe cycles come at 30 Hz"),
     ] = 0.055
     # What is shown.
     blend_s: Annotated[float, Range("s", 0.01, 1.0, "as long as a leap is seen as a motion")] = 0.1
@@ -174,7 +178,7 @@ class Settings(NamedTuple):
         float, Range("1", 0.0, 1.0, "share of the PIP besides, of a hand of which nothing is known")
     ] = 0.2
     coupled_fingers: Annotated[
-        float, Range("1", 1.0, 1e5, "half bent fingers seen that this counts as, once each triple")
+        float, Range("1", 1.0, 1e5, "half bent fingers seen that this counts as, once each strobe cycle")
     ] = 60.0
     coupled_s: Annotated[float, Range("s", 1.0, 3600.0, "as long as a hand keeps to its own share")] = 60.0
     thumb_coupled_rad: Annotated[
@@ -195,7 +199,7 @@ class Settings(NamedTuple):
     parted: Annotated[float, Range("1", 0.05, 0.95, "of the lower top, between two parts of a density")] = 0.4
     other_part: Annotated[float, Range("1", 0.001, 0.5, "less probability than this is no other part")] = 0.05
     branch_rad: Annotated[
-        float, Range("rad", 0.5, 2.5, "PIP beyond which a laser point on the last phalanx tells two poses")
+        float, Range("rad", 0.5, 2.5, "PIP beyond which a laser point on the last phalanx fits two poses")
     ] = radians(95.0)
     goes_on_rad: Annotated[
         float, Range("rad", 0.02, 2.0, "by which a PIP may have moved at least since the finger was seen")
@@ -203,7 +207,7 @@ class Settings(NamedTuple):
     near_rad: Annotated[
         float, Range("rad", 0.1, 3.0, "about its last PIP in which a finger that is well known is searched")
     ] = radians(32.0)
-    search_again: Annotated[float, Range("1", 1.0, 100.0, "triples after which all of it is searched")] = 6.0
+    search_again: Annotated[float, Range("1", 1.0, 100.0, "strobe cycles after which all is searched")] = 6.0
     hinge_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "by which real hinges lie askew to those of a hand file")
     ] = radians(4.0)
@@ -225,7 +229,7 @@ class Settings(NamedTuple):
     light_share: Annotated[
         float,
         Range(
-            "1", 0.0, 1.0, "of what distances by light tell, that teaches their unit: fingers err together"
+            "1", 0.0, 1.0, "of what distances by light measure, used to fit their unit: fingers err together"
         ),
     ] = 0.15
     teaching_gate: Annotated[
@@ -239,7 +243,7 @@ class Settings(NamedTuple):
         float, Range("rad", 0.001, 0.5, "of a palm that was calibrated before its device")
     ] = radians(1.0)
     wrist_share: Annotated[
-        float, Range("1", 0.0, 1.0, "of what fingers tell of the wrist's bend: they err together")
+        float, Range("1", 0.0, 1.0, "of what fingers measure of the wrist's bend: they err together")
     ] = 0.6
     strap_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")

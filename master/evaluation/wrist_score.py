@@ -119,7 +119,7 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
         )
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(
-            f"{path}: not the truth of the {len(rows)} triples of camera {camera!r}: {error}"
+            f"{path}: not the truth of the {len(rows)} strobe cycles of camera {camera!r}: {error}"
         ) from error
 
 

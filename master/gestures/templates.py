@@ -123,7 +123,10 @@ def learn(
     _refuse_alike(name, shape, examples, others, within)
     agree = _agreement(name, examples)
     asked = [f"{span.low:.4g} to {span.high:.4g} {quantity}" for quantity, span in shape.ranges.items()]
-    stated = [f"{name}: told by {', '.join(asked)}", f"each example fits the others by {agree:.2f} or better"]
+    stated = [
+        f"{name}: distinguished by {', '.join(asked)}",
+        f"each example fits the others by {agree:.2f} or better",
+    ]
     stated += [_difference(other, of, examples) for other, of in others.items()]
     return PoseTemplate(
         shape, tuple(stated), {"examples": float(len(examples)), "agreement": round(agree, 3)}

@@ -104,7 +104,7 @@ def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, floa
     p, q = source[both], target[both]
     if both.any(axis=1).sum() < _LEAST_ROWS:
         raise FitError(
-            f"poses and motion capture share {int(both.any(axis=1).sum())} instants, at least {_LEAST_ROWS} are needed"
+            f"poses and motion capture share {int(both.any(axis=1).sum())} times, at least {_LEAST_ROWS} are needed"
         )
     _check_spread(p)
     weight, off = np.ones(len(p)), np.zeros(len(p))
@@ -126,7 +126,7 @@ def _check_spread(points: Float) -> None:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
     if spread < _LEAST_SPREAD_M * np.sqrt(len(points)):
         raise FitError(
-            "the points that poses and motion capture share lie on a line: no turn is told by them"
+            "the points that poses and motion capture share lie on a line: they determine no rotation"
         )
 
 

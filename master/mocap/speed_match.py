@@ -40,7 +40,7 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
         raise FitError(
             f"the speeds of poses and motion capture agree nowhere (correlation {max(score[best], 0.0):.2f} at best, of"
             f" {together * _STEP_NS * 1e-9:.1f} s or more together): the same hand at the same time? Where both have"
-            " one clock and one frame, say --aligned"
+            " one clock and one frame, give --aligned"
         )
     inner = score[best - 1 : best + 2]
     shift = 0.0

@@ -176,6 +176,6 @@ def unplaced_line(name: str, tracker: str) -> str:
     Its poses mean nothing there.
     """
     return (
-        f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
+        f"object {name}: its tracker {tracker} is not registered to the rig, its poses are not used:"
         f" `phalanx calibrate tracker {name}`"
     )

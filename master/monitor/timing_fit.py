@@ -31,7 +31,7 @@ from master.monitor.timing_evidence import Evidence
 
 TENTHS = 10  # of a block, the shortest batches
 RESIDUAL_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3
-"""Residual below which a unit is not believed to be better: centroids of a tenth of a pixel, at half a metre."""
+"""Residual below which a unit is not taken to be better: centroids of a tenth of a pixel, at half a metre."""
 _FITTED = 4  # constant, plane, offset
 _AT_LEAST = 8  # equations of a unit
 _FAR = 6.0  # medians of a normal distribution: 4 sigma

@@ -114,7 +114,7 @@ class ResultPicture:
         A lane for each kind of gesture that occurred.
         """
         axes = figure.add_axes(STRIP_BOX)
-        style(axes, "What the hand said")
+        style(axes, "Gestures of the hand")
         first, span = int(t_ns[0]), max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-3)
         lanes = [kind for kind in _LANES if any(one.kind == kind for one in self.gestures)]
         for lane, kind in enumerate(reversed(lanes)):

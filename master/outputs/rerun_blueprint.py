@@ -109,7 +109,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     events = rrb.TextLogView(origin=EVENTS, name="Events")
     tabs = rrb.Tabs(*plots[-_TABS:], events, legend_view, active_tab=0)
     lanes = rrb.StateTimelineView(
-        origin=STATES, name="What the hand says and holds", time_ranges=span if live else None
+        origin=STATES, name="Gestures and held objects", time_ranges=span if live else None
     )
     return rrb.Blueprint(
         rrb.Horizontal(

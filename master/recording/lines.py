@@ -163,7 +163,7 @@ class EventMonitor:
             elif self._master is not None and reloads != self._reloads:
                 self.changed = True
                 lines.append(
-                    f"{at} files of the rig were changed: from there on a replay is not what was told live"
+                    f"{at} files of the rig were changed: from there on a replay differs from the live output"
                 )
             self._master, self._reloads = message.session, reloads
         elif message.source == "recorder":

@@ -247,7 +247,7 @@ class _Run:
             self._master, self._reloads = health.session, health.counts.get("reload.applied", 0)
         if health.counts.get("reload.applied", 0) != self._reloads:
             self._reloads = health.counts.get("reload.applied", 0)
-            self._notify("files of the rig were changed: from here on a replay is not what was told live")
+            self._notify("files of the rig were changed: from here on a replay differs from the live output")
 
     def _lost(self) -> int:
         return self._gone_lost + (0 if self._lease is None else self._lease.lost)

@@ -18,7 +18,7 @@ from common.recording.frame_recording import FrameRecording
 from master.rig.setup import RigSetup
 
 _UNPLACED = (
-    "imu.q_palm_imu and imu.q_rig_world do not both say how the IMU is mounted and how its world lies to the rig; a "
+    "imu.q_palm_imu and imu.q_rig_world do not both state how the IMU is mounted and how its world lies to the rig; a "
     "wrist rig alone needs the former"
 )
 _LOG = logging.getLogger(__name__)

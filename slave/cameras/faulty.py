@@ -125,7 +125,9 @@ class FaultyCamera:
                     _LOG.warning("%s", error)
                 self._refuse_unplugged()
             if self._faults.raises:
-                raise RuntimeError(f"the driver of camera {self._camera.name!r} fails, says {self._path}")
+                raise RuntimeError(
+                    f"the driver of camera {self._camera.name!r} fails, as set in {self._path}"
+                )
             self._count += 1
             if self._count % self._faults.keep_one_in:
                 continue
@@ -159,7 +161,7 @@ class FaultyCamera:
 
     def _refuse_unplugged(self) -> None:
         if self._faults.unplugged:
-            raise CameraError(f"camera {self._camera.name!r} is unplugged, says {self._path}")
+            raise CameraError(f"camera {self._camera.name!r} is unplugged, as set in {self._path}")
 
     def _look(self) -> None:
         """Read the file if it was changed.

@@ -119,7 +119,7 @@ def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, objec
     if mode is None or "SyncMode" not in available:
         raise CameraError(
             f"--sync {options.sync}: this libcamera cannot synchronise cameras; update the system "
-            "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one instant"
+            "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one time"
         )
     # The number of frames until "ready" is set by the server (control_ids_rpi.yaml, SyncFrames).
     return {"SyncMode": mode} | ({"SyncFrames": SYNC_FRAMES} if options.sync == "server" else {})

@@ -181,7 +181,7 @@ class SyncMonitor:
         if not metadata.get("SyncReady"):
             return "libcamera began anew"
         if self._silent >= SILENT_FRAMES:
-            return f"the server was not heard for {self._silent} frames"
+            return f"nothing was received from the server for {self._silent} frames"
         return f"it was {self.error_us:.0f} us off"
 
 
@@ -221,7 +221,7 @@ def wait_in_step(
         if stopped():
             raise CameraError(f"{where}: stopped while it waited for {other}")
         if clock.now_ns() > end_ns:
-            received = "no server was heard" if timer is None else f"{timer} us were left"
+            received = "nothing was received from a server" if timer is None else f"{timer} us were left"
             raise CameraError(
                 f"{where}: --sync {role}: not in step after {timeout_s:g} s, {received}. "
                 "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "

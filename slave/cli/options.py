@@ -101,8 +101,8 @@ def add_simulated(command: ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="DIR",
-        help="calib_json tree that says how the simulated world is: lenses, places, paints, hand; this slave goes on "
-        "believing --calibration, where they may be unknown (default: it believes the truth)",
+        help="calib_json tree that describes the simulated world: lenses, places, paints, hand; this slave goes on "
+        "using --calibration, where they may be unknown (default: it uses the truth)",
     )
     add("--truth-rig", metavar="NAME", help="the rig in it, a file in DIR/rigs (default: of the same name)")
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")

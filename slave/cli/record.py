@@ -64,7 +64,7 @@ def record(command: ArgumentParser) -> None:
         nargs="?",
         const="synthetic",
         metavar="DRIVER",
-        help=f"what the rig's IMU says, too, as imu.csv: {REAL_IMUS}; without a driver, that of a synthetic camera",
+        help=f"samples of the rig's IMU, too, as imu.csv: {REAL_IMUS}; without a driver, that of a synthetic camera",
     )
     command.add_argument(
         "--every-frame",

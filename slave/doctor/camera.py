@@ -72,7 +72,7 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
             finally:
                 camera.close()
         except PhalanxError as error:
-            found.append(fail("camera", str(error), "as it says; docs/cameras.md has the rest"))
+            found.append(fail("camera", str(error), "as the error states; docs/cameras.md has the rest"))
         else:
             found.append(ok("camera", f"opens, has its settings, automatics off, {seen} frames read"))
 

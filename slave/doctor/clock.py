@@ -32,7 +32,7 @@ def check_clock(system: System, master: str | None) -> Iterator[Finding]:
     try:
         offset_s, rms_s = float(fields[OFFSET_S]), float(fields[RMS_S])
     except ValueError:
-        yield warn("clock", f"chronyd says {asked.out.strip()!r}", "sudo systemctl restart chrony")
+        yield warn("clock", f"chronyd reports {asked.out.strip()!r}", "sudo systemctl restart chrony")
         return
     yield _tracking(fields, offset_s, rms_s, master)
 

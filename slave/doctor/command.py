@@ -90,7 +90,7 @@ def _look(
         yield from check_camera(slave, unit.runs)
     else:
         sensor = "IMU" if slave.imu is not None else "tracker"
-        yield unseen("device", f"{sensor}: whether it answers, the service says")
+        yield unseen("device", f"{sensor}: the service reports whether it answers")
 
 
 def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":

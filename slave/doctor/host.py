@@ -114,7 +114,7 @@ def _memory_limit(system: System) -> Finding:
 def _throttled(system: System) -> Finding:
     flags = _flags(system)
     if flags is None:
-        return unseen("throttling", "no firmware of a Raspberry Pi that tells, no vcgencmd")
+        return unseen("throttling", "no Raspberry Pi firmware that reports it, no vcgencmd")
     now = [text for bit, text in BITS.items() if flags >> bit & 1]
     before = [text for bit, text in BITS.items() if flags >> (bit + SINCE) & 1 and text not in now]
     if not now and not before:

@@ -41,7 +41,9 @@ def check_master(
         file = keys / RIG_KEY
         key = rig_key(system.environment, file if file.exists() else None)
     except (PhalanxError, OSError) as error:
-        yield unseen("beacon", f"without a rig key no beacon can be told from a foreign one: {error}")
+        yield unseen(
+            "beacon", f"without a rig key no beacon can be distinguished from a foreign one: {error}"
+        )
         return
     yield _listen(SlaveLink("doctor", key, SystemClock(), os.urandom), port, bind, addresses)
 
@@ -70,7 +72,7 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
         )
     if refused:
         stated = ", ".join(f"{reason} {count}" for reason, count in refused.items())
-        return fail("beacon", f"heard, but not of this rig: {stated}", "compare rig.key of both sides")
+        return fail("beacon", f"received, but not of this rig: {stated}", "compare rig.key of both sides")
     return fail("beacon", f"none in {LISTEN_S:g} s on UDP port {port}", NOT_RECEIVED.format(port))
 
 

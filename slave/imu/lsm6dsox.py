@@ -180,7 +180,7 @@ class Lsm6dsoxImu:
         if identity != chip.IDENTITY:
             other = chip.OTHERS.get(identity, "another part")
             raise ImuError(
-                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX says {chip.IDENTITY:#04x}"
+                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {chip.IDENTITY:#04x}"
             )
         self._put(Register.CTRL3_C, chip.SW_RESET)
         for _ in range(RESET_POLLS):

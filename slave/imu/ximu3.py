@@ -200,7 +200,7 @@ class Ximu3Imu:
             received = f", though {self._bytes} bytes came" if self._bytes else ""
             raise ImuError(
                 f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
-                "another baud rate (behind @)? `phalanx-slave doctor --ports` says what is there"
+                "another baud rate (behind @)? `phalanx-slave doctor --ports` lists what is there"
             )
         answer = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
         _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._place.path, *answer)
@@ -276,7 +276,7 @@ class Ximu3Imu:
                 self._metric("battery_percent", message.values[0])
             case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= LOGGED:
                 _LOG.warning(
-                    "%s: the x-IMU3 says: %s", self._place.path, message.text.decode(errors="replace")
+                    "%s: the x-IMU3 reports: %s", self._place.path, message.text.decode(errors="replace")
                 )
             case _:
                 pass
@@ -343,7 +343,7 @@ def divisor(rate_hz: float) -> int:
 
 def _why(number: int | None, error: Exception) -> str:
     if number == ENOENT:
-        return "there is no such port; `phalanx-slave doctor --ports` says which there are"
+        return "there is no such port; `phalanx-slave doctor --ports` lists those there are"
     if number == EACCES:
         return "permission denied: `sudo usermod -aG dialout $USER`, then log in again"
     if number in (EBUSY, EWOULDBLOCK):

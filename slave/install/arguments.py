@@ -39,7 +39,7 @@ def add_install(parser: argparse.ArgumentParser) -> None:
         help="install these wheels (default: what this command runs from)",
     )
     parser.add_argument("--no-apt", action="store_true", help="install no packages of the system")
-    parser.add_argument("--dry-run", action="store_true", help="write nothing; say what would be changed")
+    parser.add_argument("--dry-run", action="store_true", help="write nothing; report what would be changed")
     ends = parser.add_mutually_exclusive_group()
     ends.add_argument(
         "--rollback",

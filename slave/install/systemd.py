@@ -173,5 +173,5 @@ class Systemd:
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         own = [line for line in lines if line.startswith("phalanx-slave:")]
         errors = [line for line in lines if "Error" in line]
-        ended = f"result {state.result}, status {state.status}" if state.status else "it says nothing"
+        ended = f"result {state.result}, status {state.status}" if state.status else "it reports nothing"
         return (own or errors or lines or [state.output or ended])[-1][:300]

@@ -102,7 +102,7 @@ class FlashDriverLights:
             return
         self._write(ENABLE, STANDBY)
         if (got := self._read(ENABLE)) & IS_ON:
-            raise LightsError(f"{self._where}: was sent to standby, and says 0x{got:02x}: it may be lit")
+            raise LightsError(f"{self._where}: was sent to standby, and reports 0x{got:02x}: it may be lit")
         self._count_faults()
 
     def close(self) -> None:

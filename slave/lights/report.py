@@ -34,7 +34,7 @@ def budget(rig: RigCalibration, camera: CameraCalibration) -> str:
     limits = limits_of(strobe, laser.fan_rad)
     return "\n".join(
         [
-            f"rig {rig.name}, camera {camera.name}: {1.0 / period_s:.1f} triples/s, exposure {camera.exposure_us:g} us",
+            f"rig {rig.name}, camera {camera.name}: {1.0 / period_s:.1f} cycles/s, exposure {camera.exposure_us:g} us",
             f"  each light  pulse {pulse_s * 1e6:.0f} us (at most {strobe.max_pulse_us:g})",
             f"              duty {duty:.3f} (at most {strobe.max_duty:g} of any second)",
             *_powers(strobe, duty),

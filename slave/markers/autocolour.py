@@ -115,7 +115,7 @@ def calibrate_moving(
     things = [things_of(image, k, around) for k, image in enumerate(images)]
     colours = find_colours(things, len(names), around)
     for colour in colours:
-        at_rest = "" if colour.moved else "; it rests, skin around it tells that it is paint"
+        at_rest = "" if colour.moved else "; it rests, skin around it shows that it is paint"
         notify(f"paint of hue {colour.hue:.0f}: in {len(colour.things)} of {len(images)} frames{at_rest}")
     named = namer(colours, places(colours, len(images)))
     if sorted(named) != sorted(names):
@@ -266,7 +266,7 @@ def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
         reasons += (
             f"; the desk itself is coloured (hues {desk[0]}..{desk[-1]}): paints of these hues drown in it"
         )
-    return reasons + "; red, orange and yellow paints cannot be told from skin"
+    return reasons + "; red, orange and yellow paints cannot be distinguished from skin"
 
 
 def _others(

@@ -140,7 +140,7 @@ def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
         if in_range(np.asarray(np.median(around, axis=0).round(), np.uint8), SKIN):
             raise FitError(
                 f"{where} is skin, or looks like it: click on the paint; paints that are red, orange or yellow cannot "
-                "be told from skin, so take another colour"
+                "be distinguished from skin, so take another colour"
             )
         raise FitError(
             f"{where} is not on a paint: saturation {np.median(around[:, 1]):.0f} of 255, brightness "

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 from common.errors import PhalanxError
 
-INSTALL = "install it with `pip install 'phalanx-hand[fast]'`, or say --engine numpy"
+INSTALL = "install it with `pip install 'phalanx-hand[fast]'`, or use --engine numpy"
 F = TypeVar("F", bound=Callable[..., object])
 
 

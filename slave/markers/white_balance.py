@@ -126,7 +126,7 @@ class WhiteBalance:
             )
             found.append(ColourWarning(None, text))
         if not self.proven:
-            text = f"the light is not known: show {PROOF} or more markers at once, so that it can be told from them"
+            text = f"the light is not known: show {PROOF} or more markers at once, so it can be measured from them"
             found.append(ColourWarning(None, text))
         return found
 

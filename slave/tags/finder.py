@@ -252,7 +252,7 @@ def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
         for tag in profile.tags.tags:
             if tag.id in owner:
                 raise CalibrationError(
-                    f"object {profile.name!r}: tags: {tag.id} is on object {owner[tag.id]!r}, too; a message tells them"
+                    f"object {profile.name!r}: tags: {tag.id} is on object {owner[tag.id]!r}, too; messages name tags"
                     " by their numbers alone"
                 )
             if tag.id >= GRIDS[family].tags:

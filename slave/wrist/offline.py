@@ -86,7 +86,7 @@ class WristRecordingFound:
 
     def summary(self) -> str:
         """One line for a person."""
-        parts = [f"{self.frames} frames", f"{len(self.detections.t_ns)} triples"]
+        parts = [f"{self.frames} frames", f"{len(self.detections.t_ns)} strobe cycles"]
         parts += [
             f"{event.replace('_', ' ')} {count}"
             for event, count in self.counts.items()

@@ -118,7 +118,7 @@ def test_what_was_not_measured_is_nan_and_counted_and_late_rows_are_left_out(tmp
         ("t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,0.1\n.01,0,0,0,0,0,0.1\n", "median force is 0.1.*--accel-unit"),
         (
             "t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,1\n1e-4,0,0,0,0,0,1\n",
-            "a step of 0.0001 fits no unit: say --time-unit",
+            "a step of 0.0001 fits no unit: give --time-unit",
         ),
         ("t,gx,gy,gz,ax_g,ay_mg,az_g\n0,0,0,0,0,0,1\n1,0,0,0,0,0,1\n", "accel: its columns say g and mg"),
         ("hello\n", "line 1: no header"),

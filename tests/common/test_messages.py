@@ -809,7 +809,7 @@ def test_constructors_refuse_what_does_not_fit() -> None:
         msgspec.structs.replace(sample_detections(), uv=np.zeros((6, 3)))
     with pytest.raises(ValueError, match="sigma_px: 0 is not within"):
         msgspec.structs.replace(sample_detections(), sigma_px=np.zeros(6))
-    with pytest.raises(ValueError, match="alt_uv: a rival of a marker that is not seen"):
+    with pytest.raises(ValueError, match="alt_uv: an alternative to a marker that is not seen"):
         msgspec.structs.replace(sample_detections(), alt_uv=np.ones((6, 2)))
     with pytest.raises(ValueError, match="at most 48"):
         sample_detections(MAX_MARKERS + 1)

@@ -84,7 +84,7 @@ def test_a_thread_that_returns_too_early_has_failed() -> None:
             time.sleep(20.0)
     """)
     assert done.returncode == EXIT_CODE
-    assert "before it was told to stop" in done.stderr
+    assert "before it was asked to stop" in done.stderr
 
 
 def test_the_planted_failure_is_what_ends_it() -> None:

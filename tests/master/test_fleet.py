@@ -126,5 +126,5 @@ def test_where_no_master_runs_the_start_is_given_and_datagrams_are_counted() -> 
         uplink.close()
     with pytest.raises(PhalanxError, match="rig 'desk' has no camera or IMU 'up'"):
         here(["up"], DESK, key, *ends, 1.0, threading.Event())
-    with pytest.raises(BusError, match="if a master runs here, say where: --bus ENDPOINT"):
+    with pytest.raises(BusError, match="if a master runs here, give its address: --bus ENDPOINT"):
         here(["left"], DESK, key, ends[0], ("192.0.2.1", port), 1.0, threading.Event())

@@ -241,7 +241,7 @@ def test_synchronised_cameras_start_with_the_first_common_frame(
 
 
 def test_nobody_to_synchronise_with_is_an_error_after_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(CameraError, match=r"not in step after .* s, no server was heard"):
+    with pytest.raises(CameraError, match=r"not in step after .* s, nothing was received from a server"):
         opened(monkeypatch, Sensor(sync_ready_at=None), Picamera2Options(sync="client", sync_timeout_s=0.01))
     with pytest.raises(CameraError, match="--sync server: not in step"):
         opened(monkeypatch, Sensor(sync_ready_at=None), Picamera2Options(sync="server", sync_timeout_s=0.01))

@@ -75,7 +75,10 @@ def test_a_server_that_is_no_longer_heard_is_a_lost_lock_and_comes_back(
     assert locked.index(False, READY_AT) == 270 + SILENT_FRAMES
     assert locked.index(True, 270 + SILENT_FRAMES) == 900
     assert watch.lost == 1
-    assert "no longer in step with the others: the server was not heard for 300 frames" in caplog.text
+    assert (
+        "no longer in step with the others: nothing was received from the server for 300 frames"
+        in caplog.text
+    )
     assert "in step again, after loss number 1" in caplog.text
 
 

@@ -196,7 +196,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
 @pytest.mark.parametrize(
     ("counts", "output"),
     [
-        ({"sent": 0}, "no master heard yet"),
+        ({"sent": 0}, "no master received yet"),
         ({"refused.foreign": 5}, "of another rig key"),
         ({"refused.version": 5}, "of another version"),
         ({"refused.secret": 5}, "not with the secret of this device"),

@@ -199,7 +199,7 @@ class WristTake:
             "angles": ANGLE_NAMES,
             "ambient": scene.ambient,
             "seed": scene.seed,
-            "note": "angles, joints and laser at the laser frame, finger tips at the LED frame of each triple",
+            "note": "angles, joints and laser at the laser frame, finger tips at the LED frame of each strobe cycle",
         }
 
     def _stamp(self, seq: int) -> int:

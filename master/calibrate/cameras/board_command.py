@@ -20,7 +20,7 @@ def board(options: Namespace) -> None:
         side = 29.0 if side is None else side
         marker = 0.75 * side if options.marker_mm is None else options.marker_mm
     elif options.marker_mm is not None:
-        raise UsageError("--marker-mm: a checkerboard has no markers; say --kind charuco")
+        raise UsageError("--marker-mm: a checkerboard has no markers; use --kind charuco")
     drawn = board_of(options.size or "9x6", 25.0 if side is None else side, marker, options.dictionary)
     print_board(options.out, drawn, options.paper)
     echo(f"wrote {options.out}: {drawn}, on {options.paper}. Print it at 100 % and measure the ruler: 100 mm")

@@ -99,7 +99,7 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
         rounds += 1
         if rounds % _HINT_ROUNDS == 0 and not here:
             echo(
-                "no slave answers: is it running, with the same rig key, and does --beacon reach it? Its log says more"
+                "no slave answers: is it running, with the same rig key, and does --beacon reach it? See its log"
             )
         if stop.wait(_POLL_S):
             raise CalibrationError("stopped before any slave was there")

@@ -101,7 +101,7 @@ def fit_cameras(
     flat = _fit(seen, alone, start, held, BoardChoice(bent=False))
     count = len({shot.place for shot in flat.shots})
     if count < MIN_SHAPE_VIEWS:
-        reason = f"{count} views are too few to tell its shape, at least {MIN_SHAPE_VIEWS} are needed"
+        reason = f"{count} views are too few to determine its shape, at least {MIN_SHAPE_VIEWS} are needed"
         return replace(flat, board=BoardChoice(bent=False, reason=reason))
     try:
         shaped = _fit(seen, alone, start, held, BoardChoice(bent=True))

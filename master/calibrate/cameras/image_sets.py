@@ -83,7 +83,7 @@ def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[
                 f"{folder}: no image is named {name}*; the names begin with {', '.join(prefixes) or 'numbers'}"
             )
     if not found:
-        raise RecordingError(f"{folder}: the images are numbered only: say whose they are with --camera NAME")
+        raise RecordingError(f"{folder}: the images are numbered only: name their camera with --camera NAME")
     return found
 
 

@@ -185,5 +185,5 @@ def _disagreement(own: Sequence[Shot], parted: set[str], times: float) -> str:
     who = " and ".join(names) if len(parted) == len(own) else "this camera and the others"
     return (
         f"{who} disagree on where the board is, {times:.1f} times the usual error: it moved between the exposures,"
-        " or these are images of two instants; used for the lens only"
+        " or these are images of two different times; used for the lens only"
     )

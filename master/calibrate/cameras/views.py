@@ -9,7 +9,7 @@ from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
 from master.calibrate.cameras.detect import ImageObservation, find_board
 
 ImageSet = Mapping[str, Callable[[], Image]]
-"""Images taken at one instant: camera -> how to load its image."""
+"""Images taken at one time: camera -> how to load its image."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ def extrinsics(options: Namespace) -> None:
         )
     if device.rig.imu is None:
         raise CalibrationError(
-            f"rig {device.file_name!r}: imu: missing; the bend of the wrist is told by it alone"
+            f"rig {device.file_name!r}: imu: missing; only the IMU measures the bend of the wrist"
         )
     opened = open_recording(options.recording)
     markers = opened.manifest.marker_rig()

@@ -87,7 +87,7 @@ def calibrate_extrinsics(
         CalibrationError: The rig lacks its laser plane, palm pose or IMU.
     """
     if rig.imu is None:
-        raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else tells how the wrist is bent")
+        raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else measures the bend of the wrist")
     if not (poses and cycles and samples):
         missing = "the markers" if not poses else "the wrist camera" if not cycles else "the IMU"
         raise FitError(f"{missing} saw nothing: {MOTION}")
@@ -162,7 +162,7 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
     """
     if len(hand.t_s) < _FEWEST or len(imu) < _FEWEST:
         raise FitError(
-            f"the markers told {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {_FEWEST} of"
+            f"markers gave {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {_FEWEST} of"
             f" each are needed: {MOTION}"
         )
     fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
@@ -173,7 +173,7 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
     rows = np.flatnonzero(both)
     if len(rows) < _FEWEST or np.ptp(seen.t_s[rows]) < _LEAST_S:
         raise FitError(
-            f"marker cameras and wrist device saw the hand together in {len(rows)} triples, at least {_FEWEST} of"
+            f"marker cameras and wrist device saw the hand together in {len(rows)} cycles, at least {_FEWEST} of"
             f" {_LEAST_S:.0f} s are needed: {MOTION}"
         )
     if imu.gap_s > GAP_S:

@@ -42,7 +42,7 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
     if fit.rms > _MOST_RMS or fit.outlier_share > _MOST_OUTLIERS:
         raise FitError(
             f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
-            f" {100 * fit.outlier_share:.0f} % are outliers. Is the hand file that of this hand and side, the laser plane"
+            f" {100 * fit.outlier_share:.0f} % outliers. Is the hand file that of this hand and side, the laser plane"
             " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
         )
     rotation = max(
@@ -91,8 +91,8 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
     )
     flexed, aside = (f"{low:+.0f} ... {high:+.0f} deg" for low, high in wrist_angles.T)
     lines = [
-        f"mounting from {len(fit.wrist_angles_rad)} of {count} triples, {seen}",
-        f"left: {what}; {100 * fit.outlier_share:.0f} % stray",
+        f"extrinsics from {len(fit.wrist_angles_rad)} of {count} strobe cycles, {seen}",
+        f"left: {what}; {100 * fit.outlier_share:.0f} % outliers",
         f"wrist bent {flexed}, aside {aside}; its mean is called straight",
         f"{'':24} {'found':>22} {'standard deviation':>20}",
     ]

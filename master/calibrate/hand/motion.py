@@ -171,7 +171,7 @@ def motion_lines(hand: MotionHand) -> list[str]:
     """The report for a person."""
     palm, found = hand.palm, hand.couplings
     lines = [*hand.motion.remarks]
-    text = "as its names or --side say" if hand.motion.side else "as its fingers bend"
+    text = "from its names or --side" if hand.motion.side else "as its fingers bend"
     lines.append(
         f"{palm.side} hand ({text}), {1e3 * hand.length_m:.0f} mm long, from {hand.frames} of {len(palm.outlier)}"
         f" frames; the palm's joints keep their places to {1e3 * palm.rms_m:.1f} mm"
@@ -180,7 +180,7 @@ def motion_lines(hand: MotionHand) -> list[str]:
         other = "left" if palm.side == "right" else "right"
         lines.append(
             f"its geometry is that of a {other} hand: its axes are left-handed (Unity, Unreal) and were turned over;"
-            f" if it is a {other} hand, say --side {other}"
+            f" if it is a {other} hand, give --side {other}"
         )
     lines.append(f"{'bone':30}{'mm':>8}{'spread':>8}")
     for finger, label in enumerate(FINGERS):

@@ -96,7 +96,7 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
         couplings, taken = replace(couplings, dip_per_pip=dip.per_pip, dip_spread_rad=dip.spread_rad), True
     if mcp.spread_rad > _NO_COUPLING_RAD or mcp.per_pip <= 0.0:
         remarks.append(
-            f"MCP strays by {np.degrees(mcp.spread_rad):.0f}° from {mcp.per_pip:.2f} PIP: no habit is told; the default"
+            f"MCP deviates by {np.degrees(mcp.spread_rad):.0f}° from {mcp.per_pip:.2f} PIP: no coupling; the default"
             " stays"
         )
     else:

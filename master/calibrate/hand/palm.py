@@ -129,6 +129,6 @@ def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
         raise FitError(
             f"{where}: fingers bend about an axis that is {along['right']:+.2f} that of a right hand and"
             f" {along['left']:+.2f} that of a left one, where +1 is expected of one alone: record fists; if names were"
-            " matched wrongly, say --joints"
+            " matched wrongly, give --joints"
         )
     return right[0]

@@ -98,7 +98,7 @@ def names_of(
     names = given or (tuple(base.markers) if base is not None and base.markers else rig.free_markers)
     if len(names) < 3 or len(set(names)) < len(names):
         raise CalibrationError(
-            "--markers: three different beads or more tell how an object is turned, these are"
+            "--markers: three different beads or more determine the orientation of an object, these are"
             f" {', '.join(names) or 'none'}"
         )
     rows_of(rig, names)

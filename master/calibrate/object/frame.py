@@ -56,7 +56,7 @@ def frame_of(
     spread = np.linalg.svd(there - there.mean(axis=0), compute_uv=False) if len(shared) > 2 else np.zeros(3)
     if len(shared) < 3 or spread[1] < LINE_M:
         raise FitError(
-            f"{where}: has {len(shared)} of the beads {', '.join(names)}; three that are not in one line tell its frame"
+            f"{where}: has {len(shared)} of the beads {', '.join(names)}; its frame needs three not collinear"
         )
     T = fit_rigid(there, beads_m[shared])
     off = np.linalg.norm(transform(T, beads_m[shared]) - there, axis=1)

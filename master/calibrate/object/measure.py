@@ -92,8 +92,8 @@ def measure_object(seen: Seen) -> Measurement:
     worst = int(np.argmax(outlier_share))
     if outlier_share[worst] > _MOST_OUTLIERS:
         raise FitError(
-            f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of what was seen of it is elsewhere than the other"
-            " beads say: is its colour taught, is nothing else of that colour in sight, are the cameras calibrated?"
+            f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of its views are elsewhere than the other"
+            " beads show: is its colour calibrated, is nothing else of that colour seen, are the cameras calibrated?"
         )
     if looks < FEWEST_LOOKS or float(sigma.max()) > _SIGMA_M:
         raise FitError(
@@ -119,7 +119,7 @@ def refuse_insufficient(seen: Seen) -> None:
     )
     how = "all beads" if len(seen.names) == 3 else "three beads or more"
     raise FitError(
-        f"{how} are seen by two cameras at {together} of {len(seen.t_s)} instants, at least {FEWEST} are needed"
+        f"{how} are seen by two cameras at {together} of {len(seen.t_s)} epochs, at least {FEWEST} are needed"
         f" ({each}): {MOTION}"
     )
 

@@ -26,7 +26,7 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
     left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
     figure = figure_of((16.0, 8.4))
-    figure.suptitle(f"{profile.name}: {len(bundle.T)} instants in {found.looks} ways of turning and places")
+    figure.suptitle(f"{profile.name}: {len(bundle.T)} epochs in {found.looks} ways of turning and places")
     *sides, time = figure.subplots(2, 2).ravel()
     for axes, (a, b) in zip(sides, ((0, 1), (0, 2), (1, 2)), strict=True):
         for row, name in enumerate(found.names):
@@ -45,7 +45,7 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
             bundle.seen.t_s, np.where(outlier, np.nan, size), ".", markersize=3, color=colour, label=name
         )
         time.plot(bundle.seen.t_s[outlier], size[outlier], "x", markersize=4, color=GREY)
-    time.set(title="from the rigid body [mm]; crosses: strays", xlabel="time [s]")
+    time.set(title="from the rigid body [mm]; crosses: outliers", xlabel="time [s]")
     time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
     time.legend(fontsize=8, markerscale=3)
     saved(figure, path)

@@ -94,7 +94,7 @@ def report_lines(found: Measurement, profile: ObjectProfile, misses: Mapping[str
     bundle = found.bundle
     whole = int(bundle.seen.known.all(axis=1).sum())
     lines = [
-        f"{len(bundle.T)} instants, {whole} with all beads; turned and carried to {found.looks} ways",
+        f"{len(bundle.T)} epochs, {whole} with all beads; turned and carried to {found.looks} ways",
         f"{'bead':12} {'x':>8} {'y':>8} {'z':>8} {'+-':>6} {'left':>6} {'outlier_share':>7}   [mm]",
     ]
     for row, name in enumerate(found.names):

@@ -90,4 +90,4 @@ def progress(seen: Seen) -> tuple[str, bool]:
         hint = "turn it about another axis, and carry it elsewhere"
     else:
         hint = "go on like this"
-    return f"{100 * share:3.0f} %  {whole} instants, {looks} ways of turning and places. {hint}", share >= 1.0
+    return f"{100 * share:3.0f} %  {whole} epochs, {looks} ways of turning and places. {hint}", share >= 1.0

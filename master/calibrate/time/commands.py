@@ -81,7 +81,7 @@ def measure(
     """
     if not recording.manifest.continuous:
         raise CalibrationError(
-            f"{recording.folder}: its frames are unrelated poses (continuous is false): a time is told by motion only"
+            f"{recording.folder}: its frames are unrelated poses (continuous is false): a time offset needs motion"
         )
     if len(rig.cameras) < 2:
         raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")

@@ -122,7 +122,7 @@ def _refusal(
         f"{name}: {seconds:.1f} s, {speed:.0f} px/s"
         for name, (seconds, speed) in _motion(messages, (reference, camera))
     )
-    return f"the time of camera {camera!r} cannot be told{known}; markers seen and their speed: {parts}. {_ADVICE}"
+    return f"the time of camera {camera!r} cannot be measured{known}; markers seen and their speed: {parts}. {_ADVICE}"
 
 
 def _motion(

@@ -73,7 +73,7 @@ def profile_of(calibration: Path, name: str, device: str | None) -> ObjectProfil
         )
     if not profile.markers and profile.tags is None:
         raise CalibrationError(
-            f"{path}: neither markers nor tags: cameras cannot see where the object is, and nothing else tells where "
+            f"{path}: neither markers nor tags: cameras cannot see where the object is, and nothing else shows where "
             "the tracker sits on it"
         )
     return profile

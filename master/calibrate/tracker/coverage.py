@@ -20,7 +20,7 @@ _ADVICE = {
     "seconds": f"go on until cameras and tracker have seen it together for {LEAST_S:.0f} s",
     "rotation": "turn it about its {axes} axis as well, a quarter turn and back",
     "way": "carry it a hand's width and more to all sides, nearer and farther",
-    "pace": "move it faster, about once to and fro in two seconds: nothing else tells the lag of the clocks",
+    "pace": "move it faster, about once to and fro in two seconds: only that measures the lag of the clocks",
 }
 
 

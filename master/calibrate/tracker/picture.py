@@ -36,7 +36,9 @@ def draw_registration(path: Path, found: Registration) -> None:
         axes.plot(
             seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
         )
-        axes.plot(seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="stray")
+        axes.plot(
+            seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="outlier"
+        )
         axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
         axes.set_aspect("equal", adjustable="datalim")
         axes.legend(fontsize=8)

@@ -68,12 +68,12 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
         FitError: The motion was not done, was not seen, does not constrain the registration, or none explains it.
     """
     if not (objects and tracked):
-        raise FitError(f"{'the cameras' if not objects else 'the tracker'} told nothing: {MOTION}")
+        raise FitError(f"{'the cameras' if not objects else 'the tracker'} reported nothing: {MOTION}")
     zero_ns = min(objects[0].t_ns, tracked[0].t_ns)
     seen, device = object_track(objects, zero_ns), tracker_track(tracked, zero_ns)
     if len(seen) < _FEWEST or len(device) < _FEWEST:
         raise FitError(
-            f"the cameras told {len(seen)} poses, the tracker {len(device)}; at least {_FEWEST} of each are needed:"
+            f"the cameras gave {len(seen)} poses, the tracker {len(device)}; at least {_FEWEST} of each are needed:"
             f" {MOTION}"
         )
     late_s = first_lag(seen, device)
@@ -136,7 +136,7 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         raise FitError(
             f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
             f" and {figures['rotation_deg']:.1f} deg"
-            f" are left, {100 * figures['outlier_share']:.0f} % outliers. Does the tracker sit firmly on this object, is it the"
+            f" left, {100 * figures['outlier_share']:.0f} % outliers. Is the tracker firm on this object, is it the"
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []
@@ -163,8 +163,8 @@ def report_lines(fit: Fit, figures: dict[str, float], coverage: Coverage) -> tup
     lag = f"its poses hold {1e3 * placed.late_s:+.1f} ms after their stamps"
     sure = f"{shown['position_sigma_mm']} mm, {shown['rotation_sigma_deg']} deg"
     return (
-        f"{len(fit.t_s)} instants; {coverage.line()}",
-        f"{left}; off by {fit.scale:.2f} times what was foretold",
+        f"{len(fit.t_s)} epochs; {coverage.line()}",
+        f"{left}; off by {fit.scale:.2f} times what was predicted",
         f"the tracking system's origin lies at {system[0]:.0f} {system[1]:.0f} {system[2]:.0f} mm of the rig",
         f"the device sits at {device[0]:.1f} {device[1]:.1f} {device[2]:.1f} mm of the object",
         f"{lag} (standard deviation {shown['late_sigma_ms']} ms)",

@@ -67,9 +67,7 @@ class Session:
         Empty: both send.
         """
         if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
-            return (
-                "no tracker is heard: is `phalanx-slave run --tracker` running, and does the master know it?"
-            )
+            return "no tracker data received: is `phalanx-slave run --tracker` running, and does the master know it?"
         if not np.isfinite([one.position_m for one in self.tracked[-20:]]).any():
             return "the tracker does not know where it is: let it see a base station"
         if not _recent([one.t_ns for one in self.objects[-1:]], now_ns):

@@ -193,7 +193,7 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
     )
     if fit.cross_validated_rms > _WORST_RMS:
         raise FitError(
-            f"the light of the white squares strays {100 * fit.cross_validated_rms:.1f} % from any flat field (limit"
+            f"the light of the white squares deviates {100 * fit.cross_validated_rms:.1f} % from any flat field (limit"
             f" {100 * _WORST_RMS:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
         )
     return fit

@@ -64,7 +64,7 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
     whole = [view for view in views if {Illumination.AMBIENT, needed} <= view.frames.keys()]
     if not whole:
         raise RecordingError(
-            f"{folder}: no frame lit by the {needed} with an ambient one beside it: a recording says in frames.csv"
+            f"{folder}: no frame lit by the {needed} with an ambient one beside it: a recording states in frames.csv"
             f" what lit each frame; images are named VIEW_ambient.png, VIEW_{needed}.png"
         )
     chosen = np.unique(np.linspace(0, len(whole) - 1, min(MOST_VIEWS, len(whole))).round().astype(int))

@@ -249,7 +249,7 @@ def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
 
 def _collinear(wide_m: float) -> str:
     return (
-        f"all points of the laser lie on one line (they spread {1e3 * wide_m:.1f} mm across it): no plane is told;"
+        f"all points of the laser lie on one line (they spread {1e3 * wide_m:.1f} mm across it): they define no plane;"
         " hold the board at other distances too, and turn it, so that the line falls elsewhere"
     )
 

@@ -187,7 +187,7 @@ def _check_likely(fit: Fit) -> None:
     ):
         raise FitError(
             f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
-            f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
+            f" fingers {fit.unlike:.1f} times from their posture prior, and {_name(worst)} {pull[worst]:.1f} standard"
             " deviations from the file; is the hand file that of this hand and side, the laser plane measured, and"
             f" the palm's pose right to a centimetre and ten degrees? The motion is: {MOTION}"
         )
@@ -216,8 +216,8 @@ def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
     rotation, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
     lines = [
-        f"subject from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
-        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.prior_rms:.1f} of belief",
+        f"subject from {len(fit.fist)} of {count} cycles and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
+        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.prior_rms:.1f} of prior",
         f"palm turned by {rotation:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
         f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
         f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",
@@ -233,7 +233,7 @@ def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
             f" {np.exp(new.long[f]):6.3f} ±{sigma.long[f]:6.3f}"
         )
     lines.append(
-        "± are standard deviations; what is as large as its belief (3 mm, 0.10, 0.04) was not seen and kept from it"
+        "± are standard deviations; a value as large as its prior (3 mm, 0.10, 0.04) was not observed and stays at it"
     )
     return tuple(lines)
 

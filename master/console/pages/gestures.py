@@ -90,8 +90,8 @@ def _dial(angle_rad: float | None) -> str:
 
 
 def _show_events(state: ConsoleState) -> None:
-    with ui.element("section").classes("panel").props('aria-label="Said last"'):
-        ui.label("Said last").classes("panel-title")
+    with ui.element("section").classes("panel").props('aria-label="Last gestures"'):
+        ui.label("Last gestures").classes("panel-title")
         content = ui.html("", sanitize=False).classes("gesture-said")
 
     def update() -> None:
@@ -132,7 +132,7 @@ def _poses(state: ConsoleState) -> None:
             ui.button("Teach", icon="school", on_click=lambda: teach()).props("unelevated")
             known = ui.select([], label="Known poses").props("dense outlined").classes("known-poses")
             ui.button("Forget", icon="delete", on_click=lambda: forget()).props("outline")
-        progress = ui.label("").classes("mono").props('role="log" aria-label="What the teaching says"')
+        progress = ui.label("").classes("mono").props('role="log" aria-label="Output of the teaching"')
 
     def command(*words: str) -> list[str]:
         tree = ["--calibration", str(state.settings.calibration)]

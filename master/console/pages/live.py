@@ -144,4 +144,4 @@ def _why_none(state: ConsoleState) -> str:
         return state.link.reason
     if "master" not in state.alive:
         return "No master runs. The Set-up page starts one, or: phalanx run"
-    return "The master sees no hand. Is it before all cameras? The Checklist page says what is wrong."
+    return "The master sees no hand. Is it before all cameras? The Checklist page shows what is wrong."

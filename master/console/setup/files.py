@@ -135,7 +135,7 @@ def write_cameras(tree: Path, plan: Plan) -> list[Path]:
     """
     names = [camera.name for camera in plan.cameras]
     if len(names) < 2:
-        raise CalibrationError("cameras: two or more are needed, since one alone tells no distance")
+        raise CalibrationError("cameras: two or more are needed, since one alone measures no distance")
     if twice := [name for name in names if names.count(name) > 1]:
         raise CalibrationError(f"cameras: {twice[0]!r} stands twice; give each a name of its own")
     written: list[Path] = []

@@ -41,7 +41,7 @@ def job_view(
         bar = ui.linear_progress(value=0.0, show_value=False).props('aria-label="progress"').classes("w-full")
         last = ui.label().classes("text-h6 setup-text").props('aria-live="polite" data-testid="last-line"')
         buttons = ui.row()
-        lines = ui.label().classes("setup-lines").props('tabindex=0 role="log" aria-label="All it said"')
+        lines = ui.label().classes("setup-lines").props('tabindex=0 role="log" aria-label="All output"')
     result = ui.column().classes("w-full")
 
     def follow() -> None:

@@ -96,7 +96,7 @@ class _Rows:
             truth = ui.input("Folder of the simulated world", value=self._truth).classes("w-full max-w-xl")
             truth.on_value_change(lambda event: self._see(event.value))
             ui.label(
-                "Simulated cameras see a drawn hand. What they are told is measured from their pictures, as with"
+                "Simulated cameras see a drawn hand. Their calibration is measured from their pictures, as with"
                 " real ones; only the paints and lenses of that world stand in its folder."
             ).classes("setup-text")
 

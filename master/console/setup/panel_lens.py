@@ -72,7 +72,9 @@ def judged(numbers: dict[str, object]) -> str:
     poor = [name for name, lens in _lenses(numbers).items() if lens]
     text = f"Corners fit to {rms:.2f} px; squares come out alike to {100 * max(off, default=0.0):.1f} %. "
     if rms > POOR_PX or max(off, default=0.0) > 5 * _SQUARES_SHARE:
-        return text + "Repeat it: the board moved, is not flat, or its squares are of another size than told."
+        return (
+            text + "Repeat it: the board moved, is not flat, or its squares are of another size than stated."
+        )
     if rms > GOOD_PX or max(off, default=0.0) > 2 * _SQUARES_SHARE:
         return text + "Fair: usable; more views, held stiller, would make it better."
     more = f" It would gain most by more views for {', '.join(poor)}: in corners and tilted." if poor else ""

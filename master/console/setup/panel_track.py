@@ -12,9 +12,7 @@ _POLL_S = 0.5
 def build(desk: Desk) -> None:
     """Fill the panel."""
     session = desk.session
-    heading(
-        "Track", "The master makes a hand of what the cameras see, and tells what is not as it should be."
-    )
+    heading("Track", "The master estimates the hand from what the cameras see, and reports what is wrong.")
 
     def go() -> bool:
         if not session.tracks:

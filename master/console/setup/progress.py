@@ -46,4 +46,4 @@ def fault(lines: Iterable[str]) -> str:
             return " ".join([line.partition(": ")[2], *printed[place + 1 :]])
         if ": error: " in line:  # wrong usage
             return line.partition(": error: ")[2]
-    return printed[-1] if printed else "it said nothing"
+    return printed[-1] if printed else "it printed nothing"

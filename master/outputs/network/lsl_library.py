@@ -124,6 +124,6 @@ def load_library(scope: str, bound_scope: str | None) -> Library:
         except NotImplementedError as error:
             raise PhalanxError(
                 f"liblsl is older than 1.17.7 and cannot be kept to this machine: {INSTALL};"
-                " or say lsl.scope network"
+                " or set lsl.scope network"
             ) from error
     return library

@@ -223,7 +223,9 @@ class WebServer:
         if (trouble := foreign(request.headers, self._names)) is not None:
             return _refusal(HTTPStatus.FORBIDDEN, trouble)
         if not self._knows(request):
-            return _refusal(HTTPStatus.UNAUTHORIZED, "open the address with ?key= that `phalanx send` said")
+            return _refusal(
+                HTTPStatus.UNAUTHORIZED, "open the address with ?key= that `phalanx send` printed"
+            )
         if path in self._files:
             kind, body = self._files[path]
             answer = _response(HTTPStatus.OK, kind, body)

@@ -49,7 +49,7 @@ class Column:
 
 def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
     """A hand's poses; `begin_t_ns` is second 0."""
-    out = [*_times(poses.t_ns, begin_t_ns, "the instant at which the pose holds")]
+    out = [*_times(poses.t_ns, begin_t_ns, "the time at which the pose holds")]
     for joint, title in enumerate(JOINTS):
         out += _joint_columns(poses, joint, title)
     for finger, title in enumerate(FINGERS):
@@ -92,7 +92,7 @@ def _joint_columns(poses: Poses, joint: int, title: str) -> Iterator[Column]:
 def object_columns(poses: ObjectPoses, begin_t_ns: int) -> list[Column]:
     """An object's poses."""
     return [
-        *_times(poses.t_ns, begin_t_ns, "the instant at which the pose holds"),
+        *_times(poses.t_ns, begin_t_ns, "the time at which the pose holds"),
         *_place("", poses.position_m, "position of the object's own frame"),
         *_quaternion("", poses.orientation_wxyz, "orientation, object axes to rig"),
         *(

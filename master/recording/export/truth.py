@@ -87,7 +87,7 @@ def compare_source(
     found = figures(compared)
     if found["joint_mm"] is None and not np.isfinite(compared.marker_mm).any():
         raise RecordingError(
-            f"{truth}: at no instant of the poses of {source} does it know a point that they have"
+            f"{truth}: at no time of the poses of {source} does it know a point that they have"
         )
     for line in table_lines(found):
         notify(line)

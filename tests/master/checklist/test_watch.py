@@ -268,7 +268,7 @@ CASES = [
         "right",
         _unproven,
         _as_ours,
-        "10.0.0.9 says that he is right",
+        "10.0.0.9 claims to be right",
         "device-right.secret",
     ),
     Case(

@@ -86,7 +86,7 @@ def test_what_went_wrong_is_the_commands_own_sentence() -> None:
     lines = ["reading", "phalanx: views: 2 views kept; a calibration needs 5"]
     assert fault(lines) == "views: 2 views kept; a calibration needs 5"
     assert fault(_wrong_usage()).startswith("the following arguments are required: SOURCE, --board")
-    assert fault([]) == "it said nothing"
+    assert fault([]) == "it printed nothing"
 
 
 def _wrong_usage() -> list[str]:

@@ -131,7 +131,7 @@ def test_the_impossible_is_reported() -> None:
     with pytest.raises(ImuError, match=r"imu.rate_hz: 800 Hz: .* at most 417 Hz"):
         rate_of(800.0)
     with pytest.raises(
-        ImuError, match=r"I2C bus 1, address 0x6a: WHO_AM_I is 0xea, ICM-20948; an LSM6DSOX says 0x6c"
+        ImuError, match=r"I2C bus 1, address 0x6a: WHO_AM_I is 0xea, ICM-20948; an LSM6DSOX reports 0x6c"
     ):
         opened(FakeLsm6dsox(identity=0xEA))
     with pytest.raises(ImuError, match=r"I2C bus 1, address 0x6b: nobody answers: .*i2cdetect -y 1"):

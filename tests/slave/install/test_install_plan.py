@@ -275,7 +275,7 @@ def test_a_service_that_asks_for_time_to_start_has_it_once() -> None:
     with pytest.raises(NotReadyError, match="a is not ready after 180 s: compiles"):
         services("compiles: may take 180 s", 1e9).wait_ready({"a": 10.0}, 2.0)
     clock[0] = 0.0
-    with pytest.raises(NotReadyError, match="a is not ready after 10 s: it says nothing"):
+    with pytest.raises(NotReadyError, match="a is not ready after 10 s: it reports nothing"):
         services("", 1e9).wait_ready({"a": 10.0}, 2.0)
 
 

@@ -89,7 +89,7 @@ def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[st
     assert main(["doctor", "--lights", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]) == 0
     output = capsys.readouterr().out
     for line in (
-        "30.0 triples/s, exposure 2000 us",
+        "30.0 cycles/s, exposure 2000 us",
         "pulse 3200 us (at most 5000)",
         "duty 0.096 (at most 0.12",
         "together 315 mW (at most 400)",

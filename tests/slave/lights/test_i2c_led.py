@@ -222,7 +222,7 @@ def test_a_chip_that_does_not_go_dark_is_said(chip: Chip) -> None:
     lights = FlashDriverLights("1", STROBE)
     lights.switch(LASER)
     chip.deaf = {0x01}
-    with pytest.raises(LightsError, match="was sent to standby, and says 0x0d: it may be lit"):
+    with pytest.raises(LightsError, match="was sent to standby, and reports 0x0d: it may be lit"):
         lights.off()
 
 

@@ -281,6 +281,6 @@ def test_few_views_take_the_board_as_drawn_and_say_so() -> None:
     views = scene(23, 1, views=7, shape_mm=0.3).views(NOISE_PX, 23)
     fit = fit_cameras(views)
     assert not fit.board.bent
-    assert "7 views are too few to tell its shape, at least 8" in fit.board.reason
+    assert "7 views are too few to determine its shape, at least 8" in fit.board.reason
     with pytest.raises(FitError, match="7 good views are too few for the board's own shape"):
         fit_cameras(views, bent=True)

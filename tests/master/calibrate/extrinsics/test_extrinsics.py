@@ -111,7 +111,7 @@ def test_what_was_not_seen_together_is_refused() -> None:
     for nothing, what in (("poses", "markers"), ("cycles", "wrist camera"), ("samples", "IMU")):
         with pytest.raises(FitError, match=f"the {what} saw nothing: for ten seconds bend"):
             calibrated(seen, **{nothing: []})
-    with pytest.raises(FitError, match=r"saw the hand together in \d+ triples, at least 60"):
+    with pytest.raises(FitError, match=r"saw the hand together in \d+ cycles, at least 60"):
         calibrated(seen, poses=seen.poses[:150])
     with pytest.raises(FitError, match=r"the IMU was silent for 0\.2"):
         calibrated(seen, samples=seen.samples[:300] + seen.samples[324:])

@@ -143,7 +143,7 @@ def test_a_user_makes_a_hand_file(tmp_path: Path) -> None:
     output = run(
         "--from", str(table), "--name", "mine", "--out", str(tmp_path), "--json", str(tmp_path / "mine.json")
     )
-    assert "left hand (as its names or --side say), 190 mm long" in output
+    assert "left hand (from its names or --side), 190 mm long" in output
     made = load(tmp_path / "hands" / "mine.json", HandProfile)
     assert made.side == "left"
     assert made.provenance["rest_joints"].data == ("mine.csv",)

@@ -88,7 +88,7 @@ def test_beads_in_one_line_are_refused() -> None:
 def test_a_bead_that_one_camera_sees_is_named(motion: Seen) -> None:
     points = motion.points_m.copy()
     points[20:, 2] = np.nan
-    with pytest.raises(FitError, match=r"at 20 of \d+ instants.*wand3 7 %"):
+    with pytest.raises(FitError, match=r"at 20 of \d+ epochs.*wand3 7 %"):
         measure_object(replace(motion, points_m=points))
 
 

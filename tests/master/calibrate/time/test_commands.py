@@ -89,7 +89,7 @@ def test_too_little_motion_is_refused_with_what_to_do(
 ) -> None:
     messages = messages_of(motion(1), late, seconds)
     with pytest.raises(
-        CalibrationError, match=r"camera 'right' cannot be told.*px/s.*record ten seconds"
+        CalibrationError, match=r"camera 'right' cannot be measured.*px/s.*record ten seconds"
     ) as error:
         measure_times(cameras(), RATES, messages)
     assert "up and down" in str(error.value)

@@ -123,7 +123,7 @@ def test_the_other_systems_frame_is_found_as_well() -> None:
 
 def test_nothing_at_all_is_refused() -> None:
     motion = Motion(1, seconds=3.0)
-    with pytest.raises(FitError, match="the tracker told nothing"):
+    with pytest.raises(FitError, match="the tracker reported nothing"):
         register(motion.objects(), [])
-    with pytest.raises(FitError, match="the cameras told nothing"):
+    with pytest.raises(FitError, match="the cameras reported nothing"):
         register([], motion.tracked())
