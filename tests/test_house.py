@@ -290,9 +290,11 @@ def private_words(path: str, text: str) -> set[str]:
 
 def long_first_lines(path: str, text: str) -> set[str]:
     """Docstrings whose first line is longer than 79 characters."""
-    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    documented = [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
-    lines = [(ast.get_docstring(node) or "").partition("\n")[0] for node in documented]
+    lines = [
+        (ast.get_docstring(node) or "").partition("\n")[0]
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
     return {line for line in lines if len(line) > FIRST_LINE}
 
 
