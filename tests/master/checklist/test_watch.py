@@ -252,7 +252,7 @@ CASES = [
         "left",
         _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
         _set("duplicate", "left", None),
-        "the one at 10.0.0.7 is not taken",
+        "the one at 10.0.0.7 is ignored",
         "--name",
     ),
     Case(
