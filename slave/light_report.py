@@ -69,7 +69,7 @@ class LightReport:
         While the light is followed, its metrics compare it with calibration.
 
         That is red and blue relative to green, and green. Of markers that look alike
-        twins.<one>..<other>, the hues between them.
+        alike.<one>..<other>, the hues between them.
         """
         if not self._detector.adapts:
             return dict(self._others.metrics())
@@ -81,5 +81,5 @@ class LightReport:
 def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
     # A name in `Health` has 64 characters
     return {
-        f"twins.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
+        f"alike.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
     }

@@ -11,8 +11,10 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, s
 from common.calibration.gesture_settings import GestureSettings
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.output_settings import OutputSettings
+from common.errors import MessageError
 from common.link.handshake import state_pages
-from common.messages import AnyMessage, HandPose
+from common.messages import AnyMessage, HandPose, Health, decode, encode
+from common.messages.metrics import METRICS, is_known, metrics_page
 from common.messages.schema import bounds_table, bus_schema
 from common.recording.frame_recording import Manifest
 
@@ -31,6 +33,7 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 
 ALL = (*KINDS, MESSAGES)
 WIRE = FOLDER.parent / "wire.md"
+METRICS_PAGE = FOLDER.parent / "metrics.md"
 MADE = {"bounds": bounds_table, "handshake": state_pages}
 
 
@@ -60,6 +63,37 @@ def test_the_page_of_the_wire_lists_the_bounds_of_every_message() -> None:
     for kind in get_args(AnyMessage):
         numbers = {field.name for field in msgspec.structs.fields(kind) if field.type in (float, int, Float)}
         assert not numbers, f"{kind.__name__}: {', '.join(numbers)}: a number without bounds"
+
+
+def test_the_page_of_metrics_is_the_table() -> None:
+    assert METRICS_PAGE.read_text() == metrics_page(), f"{METRICS_PAGE} is out of date: run `make schema`"
+    assert len({metric.name for metric in METRICS}) == len(METRICS)
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("rate_hz", True),
+        ("rate_khz", False),
+        ("left.clock_offset_us", True),
+        ("left.clock_offset_s", False),
+        (".clock_offset_us", False),
+        ("colour.index", True),
+        ("colour.", False),
+        (f"overlap.{30 * 'a'}..{30 * 'b'}"[:64], True),
+        (64 * "a", False),
+    ],
+)
+def test_a_health_with_a_metric_that_is_not_in_the_table_is_refused(name: str, known: bool) -> None:
+    assert is_known(name) == known
+    if known:
+        assert Health("left", 1, 2, {}, {name: 1.0}).metrics == {name: 1.0}
+        return
+    with pytest.raises(ValueError, match="is not in the table of metrics"):
+        Health("left", 1, 2, {}, {name: 1.0})
+    good = encode(Health("left", 1, 2, {}, {"rate_hz": 1.0}))
+    with pytest.raises(MessageError, match="not in the table"):
+        decode(good.replace(b"rate_hz", name.encode()[:7].ljust(7, b"x")))
 
 
 def test_no_schema_is_left_over() -> None:
@@ -92,4 +126,5 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for file in ALL:
         (FOLDER / file).write_text(text_of(file))
+    METRICS_PAGE.write_text(metrics_page())
     WIRE.write_text(with_made_parts(WIRE.read_text()))

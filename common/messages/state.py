@@ -10,6 +10,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
 from common.errors import PictureError
+from common.messages.metrics import unknown
 from common.messages.parts import (
     MAX_COUNT,
     MAX_NUMBER,
@@ -66,7 +67,7 @@ class Health(Message, frozen=True, eq=False, tag=True):
         session: Random id of the process.
         t_ns: Moment of the report [ns], clock of the source.
         counts: Event name -> how often (frames, dropped, refused by reason, ...).
-        metrics: Quantity name with its unit -> value now (rate_hz, offset_us, ...).
+        metrics: Quantity -> value now, by the table of `common.messages.metrics`; others are refused.
         host: Name of the machine that the process runs on; empty: not reported.
         version: Of the program; empty: not reported.
     """
@@ -82,6 +83,8 @@ class Health(Message, frozen=True, eq=False, tag=True):
     def __post_init__(self) -> None:
         counts = list(self.counts.items())[:MAX_NUMBERS]
         metrics = [(name, value) for name, value in self.metrics.items() if isfinite(value)][:MAX_NUMBERS]
+        if strange := unknown(name[:_NAME] for name, _ in metrics):
+            raise ValueError(f"metrics: {strange[0]!r} is not in the table of metrics (docs/metrics.md)")
         force_setattr(self, "counts", {name[:_NAME]: max(0, min(n, MAX_COUNT)) for name, n in counts})
         clamped = {name[:_NAME]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in metrics}
         force_setattr(self, "metrics", clamped)

@@ -25,7 +25,7 @@ BRIGHT, BRIGHT_WELL = (
     1.5,
     1.35,
 )  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
-DUPLICATE_SENDER = "twins."  # metrics of the slave: hues between two markers as they are seen,
+ALIKE = "alike."  # metrics of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
 AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker
@@ -123,8 +123,8 @@ def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         if metric.startswith(OVERLAP):
             pair = tuple(metric.removeprefix(OVERLAP).split(BETWEEN))
             what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
-        elif metric.startswith(DUPLICATE_SENDER):
-            pair = tuple(metric.removeprefix(DUPLICATE_SENDER).split(BETWEEN))
+        elif metric.startswith(ALIKE):
+            pair = tuple(metric.removeprefix(ALIKE).split(BETWEEN))
             what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
         else:
             continue

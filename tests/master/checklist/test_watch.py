@@ -129,7 +129,7 @@ CASES = [
     Case(
         "colour_collision",
         "left.index-ring",
-        _named("left", {"twins.index..ring": 4.0}),
+        _named("left", {"alike.index..ring": 4.0}),
         lambda b: b.metrics["left"].clear(),
         "look alike, 4 hues apart",
         "repaint",
