@@ -104,7 +104,11 @@ class FakeSlave:
         )
 
     def health(self) -> Health:
-        metrics = figures(self.camera) | {"roi_margin": self.roi_margin, "rate_hz": 90.0, "soc_celsius": 48.5}
+        metrics = figures(self.camera) | {
+            "roi_margin": self.roi_margin,
+            "rate_hz": 90.0,
+            "sensor_celsius": 48.5,
+        }
         metrics |= {f"wanted.{name}": value for name, value in metrics.items()}
         for name, colour in (self.camera.markers or {}).items():
             for end, values in (("low", colour.hsv_low), ("high", colour.hsv_high)):

@@ -134,7 +134,7 @@ def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None
         metrics = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
         counts = {"left.received": 45 * k} | ({"left.lost": 2 * (k - 100)} if k > 100 else {})
         master = Health("master", 1, k * 500_000_000, counts, metrics)
-        slave = Health("left", 1, k, {}, {"soc_celsius": 50.0})
+        slave = Health("left", 1, k, {}, {"sensor_celsius": 50.0})
         history.push(0.5 * k, [5.0, 7.0, 100.0], {"master": master, "left": slave})
     assert history.latest("latency_p50_ms") == 7.0
     assert history.latest("poses_per_s") == 6.0
