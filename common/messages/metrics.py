@@ -1,4 +1,4 @@
-"""Single table of the metrics that processes publish in `Health`: name, unit, process, meaning.
+"""Table of the metrics that processes publish in `Health`.
 
 A `Health` with a metric that is not in it is refused, where it is made and where it is received. `<...>` in a name
 stands for a name of the rig (a camera, a marker, a sender) or of a device's control. docs/metrics.md is made of it.
