@@ -163,7 +163,10 @@ def test_ray_meets_the_plane_on_the_plane_and_ahead(o: Float, d: Float, n: Float
     point = intersect_plane(o, d, n, offset)
     assert np.isnan(point).all() or np.isfinite(point).all()
     if np.isfinite(point).all():
-        scale = 1.0 + float(np.linalg.norm(n)) * (1.0 + float(np.linalg.norm(point)))
+        far = (
+            1.0 + float(np.linalg.norm(point)) + float(np.linalg.norm(o))
+        )  # rounding goes with both ends of the ray
+        scale = 1.0 + abs(offset) + float(np.linalg.norm(n)) * far
         assert abs(float(point @ n) - offset) < 1e-9 * scale
         assert float((point - o) @ d) >= 0.0
 
