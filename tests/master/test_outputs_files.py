@@ -1,4 +1,5 @@
 import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -109,7 +110,7 @@ def test_full_disk_is_a_clear_error_and_leaves_nothing_half_written(
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("common.calibration.replacing.os.fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(RecordingError, match=r"poses\.npz: cannot write: No space left.*free the disk"):
         sink.close()
     assert list(tmp_path.iterdir()) == []

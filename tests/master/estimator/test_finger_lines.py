@@ -45,7 +45,7 @@ def test_deviation_keeps_its_sign_and_size() -> None:
         (np.full((30, 3), np.nan), "0 points"),
         (np.linspace([0, 0, 0.1], [0, 0, 0.2], 4), "4 points"),
         (np.linspace([0, 0, 0.1], [0, 0, 0.101], 30), "1.0 mm only"),
-        (np.random.default_rng(1).normal(size=(50, 3)) * 0.01 + [0, 0, 0.15], "stray"),
+        (np.random.default_rng(1).normal(size=(50, 3)) * 0.01 + [0, 0, 0.15], "deviate"),
     ],
 )
 def test_what_is_no_line_is_refused(points: np.ndarray, expected: str) -> None:

@@ -222,10 +222,10 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
 @pytest.mark.parametrize(
     ("rejected", "text"),
     [
-        ("both", "no tracker data received"),
+        ("tracker", "no tracker data received"),
         ("object", "the cameras do not see the object"),
         ("place", "does not know where it is"),
-        ("both", "no tracker is heard"),
+        ("both", "no tracker data received"),
     ],
 )
 def test_who_is_silent_is_said(rejected: str, text: str) -> None:

@@ -105,7 +105,7 @@ def test_a_tracker_that_slipped_meanwhile_is_refused() -> None:
     object.__setattr__(after, "Y", after.Y @ slipped)
     first, then = before.tracked(), after.tracked()
     half = len(first) // 2
-    with pytest.raises(FitError, match="Does the tracker sit firmly"):
+    with pytest.raises(FitError, match="Is the tracker firm"):
         register(before.objects(), [*first[:half], *then[half:]])
 
 
