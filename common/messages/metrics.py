@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
+from common.messages.parts import MAX_NAME_CHARACTERS
+
 
 class Metric(NamedTuple):
     """One published metric.
@@ -113,7 +115,6 @@ METRICS = (
     Metric("play.speed", "1", "player", "1: as recorded"),
     Metric("play.paused", "0/1", "player", "it stands still"),
 )
-_LONGEST = 64  # characters of a name in `Health`; a longer one is cut at its end, or in the sender's part
 
 
 def _pattern(name: str) -> str:
@@ -134,7 +135,7 @@ def is_known(name: str) -> bool:
     """
     if _KNOWN.fullmatch(name):
         return True
-    return len(name) == _LONGEST and any(head and name.startswith(head) for head in _CUT)
+    return len(name) == MAX_NAME_CHARACTERS and any(head and name.startswith(head) for head in _CUT)
 
 
 def unknown(names: Iterable[str]) -> list[str]:

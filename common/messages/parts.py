@@ -61,12 +61,13 @@ def within(low: float, high: float) -> Meta:
 
 
 # The look-ahead: in Python `$` also matches before a final line feed, and names become keys and file names.
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
+MAX_NAME_CHARACTERS = 64
+Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_CHARACTERS, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
 # For people: printed on terminals and pages, so no control characters, no marks that turn the line's direction, no
 # lone surrogates.
 _UNPRINTABLE = r"\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff"
 _NOT_PRINTABLE = re.compile(f"[{_UNPRINTABLE}]")
-Text = Annotated[str, Meta(max_length=64, pattern=rf"^[^{_UNPRINTABLE}]*(?!\n)$")]
+Text = Annotated[str, Meta(max_length=MAX_NAME_CHARACTERS, pattern=rf"^[^{_UNPRINTABLE}]*(?!\n)$")]
 Sentence = Annotated[str, Meta(min_length=1, max_length=500, pattern=rf"^[^{_UNPRINTABLE}]+(?!\n)$")]
 
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]

@@ -13,6 +13,7 @@ from common.errors import PictureError
 from common.messages.metrics import unknown
 from common.messages.parts import (
     MAX_COUNT,
+    MAX_NAME_CHARACTERS,
     MAX_NUMBER,
     Count,
     Finite,
@@ -30,7 +31,6 @@ MAX_STILL_BYTES = 900 * 1024
 MAX_BODY_CHARACTERS = 64 * 1024
 MAX_CHECKS = 64
 MAX_NUMBERS = 512
-_NAME = 64
 
 CheckCode = Literal[
     "camera_absent",
@@ -83,13 +83,17 @@ class Health(Message, frozen=True, eq=False, tag=True):
     def __post_init__(self) -> None:
         counts = list(self.counts.items())[:MAX_NUMBERS]
         metrics = [(name, value) for name, value in self.metrics.items() if isfinite(value)][:MAX_NUMBERS]
-        if strange := unknown(name[:_NAME] for name, _ in metrics):
+        if strange := unknown(name[:MAX_NAME_CHARACTERS] for name, _ in metrics):
             raise ValueError(f"metrics: {strange[0]!r} is not in the table of metrics (docs/metrics.md)")
-        force_setattr(self, "counts", {name[:_NAME]: max(0, min(n, MAX_COUNT)) for name, n in counts})
-        clamped = {name[:_NAME]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in metrics}
+        force_setattr(
+            self, "counts", {name[:MAX_NAME_CHARACTERS]: max(0, min(n, MAX_COUNT)) for name, n in counts}
+        )
+        clamped = {
+            name[:MAX_NAME_CHARACTERS]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in metrics
+        }
         force_setattr(self, "metrics", clamped)
-        force_setattr(self, "host", printable(self.host)[:_NAME])
-        force_setattr(self, "version", printable(self.version)[:_NAME])
+        force_setattr(self, "host", printable(self.host)[:MAX_NAME_CHARACTERS])
+        force_setattr(self, "version", printable(self.version)[:MAX_NAME_CHARACTERS])
 
 
 class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):

@@ -47,7 +47,7 @@ class Probe:
         self._load_shedding = threading.Event()
         self._busy = self._closed = False
         self._shown = self._dropped = 0
-        self._rejected, self._again = 0, False  # as was shown last; a reader may not have been there
+        self._skipped, self._again = 0, False  # as was shown last; a reader may not have been there
         if always:
             self._start()
 
@@ -82,8 +82,8 @@ class Probe:
             if self._clock.now_ns() >= self._until_ns:
                 self._until_ns = 0
                 return
-        if skip != self._rejected or (self._again and skip):
-            self._rejected = skip
+        if skip != self._skipped or (self._again and skip):
+            self._skipped = skip
             self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), skip))
         self._again = False
         self._put(message)

@@ -91,7 +91,7 @@ class MarkerSource(Protocol):
 def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
     """Return the ambiguity counts of `Health`.
 
-    beside.<marker>, frames with something else in its colour.
+    ambiguous.<marker>, frames with something else in its colour.
     """
     return (
         {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
@@ -101,7 +101,7 @@ def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
 def ambiguity_metrics(detector: MarkerSource | None) -> dict[str, float]:
     """Return the ambiguity metrics of `Health`.
 
-    beside.<marker>.u and .v, where the other thing was last [px].
+    ambiguous.<marker>.u and .v, where the other thing was last [px].
     """
     if detector is None:
         return {}

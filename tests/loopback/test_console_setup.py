@@ -119,7 +119,7 @@ def shot(page: Page, name: str, settled_s: float = 0.0) -> None:
         page.screenshot(path=f"{folder}/{name}.png")
 
 
-def dispatcher(root: Path) -> Scene:
+def simulated_scene(root: Path) -> Scene:
     """What the simulated cameras really see."""
     tree = root / "calib_json"
     rig = load(tree / "rigs" / "desk.json", RigCalibration)
@@ -210,7 +210,7 @@ def epoch_ns(tree: Path) -> int:
 
 def test_from_an_empty_folder_to_a_tracked_hand(console: tuple[str, str, Path], root: Path) -> None:
     url, bus, tree = console
-    scene = dispatcher(root)
+    scene = simulated_scene(root)
     with chromium() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.set_default_timeout(PATIENCE_MS)

@@ -45,7 +45,7 @@ class Model:
         flat = np.frombuffer(self.blob, dtype, one["count"] * width, start)
         return flat.reshape(one["count"], width).astype(np.float64)
 
-    def dispatcher(self, key: int | None) -> dict[str, Float]:
+    def world(self, key: int | None) -> dict[str, Float]:
         """Name -> matrix (4, 4) in the scene at a key of the animation, or at rest."""
         nodes = [dict(node) for node in self.json["nodes"]]
         clip = self.json["animations"][0]
@@ -83,7 +83,7 @@ def test_joints_are_where_they_were_and_turned_as_they_were(
     (times,) = {sampler["input"] for sampler in model.json["animations"][0]["samplers"]}
     np.testing.assert_allclose(model.values(times)[:, 0], np.arange(count) * STEP_NS * 1e-9, atol=1e-6)
     for key, pose in enumerate(poses):
-        found = model.dispatcher(key)
+        found = model.world(key)
         places = np.array([found[name][:3, 3] for name in JOINTS])
         assert np.abs(places - FLIP * pose.position_m).max() < NEAR_M
         rotated = Rotation.from_matrix([found[name][:3, :3] for name in JOINTS])
@@ -97,7 +97,7 @@ def test_the_skin_is_bound_to_the_joints_at_rest(tmp_path: Path) -> None:
     names = [model.json["nodes"][number]["name"] for number in skin["joints"]]
     assert tuple(names) == JOINTS
     bind = model.values(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)  # by columns
-    rest = model.dispatcher(None)
+    rest = model.world(None)
     for name, matrix in zip(names, bind, strict=True):
         np.testing.assert_allclose(rest[name] @ matrix, np.eye(4), atol=1e-6)
     parts = model.json["meshes"][0]["primitives"][0]
@@ -132,7 +132,7 @@ def test_over_a_gap_the_hand_stands_still(tmp_path: Path) -> None:
     times = model.values(model.json["animations"][0]["samplers"][0]["input"])[:, 0]
     assert len(times) == 5
     assert times[4] - times[3] == pytest.approx(0.001, abs=1e-5)
-    before, after = model.dispatcher(2), model.dispatcher(3)
+    before, after = model.world(2), model.world(3)
     np.testing.assert_array_equal(before["wrist"], after["wrist"])
 
 
