@@ -24,7 +24,7 @@ from common.service_manager import ServiceManager, one_line
 from common.supervisor import supervised_threads
 from common.terminal import echo
 
-DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_USAGE = 0, 1, 2
 _EXAMPLES = "Examples:"
 _HELP = ("-h", "--help")
 _OURS = frozenset({"common", "deploy", "master", "slave"})
@@ -147,7 +147,7 @@ class Program:
                 return FAILED
             except KeyboardInterrupt:
                 echo(f"\n{self.name}: interrupted", error=True)
-                return INTERRUPTED
+                return 130
             except BrokenPipeError:  # whoever read the output has ended
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 return FAILED

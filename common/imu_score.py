@@ -13,8 +13,6 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.transforms import quaternion_to_matrix
 
-_REGION = 5.991  # chi square, two degrees of freedom, 95 %
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiltErrors:
@@ -54,7 +52,8 @@ class TiltErrors:
     @property
     def within(self) -> float:
         """Share of samples in their 95 % regions."""
-        return float((np.vecdot(self.error_rad, self.error_rad) < _REGION * np.square(self.sigma_rad)).mean())
+        region = 5.991  # chi square, two degrees of freedom, 95 %
+        return float((np.vecdot(self.error_rad, self.error_rad) < region * np.square(self.sigma_rad)).mean())
 
     def where(self, rows: Bool) -> "TiltErrors":
         """Those of some samples (N,)."""

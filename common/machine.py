@@ -20,16 +20,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = "PHALANX_SYSTEM_ROOT"
-HOT_C = 80.0  # from here on a Raspberry Pi lowers its clock (its documentation, "Frequency management")
-BELOW_TRIP_C = 5.0
-LEAST_TRIP_C = 50.0  # a lower one switches a fan, or is a dummy of the firmware
 _ZONES = "sys/class/thermal"
 # Below soc or, on a Pi 5 with newer kernels, soc@107c000000. The file is deprecated, and some kernels have none: these
 # report a weak supply alone, as an alarm of the sensor rpi_volt (Linux, drivers/hwmon/raspberrypi-hwmon.c).
 _THROTTLED = "sys/devices/platform/soc*/soc*:firmware/get_throttled"
 _SENSORS, _SUPPLY, _WEAK = "sys/class/hwmon/hwmon*", "rpi_volt", "in0_lcrit_alarm"
 _TRIPS = ("passive", "hot", "critical")
-_NOW = 0xF  # bits of what holds now; those above are of what has been since the start
 
 
 class Program(NamedTuple):
@@ -81,7 +77,8 @@ class Machine:
             found |= {"temperature_c": round(now, 1), "temperature_limit_c": limit}
         if (flags_path := self._flags or self._weak) is not None and (flags := _text(flags_path)) is not None:
             with contextlib.suppress(ValueError):  # of another firmware: nothing is known
-                found["throttled"] = float(int(flags, 16) & _NOW)
+                # bits of what holds now; those above are of what has been since the start
+                found["throttled"] = float(int(flags, 16) & 0xF)
         if (free := self.disk_free_mb()) is not None:
             found["disk_free_mb"] = round(free, 1)
         return found
@@ -115,9 +112,13 @@ def _zone(path: Path) -> tuple[float, float] | None:
     except ValueError:
         return None
     if kind == "cpu-thermal":  # of a Raspberry Pi; its only trip point is far above what its firmware allows
-        return now, HOT_C
-    trips = [trip for trip in trips if trip >= LEAST_TRIP_C]
-    return (now, min(trips) - BELOW_TRIP_C) if trips else None
+        # from here on a Raspberry Pi lowers its clock (its documentation, "Frequency management")
+        hot_c = 80.0
+        return now, hot_c
+    least_trip_c = 50.0  # a lower one switches a fan, or is a dummy of the firmware
+    trips = [trip for trip in trips if trip >= least_trip_c]
+    below_trip_c = 5.0
+    return (now, min(trips) - below_trip_c) if trips else None
 
 
 def _text(path: Path) -> str | None:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 EXIT_CODE = 70  # EX_SOFTWARE of sysexits.h
-_GRACE_S = 1.0  # to close files and devices: the next process is to be there within two seconds
 _LOG = logging.getLogger(__name__)
 
 
@@ -45,7 +44,8 @@ class ThreadSupervisor:
         self.failed = name
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
             os._exit(EXIT_CODE)
-        last = threading.Timer(_GRACE_S, os._exit, (EXIT_CODE,))
+        grace_s = 1.0  # to close files and devices: the next process is to be there within two seconds
+        last = threading.Timer(grace_s, os._exit, (EXIT_CODE,))
         last.daemon = True
         last.start()
         os.kill(os.getpid(), signal.SIGTERM)

@@ -10,9 +10,6 @@ from pathlib import Path
 from deploy.checks import default_keys
 from deploy.sender_check import WAIT_SENDERS_S
 
-_DEADLINE_S = 900.0
-_READY_S = 90.0
-
 
 def add_demo(demo: ArgumentParser) -> None:
     """Start a complete synthetic system: slaves, one master and the viewer.
@@ -141,7 +138,8 @@ def add_deploy(deploy: ArgumentParser) -> None:
     deploy.add_argument(
         "--no-wait", action="store_true", help="do not wait for datagrams, only until slaves are ready"
     )
-    deploy.add_argument("--ready-s", type=float, default=_READY_S, metavar="S", help=argparse.SUPPRESS)
+    ready_s = 90.0
+    deploy.add_argument("--ready-s", type=float, default=ready_s, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument("--wait-s", type=float, default=WAIT_SENDERS_S, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument(
         "--beacon", metavar="ADDRESS:PORT", help="where slaves listen for the start (default: broadcast)"
@@ -220,8 +218,9 @@ def _keys(command: ArgumentParser, what: str) -> None:
 
 def _reach(command: ArgumentParser) -> None:
     command.add_argument("--dry-run", action="store_true", help="write nothing, print what would be done")
+    deadline_s = 900.0
     command.add_argument(
-        "--deadline", type=_seconds, default=_DEADLINE_S, metavar="S", help="for all (default: %(default)g)"
+        "--deadline", type=_seconds, default=deadline_s, metavar="S", help="for all (default: %(default)g)"
     )
     command.add_argument("--user", metavar="USER", help="of ssh; root, or one with passwordless sudo")
     command.add_argument("--port", type=int, metavar="PORT", help="of ssh")

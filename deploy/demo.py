@@ -25,13 +25,9 @@ from typing import cast
 from deploy.process import Process
 from deploy.sensors import DemoError, Sensor, SensorKind, rig_options, sensors_of
 
-_READY_S = 90.0  # on a machine that has other things to do; an ended process is reported at once
 _STALE = ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd", "object_*.npz", "contact_*.npz",
           "gestures.jsonl")  # fmt: skip
-# Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
-# one in which cameras already look at the hand, which does not move yet, so that the light is known and a hand found.
-# Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
-_READY_CORE_S, _KNOWN_S, _LEAST_S, _MOST_S = 2.0, 1.0, 4.0, 20.0
+_KNOWN_S = 1.0
 # What draws pictures gives way to what is measured: a real camera costs no processor its time.
 _GIVES_WAY = 4
 _DRIVERS: dict[SensorKind, Callable[[str], list[str]]] = {
@@ -39,7 +35,7 @@ _DRIVERS: dict[SensorKind, Callable[[str], list[str]]] = {
     "imu": lambda name: ["run", "--imu", "synthetic", "--name", name],
     "tracker": lambda name: ["run", "--tracker", "synthetic", "--name", name],
 }
-_LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
+_LATE_MS, _APART_PPM = 5.0, 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +131,12 @@ def lead_s(processes: int, load: float) -> float:
 
     It depends on the number of processes and on the `load` of others that want to run.
     """
-    ready = _READY_CORE_S * (processes + load) / (os.cpu_count() or 1)
-    return min(max(ready + _KNOWN_S, _LEAST_S), _MOST_S)
+    # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
+    # one in which cameras already look at the hand, which does not move yet, so that the light is known and a hand found.
+    # Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
+    ready_core_s, least_s, most_s = 2.0, 4.0, 20.0
+    ready = ready_core_s * (processes + load) / (os.cpu_count() or 1)
+    return min(max(ready + _KNOWN_S, least_s), most_s)
 
 
 def play(
@@ -207,7 +207,8 @@ def _table(settings: DemoSettings, keys: Path, epoch_ns: int) -> list[tuple[str,
     link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
     played = ["--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
     for index, sensor in enumerate(settings.sensors()):
-        clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
+        zero_ms = 1234.5
+        clock = ["--clock-offset-ms", str(zero_ms * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
         who = ["--rig", sensor.rig, *tree, "--scene", sensor.scene]
         command = [*_DRIVERS[sensor.kind](sensor.name), *who, *played, *clock, *link]
@@ -248,7 +249,8 @@ def _wait_until_tracking(
     state: _State, processes: list[Process], stop: threading.Event, notify: Callable[[str], None]
 ) -> None:
     notify("waiting until every camera is there and the first pose is out ...")
-    deadline = time.monotonic() + _READY_S
+    ready_s = 90.0  # on a machine that has other things to do; an ended process is reported at once
+    deadline = time.monotonic() + ready_s
     while not state.tracking.wait(0.1):
         if stop.is_set():
             return
@@ -256,7 +258,7 @@ def _wait_until_tracking(
         failed = next((p for p in processes if p.name != "viewer" and p.ended() is not None), None)
         if failed is not None or time.monotonic() > deadline:
             late = failed or next(p for p in processes if p.name == "master")
-            what = "ended" if failed else f"no pose after {_READY_S:.0f} s"
+            what = "ended" if failed else f"no pose after {ready_s:.0f} s"
             raise DemoError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
 
 

@@ -15,7 +15,6 @@ from deploy.remote import Deadline, Remote, printable, run_bounded
 from deploy.sender_check import Before, Ears, Received, received_of
 from deploy.targets import DeployError, Target
 
-_KEYS_S = 60.0
 Notify = Callable[[str], None]
 
 
@@ -48,7 +47,8 @@ def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
     devices = [word for name in names for word in ("--device", name)]
     words = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *devices]
     lines: list[str] = []
-    code, errors = run_bounded(words, b"", lines.append, _KEYS_S)
+    keys_s = 60.0
+    code, errors = run_bounded(words, b"", lines.append, keys_s)
     if code != 0:
         raise DeployError(f"keys: {([*lines, *errors] or ['phalanx fleet keys --make has no end'])[-1]}")
 

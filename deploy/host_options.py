@@ -9,7 +9,6 @@ from deploy.one_host import Wish
 from deploy.sender_check import Ears
 from deploy.targets import DeployError, RigFile, read_rig
 
-BEACON_PORT, DATA_PORT, BUS_PORT = 47800, 47801, 47802
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 
 
@@ -63,10 +62,11 @@ def ears_of(options: argparse.Namespace) -> Ears | None:
     address = _here(options.master)
     bus_host = "127.0.0.1" if address else options.master
     words = ["--rig", options.rig, "--calibration", str(options.calibration)]
-    words += ["--bus", options.bus or f"tls/{bus_host}:{BUS_PORT}"]
-    words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{DATA_PORT}"]
+    beacon_port, data_port, bus_port = 47800, 47801, 47802
+    words += ["--bus", options.bus or f"tls/{bus_host}:{bus_port}"]
+    words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{data_port}"]
     default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
-    words += ["--beacon", options.beacon or f"{default}:{BEACON_PORT}"]
+    words += ["--beacon", options.beacon or f"{default}:{beacon_port}"]
     return Ears(tuple(words), options.keys, options.wait_s)
 
 

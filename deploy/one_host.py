@@ -16,8 +16,6 @@ from deploy.targets import DeployError, RigFile, Target
 from deploy.wheelhouse import Kind, wheelhouse
 
 STAGE = "/opt/phalanx/wheels"  # of root; the installer removes it
-_CLOCK_S = 0.5  # from here on it is reported
-_PROBE_S = 60.0
 _PICAMERA2 = "picamera2"  # the default of cameras
 
 
@@ -138,11 +136,12 @@ class Host:
             DeployError: It is not reached, or nothing can be installed there.
         """
         lines: list[tuple[float, str]] = []
+        probe_s = 60.0
         code = self.remote.run(
             command(["probe", camera, *([] if apt else ["--no-apt"])], sudo=False),
             _plain_bundle(),
             lambda line: lines.append((time.time(), line)),
-            _PROBE_S,
+            probe_s,
         )
         results = [(at, found) for at, line in lines if (found := _result(line)) is not None]
         if code != 0 or not results:
@@ -158,7 +157,8 @@ class Host:
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
         self.notify(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
         ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
-        if abs(ahead_s) > _CLOCK_S:
+        clock_s = 0.5  # from here on it is reported
+        if abs(ahead_s) > clock_s:
             self.notify(
                 f"its clock is {ahead_s:+.1f} s from this one; chrony brings it here, if this machine answers"
             )

@@ -13,9 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-_TAIL = 12
 _STOP_S = 20.0  # a master writes what it has; whoever cannot wait presses Ctrl-C again
-_SESSION_TRIES, _SESSION_AGAIN_S = 3, 0.11  # who is not root may change one session in a tenth of a second
 
 
 class Process:
@@ -49,7 +47,8 @@ class Process:
         """
         self.name = name
         self.restarts = 0
-        self.tail: deque[str] = deque(maxlen=_TAIL)
+        tail = 12
+        self.tail: deque[str] = deque(maxlen=tail)
         self._command, self._environment = list(command), {**os.environ, **environment}
         self._on_line, self._nice = on_line, nice
         self._log: IO[str] = log.open("w", buffering=1)
@@ -136,11 +135,13 @@ def _give_way(pid: int, nice: int) -> None:
         os.setpriority(os.PRIO_PROCESS, pid, min(os.getpriority(os.PRIO_PROCESS, 0) + nice, 19))
         # Linux may share its time among sessions first, and each child has one of its own (sched(7), autogroup).
         session = Path(f"/proc/{pid}/autogroup")
-        for _ in range(_SESSION_TRIES if session.exists() else 0):
+        # who is not root may change one session in a tenth of a second
+        session_tries, session_again_s = 3, 0.11
+        for _ in range(session_tries if session.exists() else 0):
             try:
                 session.write_text(str(nice))
                 return
             except BlockingIOError:
-                time.sleep(_SESSION_AGAIN_S)
+                time.sleep(session_again_s)
     except OSError:
         return  # it has ended, or it may not be changed here: it runs as the others do

@@ -19,15 +19,12 @@ from deploy.targets import DeployError
 
 CONNECT_S = 10
 ALIVE_S, ALIVE_TIMES = 3, 3  # a link that is gone shows after nine seconds
-STALLED_S = 15
-_POLL_S = 0.5
 _SETTINGS = (
     "BatchMode=yes",
     f"ConnectTimeout={CONNECT_S}",
     f"ServerAliveInterval={ALIVE_S}",
     f"ServerAliveCountMax={ALIVE_TIMES}",
 )
-_NOT_REACHED = 255  # ssh's own exit code
 _HINTS = (  # the first that is found: a changed host key is reported with two of them
     (
         "Could not resolve hostname",
@@ -112,7 +109,8 @@ class Remote:
         if code is None:
             self.deadline.left_s()
             raise DeployError(f"no answer within {limit_s:.0f} s")
-        if code == _NOT_REACHED:
+        not_reached = 255  # ssh's own exit code
+        if code == not_reached:
             raise DeployError(_plain(errors, self.host))
         if code != 0 and errors:
             on_line(f"! {errors[-1]}")
@@ -126,12 +124,13 @@ class Remote:
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
         """
+        stalled_s = 15
         words = [
             "rsync",
             "--partial",
             "--times",
             "--mkpath",
-            f"--timeout={STALLED_S}",
+            f"--timeout={stalled_s}",
         ]
         if sudo:
             words += ["--rsync-path", "sudo -n rsync"]
@@ -200,7 +199,8 @@ def run_bounded(
     try:
         while code is None and time.monotonic() < end and not (ended is not None and ended.is_set()):
             with contextlib.suppress(subprocess.TimeoutExpired):
-                code = child.wait(min(_POLL_S, max(0.0, end - time.monotonic())))
+                poll_s = 0.5
+                code = child.wait(min(poll_s, max(0.0, end - time.monotonic())))
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)

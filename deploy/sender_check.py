@@ -21,9 +21,6 @@ WAIT_SENDERS_S = (
     12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
 )
 LEAST_S = 4.0  # a master reports its counts once a second, a beacon comes as often
-_TIMES = 2.0
-_BEFORE_S = 5.0
-_END_S = 60.0  # of the program that listens, besides what it listens
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +62,8 @@ def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None 
     words += [*ears.options, *(word for name in names for word in ("--wait", name))]
     lines: list[str] = []
     environment = {"PHALANX_KEYS": str(ears.keys)}
-    code, errors = run_bounded(words, b"", lines.append, ears.seconds + _END_S, environment, ended)
+    end_s = 60.0  # of the program that listens, besides what it listens
+    code, errors = run_bounded(words, b"", lines.append, ears.seconds + end_s, environment, ended)
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
         lines = [*lines, *errors] or [f"phalanx fleet status --wait ended with {code}"]
@@ -107,7 +105,8 @@ class Before:
         self._thread.join()
         if start_s is None or not self._received.master or set(self._received.rates) < set(self._names):
             return self._ears
-        seconds = max(LEAST_S, _TIMES * self._took_s, _TIMES * start_s)
+        times = 2.0
+        seconds = max(LEAST_S, times * self._took_s, times * start_s)
         return replace(self._ears, seconds=min(self._ears.seconds, seconds))
 
     def end(self) -> None:
@@ -116,6 +115,7 @@ class Before:
 
     def _listen(self) -> None:
         began = time.monotonic()
-        ears = replace(self._ears, seconds=min(_BEFORE_S, self._ears.seconds))
+        before_s = 5.0
+        ears = replace(self._ears, seconds=min(before_s, self._ears.seconds))
         self._received = received_of(self._names, ears, self._ended)
         self._took_s = time.monotonic() - began

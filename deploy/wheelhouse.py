@@ -26,7 +26,6 @@ from deploy.targets import DeployError
 NAME = "phalanx-hand"
 PACKAGES = ("slave", "common", "master", "deploy")
 _GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28", "2_31", "2_34", "2_35")  # Bookworm has 2.36
-_DOWNLOAD_S = 600.0
 _WHEN = (1980, 1, 1, 0, 0, 0)  # a wheel of the same content is the same file
 _LOCK = threading.Lock()
 
@@ -250,12 +249,13 @@ def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: 
     words += ["--only-binary=:all:", "--implementation", "cp", "--python-version", kind.python]
     words += [word for platform in platforms for word in ("--platform", platform)]
     words += ["-c", str(limits)] if limits is not None else []
+    download_s = 600.0
     try:
         done = subprocess.run(
-            [*words, *requirements], capture_output=True, text=True, timeout=_DOWNLOAD_S, check=False
+            [*words, *requirements], capture_output=True, text=True, timeout=download_s, check=False
         )
     except subprocess.TimeoutExpired as error:
-        raise DeployError(f"pip download: no end after {_DOWNLOAD_S:.0f} s; is there a network?") from error
+        raise DeployError(f"pip download: no end after {download_s:.0f} s; is there a network?") from error
     if done.returncode != 0:
         errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
             done.stderr[-300:].strip()

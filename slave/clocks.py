@@ -27,9 +27,6 @@ import numpy as np
 
 from common.clock import Clock
 
-STEP_NS = (
-    1_000_000  # a clock that moved this much between two frames was set; slewing makes 500 ppm of a period
-)
 TRIES = 5
 OLDEST_NS = 5_000_000_000  # an older frame, or one from the future, is not on the clock that was assumed
 CLOCKS: dict[str, int] = {
@@ -65,7 +62,9 @@ class ForeignClock:
         now_ns, offset_ns = self._pair()
         t_ns = stamp_ns - offset_ns
         before, self._offset_ns = self._offset_ns, offset_ns
-        if before is not None and abs(offset_ns - before) > STEP_NS:
+        # a clock that moved this much between two frames was set; slewing makes 500 ppm of a period
+        step_ns = 1_000_000
+        if before is not None and abs(offset_ns - before) > step_ns:
             self.steps += 1
             if self._age_ns is not None:
                 typical_ns = now_ns - self._age_ns
@@ -108,7 +107,6 @@ def clock_of(stamp_ns: int) -> str | None:
     return None
 
 
-BUCKET_NS = 500_000_000  # of so much time one lag is kept, the least
 IMPOSSIBLE_NS = 1_000_000_000  # a stamp from so far in the future is broken, or its clock was set
 SUSPECTS = 3  # impossible stamps in a row: not bytes are broken, but the clock was set
 
@@ -163,7 +161,8 @@ class DeviceClock:
                 raise ClockSteppedError
             return False
         self._suspects, self._last_ns = 0, stamp_ns
-        bucket = stamp_ns // BUCKET_NS
+        bucket_ns = 500_000_000  # of so much time one lag is kept, the least
+        bucket = stamp_ns // bucket_ns
         if bucket != self._bucket:
             self._least.append((stamp_ns, lag))
             self._bucket = bucket

@@ -11,7 +11,6 @@ import msgspec
 from common.calibration import CameraCalibration, HsvRange
 
 _NAME = 64  # characters of a name in `Health`
-_HUES = 180
 
 
 def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, float]:
@@ -46,7 +45,8 @@ def overlap(one: HsvRange, other: HsvRange) -> int:
 def _hues(colour: HsvRange) -> set[int]:
     """The hues of a range, which may wrap through 0."""
     low, high = colour.hsv_low[0], colour.hsv_high[0]
-    return {hue % _HUES for hue in range(low, high + 1 + (_HUES if high < low else 0))}
+    hues = 180
+    return {hue % hues for hue in range(low, high + 1 + (hues if high < low else 0))}
 
 
 def _number(colour: HsvRange) -> float:

@@ -44,15 +44,8 @@ from common.link.session import (
 from common.messages import WIRE_VERSION, Message, encode
 
 VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
-UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
-NONCE_NS = 2_000_000_000
-DUPLICATE_SENDER_NS = (
-    1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
-)
-STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
-LATELY_NS = 2_500_000_000  # so long after it was last seen something is reported as wrong
 _DUPLICATE_SENDER = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
@@ -134,7 +127,8 @@ class SlaveLink:
 
         A duplicate sender, another wire version, another secret.
         """
-        if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < LATELY_NS:
+        lately_ns = 2_500_000_000  # so long after it was last seen something is reported as wrong
+        if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < lately_ns:
             return None
         return self._wrong[1]
 
@@ -246,8 +240,9 @@ class SlaveLink:
         if counter <= session.beacon_counter and not vanished:
             return Event.BEACON_OLD
         listed = beacon.sessions.get(self._name) == session.key_id
+        unlisted_ns = 1_000_000_000
         return (
-            Event.BEACON_LISTED if listed or t_ns - session.since_ns < UNLISTED_NS else Event.BEACON_UNLISTED
+            Event.BEACON_LISTED if listed or t_ns - session.since_ns < unlisted_ns else Event.BEACON_UNLISTED
         )
 
     def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
@@ -258,7 +253,8 @@ class SlaveLink:
             and t_ns - old.received_ns < OFFER_NS
         ):
             since_ns = old.since_ns
-        if old is not None and 0 <= t_ns - old.drawn_ns < NONCE_NS:
+        nonce_ns = 2_000_000_000
+        if old is not None and 0 <= t_ns - old.drawn_ns < nonce_ns:
             nonce, drawn_ns = old.slave_nonce, old.drawn_ns
         else:
             nonce, drawn_ns = self._random(NONCE_BYTES), t_ns
@@ -269,10 +265,12 @@ class SlaveLink:
         """Return a refusal if the master only reports a sender of the same name."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
+        # unanswered for so long while the beacons list the name: another process has it
+        duplicate_sender_ns = 1_000_000_000
         if (
             self._offer is None
             or listed in (None, ours)
-            or not t_ns - self._offer.since_ns >= DUPLICATE_SENDER_NS
+            or not t_ns - self._offer.since_ns >= duplicate_sender_ns
         ):
             return None
         self._wrong = t_ns, _DUPLICATE_SENDER.format(self._name)
@@ -289,9 +287,10 @@ class SlaveLink:
         _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)
         if kind != Kind.BEACON or rig != self._keys.rig_tag:
             return
-        if self._next_strange_ns is not None and 0 < self._next_strange_ns - t_ns <= STRANGE_NS:
+        strange_ns = 1_000_000_000  # between two hellos to a master of another wire version
+        if self._next_strange_ns is not None and 0 < self._next_strange_ns - t_ns <= strange_ns:
             return
-        self._next_strange_ns = t_ns + STRANGE_NS
+        self._next_strange_ns = t_ns + strange_ns
         self._wrong = t_ns, _OTHER_VERSION.format(address[0], version, WIRE_VERSION)
         nonces = self._random(NONCE_BYTES), bytes(NONCE_BYTES)
         hello = self._keys.hello(self._name, self.process, *nonces)

@@ -32,7 +32,6 @@ PERIOD_NS = 100_000_000
 POLL_NS = 3_000_000_000
 FOUND = ""  # stands beside the names of markers for the wish to see what was found
 STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
-_NEVER_NS = -(2**63)
 _LOG = logging.getLogger(__name__)
 
 
@@ -46,8 +45,9 @@ class Gate:
 
     def __init__(self) -> None:
         """Nobody looks yet."""
-        self._end_ns = _NEVER_NS
-        self._next_ns = _NEVER_NS
+        never_ns = -(2**63)
+        self._end_ns = never_ns
+        self._next_ns = never_ns
 
     def ask(self, now_ns: int) -> None:
         """Somebody looks at `now_ns` [ns], same clock as the frames."""

@@ -7,8 +7,6 @@ import math
 from dataclasses import dataclass
 from typing import TextIO
 
-PLAIN_EVERY = 5  # calls, where no terminal shows the line in place
-
 
 @dataclass(frozen=True, slots=True)
 class Length:
@@ -86,9 +84,10 @@ class ProgressDisplay:
     def show(self, progress: Progress) -> None:
         """The recording goes on; called once a second."""
         self._calls += 1
+        plain_every = 5  # calls, where no terminal shows the line in place
         if self._stream.isatty():
             self._write(f"\r{self._name}: {progress_text(progress)}\x1b[K")
-        elif self._calls % PLAIN_EVERY == 0:
+        elif self._calls % plain_every == 0:
             self._write(f"{self._name}: {progress_text(progress)}\n")
 
     def end(self, progress: Progress) -> None:

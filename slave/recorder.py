@@ -32,7 +32,6 @@ from slave.progress import Length, Progress, megabytes
 from slave.sources import Frame, FrameSource
 
 RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
-QUEUE_BYTES = 128_000_000  # a quarter of the smallest slave's memory; at 640x480, 90 Hz it bridges 1.5 s
 ENCODERS = 4
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # Linux: a new one at every start of the machine
 
@@ -62,7 +61,8 @@ class Recorder:
         length: Length,
         show: Callable[[Progress], None] = lambda _progress: None,
         reserve_bytes: int = RESERVE_BYTES,
-        queue_bytes: int = QUEUE_BYTES,
+        # a quarter of the smallest slave's memory; at 640x480, 90 Hz it bridges 1.5 s
+        queue_bytes: int = 128_000_000,
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
         encoders: int = ENCODERS,
         reserve_option: str = "--reserve-mb",

@@ -24,7 +24,6 @@ if TYPE_CHECKING:  # of cameras alone
     from slave.raw import RawFrames
     from slave.tuning import CameraTuning
 
-LOG_EVERY = 20  # reports
 ALONE_AT = 6  # the report after which a slave without a master logs what it receives
 _LOG = logging.getLogger(__name__)
 
@@ -113,7 +112,8 @@ class Reporter:
     def _work(self) -> None:
         count = 0
         while not self._closing.wait(self._period_s):
-            if count % LOG_EVERY == ALONE_AT and self._uplink.zenoh_endpoint is None:
+            log_every = 20  # reports
+            if count % log_every == ALONE_AT and self._uplink.zenoh_endpoint is None:
                 _LOG.warning("%s", _why_alone(self._uplink.counts))
             try:
                 for part in self._parts:
@@ -124,11 +124,11 @@ class Reporter:
                     self._bus.publish("health", self._name, self.health())
             except BusError as error:
                 self._leave()
-                if count % LOG_EVERY == 0:
+                if count % log_every == 0:
                     _LOG.warning("no bus: %s", error)
             except Exception as error:  # noqa: BLE001 - whatever it is of, the next report is tried
                 self._failures.log("no report", error)
-            if count % LOG_EVERY == 0 and self._counters.counts().get("frames", 0):
+            if count % log_every == 0 and self._counters.counts().get("frames", 0):
                 _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._metrics.items()))
             count += 1
         self._leave()

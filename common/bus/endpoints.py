@@ -13,7 +13,6 @@ from common.bus.keys import OPEN, keys_folder
 from common.errors import BusError
 
 SCHEMES = ("tcp", "tls", "quic")
-_PORT = 47802
 ANYWHERE = "0.0.0.0"
 
 
@@ -72,7 +71,8 @@ def default_bus(environment: Mapping[str, str]) -> str:
 
     Encrypted where there are keys, on this machine in any case.
     """
-    return f"{'tcp' if keys_folder(environment) is None else 'tls'}/127.0.0.1:{_PORT}"
+    port = 47802
+    return f"{'tcp' if keys_folder(environment) is None else 'tls'}/127.0.0.1:{port}"
 
 
 def reached_at(endpoint: str, address: str) -> str:

@@ -16,9 +16,6 @@ from common.bus.endpoints import host_of, port_of
 from common.bus.keys import Identity
 
 _PATIENCE_S = 0.5
-_ALONE_S = 2.0  # without anybody for so long, a process logs why
-_POLL_S = 0.25
-_NOT_YET_VALID, _EXPIRED = 9, 10  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
 _LOG = logging.getLogger(__name__)
 
 
@@ -54,7 +51,9 @@ def why_refused(endpoint: str, identity: Identity) -> str:
     except TimeoutError:
         return ""  # accepted: whoever refuses reports it at once
     except ssl.SSLCertVerificationError as error:
-        if error.verify_code in (_NOT_YET_VALID, _EXPIRED):
+        # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
+        not_yet_valid, expired = 9, 10
+        if error.verify_code in (not_yet_valid, expired):
             return _why_invalid(endpoint, identity)
         return (
             f"who listens there has no certificate of this rig's master ({error.verify_message}): another rig's, or"
@@ -134,11 +133,13 @@ def log_why_alone(
 
     def monitor() -> None:
         message, since = "", time.monotonic()
-        while not closing.wait(_POLL_S):
+        poll_s = 0.25
+        while not closing.wait(poll_s):
             now = time.monotonic()
+            alone_s = 2.0  # without anybody for so long, a process logs why
             if peers():
                 message, since = "", now
-            elif now - since > _ALONE_S:
+            elif now - since > alone_s:
                 why, since = reason(), now
                 if why and why != message and not closing.is_set():
                     _LOG.warning("bus (%s): %s", where, why)

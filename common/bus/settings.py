@@ -10,10 +10,7 @@ from common.bus.certificates import MASTER, OPERATOR
 from common.bus.endpoints import SCHEMES, encrypted
 from common.bus.keys import Identity
 
-LEASE_MS = 1000  # so soon a pulled cable is noticed
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-MAX_MESSAGE_BYTES = 1 << 20
-CLIENT_TIMEOUT_MS = 500  # a viewer tries a master that is not there for so long, then reports that it waits
 # Batches that may wait for the link before a message is dropped. With zenoh's own 2, a busy machine that gives the link
 # no time for a millisecond loses messages; 16 is its most.
 LINK_QUEUE = {"data": 16, "data_low": 16}
@@ -38,11 +35,15 @@ def settings(
         devices: Who may connect to a listening peer beside those of the identity.
         namespace: Put before every key that is sent and taken from every key that comes; None: nothing.
     """
+    lease_ms = 1000  # so soon a pulled cable is noticed
+    max_message_bytes = 1 << 20
     link: dict[str, object] = {
         "protocols": list(SCHEMES),
-        "tx": {"lease": LEASE_MS, "queue": {"size": LINK_QUEUE}},
-        "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+        "tx": {"lease": lease_ms, "queue": {"size": LINK_QUEUE}},
+        "rx": {"max_message_size": max_message_bytes},
     }
+    # a viewer tries a master that is not there for so long, then reports that it waits
+    client_timeout_ms = 500
     made: dict[str, object] = {
         "mode": mode,
         "listen": {"endpoints": [listen] if listen else [], "exit_on_failure": True},
@@ -50,7 +51,7 @@ def settings(
             "endpoints": list(connect),
             # A client that has not found its peer is no session at all: zenoh gives up after this, or never returns.
             # For a peer 0 would try once and give up for ever; `open` returns after 0.5 s in any case.
-            "timeout_ms": CLIENT_TIMEOUT_MS if mode == "client" else -1,
+            "timeout_ms": client_timeout_ms if mode == "client" else -1,
             "exit_on_failure": False,
             "retry": RETRY,
         },

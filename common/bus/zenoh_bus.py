@@ -35,10 +35,6 @@ from common.messages.parts import printable
 from common.messages.streams import ALIVE_KEY, key_of
 from common.supervisor import until
 
-ASK_AGAIN_S = 0.05  # a target that has just connected is not known everywhere yet
-JOIN_S = 1.0  # a thread that zenoh does not release is left to the end of the process
-LIVELINESS_TIMEOUT_S = 0.5
-MAX_REFUSAL = 2000  # characters of why a device refused a command
 FIFO_DEPTH = 64  # between zenoh and the thread that empties it at once
 # Nothing of these is dropped: who publishes them does so on a thread of its own.
 WAITING = frozenset({"taken"})
@@ -231,11 +227,13 @@ class ZenohBus:
                 text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
                 if text == "Timeout":  # zenoh's own word for a target that took the query and kept silent
                     break
+                max_refusal = 2000  # characters of why a device refused a command
                 raise BusError(
-                    f"{command.target!r} refused {command.verb!r}: {printable(text[:MAX_REFUSAL])}"
+                    f"{command.target!r} refused {command.verb!r}: {printable(text[:max_refusal])}"
                 )
+            ask_again_s = 0.05  # a target that has just connected is not known everywhere yet
             # Nobody there yet looks the same as no answer: ask again, it costs nothing.
-            time.sleep(max(0.0, min(ASK_AGAIN_S, deadline - time.monotonic())))
+            time.sleep(max(0.0, min(ask_again_s, deadline - time.monotonic())))
         raise BusError(self._silence(command, timeout_s))
 
     def announce(self, name: str) -> None:
@@ -250,10 +248,11 @@ class ZenohBus:
         if self._closed:
             return frozenset()
         try:
+            liveliness_timeout_s = 0.5
             replies = self._session.liveliness().get(
                 ALIVE_KEY.format(name=ANY),
                 zenoh.handlers.FifoChannel(FIFO_DEPTH),
-                timeout=LIVELINESS_TIMEOUT_S,
+                timeout=liveliness_timeout_s,
             )
         except zenoh.ZError:  # closed by another thread meanwhile
             return frozenset()
@@ -279,7 +278,8 @@ class ZenohBus:
             _LOG.warning("bus: closing: %s", error)
         for thread in threads:
             if thread is not threading.current_thread():
-                thread.join(JOIN_S)
+                join_s = 1.0  # a thread that zenoh does not release is left to the end of the process
+                thread.join(join_s)
 
     def _check_open(self) -> None:
         if self._closed:

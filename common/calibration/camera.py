@@ -13,7 +13,6 @@ Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
 RoiMargin = Annotated[float, Meta(ge=0.01, le=0.5)]
-MIN_FOCAL_PER_WIDTH, MAX_FOCAL_PER_WIDTH = 0.05, 1000.0  # fields of view of 169 and 0.06 degrees
 
 # From a time-lapse of one picture in 10 s to a high-speed camera.
 FrameRate = Annotated[float, Meta(ge=0.1, le=10_000.0)]
@@ -104,7 +103,8 @@ def check_lens(lens: Intrinsics, size_px: tuple[int, int], where: str) -> None:
             `where` and the key.
     """
     width = size_px[0]
-    low, high = MIN_FOCAL_PER_WIDTH * width, MAX_FOCAL_PER_WIDTH * width
+    min_focal_per_width, max_focal_per_width = 0.05, 1000.0  # fields of view of 169 and 0.06 degrees
+    low, high = min_focal_per_width * width, max_focal_per_width * width
     for axis, focal, principal, side in (
         ("x", lens.fx_px, lens.cx_px, width),
         ("y", lens.fy_px, lens.cy_px, size_px[1]),

@@ -8,13 +8,10 @@ stricter case. IEC 60825-1 is edition 3 (2014) unless stated otherwise, IEC 6247
 
 from math import atan, pi
 
-PUPIL_M = 0.007  # IEC 60825-1, table 10, condition 3: aperture stop for the naked eye
-EYE_AT_M = 0.100  # the same condition: its distance
 LAMP_AT_M = 0.200  # IEC 62471, 6.1: distance at which all lamps but those of general lighting are judged
 LONG_S = 10.0  # from here on the laser's limit is one of power (T2 of a point, IEC 60825-1, table 9)
-RAMP_S = 5e-6  # below, the energy limit no longer falls with the duration (IEC 60825-1, table 3)
 CORNEA_W_M2 = 100.0  # IEC 62471, 4.3.7: cornea and lens, longer than 1000 s
-_ALPHA_LONG, _ALPHA_SHORT, _ALPHA_LARGE = 0.011, 0.0017, 0.1  # rad; IEC 62471, 4.2.2
+_ALPHA_LONG, _ALPHA_SHORT = 0.011, 0.0017  # rad; IEC 62471, 4.2.2
 
 
 def laser_c4(wavelength_nm: float) -> float:
@@ -32,7 +29,8 @@ def class_1_energy_j(wavelength_nm: float, duration_s: float) -> float:
 
     From 5 us to 10 s; a shorter pulse may have as much as one of 5 us.
     """
-    return 7e-4 * min(max(duration_s, RAMP_S), LONG_S) ** 0.75 * laser_c4(wavelength_nm)
+    ramp_s = 5e-6  # below, the energy limit no longer falls with the duration (IEC 60825-1, table 3)
+    return 7e-4 * min(max(duration_s, ramp_s), LONG_S) ** 0.75 * laser_c4(wavelength_nm)
 
 
 def class_1_power_w(wavelength_nm: float) -> float:
@@ -66,7 +64,9 @@ def share_of_fan(fan_rad: float, peak_over_mean: float) -> float:
         fan_rad: Angle over which the line spreads [rad].
         peak_over_mean: How much brighter its brightest part is than its mean.
     """
-    return min(peak_over_mean * 2.0 * atan(0.5 * PUPIL_M / EYE_AT_M) / fan_rad, 1.0)
+    pupil_m = 0.007  # IEC 60825-1, table 10, condition 3: aperture stop for the naked eye
+    eye_at_m = 0.100  # the same condition: its distance
+    return min(peak_over_mean * 2.0 * atan(0.5 * pupil_m / eye_at_m) / fan_rad, 1.0)
 
 
 def lamp_irradiance_w_m2(intensity_w_sr: float) -> float:
@@ -117,4 +117,5 @@ def _alpha(emitter_m: float, least_rad: float) -> float:
 
     Clipped to the range for which the limits are defined.
     """
-    return min(max(emitter_m / LAMP_AT_M, least_rad), _ALPHA_LARGE)
+    alpha_large = 0.1  # rad; IEC 62471, 4.2.2
+    return min(max(emitter_m / LAMP_AT_M, least_rad), alpha_large)

@@ -8,8 +8,6 @@ import numpy as np
 from common.arrays import Float
 from common.calibration.wrist import FLAT_FIELD_TERMS, FlatField
 
-_LEAST = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
-
 
 def terms_of(xy: Float, degree: int) -> Float:
     """Return the polynomial terms (..., T) at normalised image points (..., 2).
@@ -30,4 +28,5 @@ def flat_of(field: FlatField, xy: Float) -> Float:
 
     Never less than a fiftieth of the value on the axis.
     """
-    return np.maximum(field_at(field, xy), _LEAST)
+    least = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
+    return np.maximum(field_at(field, xy), least)

@@ -13,8 +13,6 @@ from common.messages import MAX_MARKERS, Name
 HandCoordinate = Annotated[float, Meta(ge=-0.5, le=0.5)]  # [m] twice the longest hand, from its wrist
 HandPlace = tuple[HandCoordinate, HandCoordinate, HandCoordinate]
 Thickness = Annotated[float, Meta(ge=5e-4, le=0.2)]  # [m] radius at a joint, painted length of a cap
-_MIN_BONE_M = 1e-3
-_UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one
 
 
 class RestJoint(Part, frozen=True):
@@ -145,13 +143,15 @@ def check_hand(hand: HandProfile, where: str) -> None:
     """
     for name, joint in hand.rest_joints.items():
         length = math.hypot(*joint.orientation_wxyz)
-        if abs(length - 1.0) > _UNIT_WITHIN:
+        unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one
+        if abs(length - 1.0) > unit_within:
             raise CalibrationError(
                 f"{where}: rest_joints.{name}.orientation_wxyz: length {length:.4g},"
                 " a rotation is a unit quaternion wxyz, of length 1"
             )
     for (one, a), (other, b) in combinations(hand.rest_joints.items(), 2):
-        if math.dist(a.position_m, b.position_m) < _MIN_BONE_M:
+        min_bone_m = 1e-3
+        if math.dist(a.position_m, b.position_m) < min_bone_m:
             raise CalibrationError(
                 f"{where}: rest_joints.{other}.position_m: where {one} is; a bone has a length, 1 mm or more"
             )

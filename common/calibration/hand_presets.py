@@ -30,7 +30,6 @@ _RADIUS_SHARE = {
     "tip": 0.145,
 }
 
-SPREAD_AT_FULL_FLEXION = 15.0 / 24.0
 _TOLERANCE_RAD = (radians(5.0), radians(6.0), radians(4.0), radians(4.0))
 
 
@@ -42,7 +41,8 @@ def preset_limits(preset: Preset) -> Limits:
 
     def finger(spread: float) -> FingerLimits:
         flexion, pip, dip = (90.0, 110.0, 90.0) if k else (100.0, 120.0, 101.0)
-        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip), SPREAD_AT_FULL_FLEXION)
+        spread_at_full_flexion = 15.0 / 24.0
+        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip), spread_at_full_flexion)
 
     side = finger(abduction)
     return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)

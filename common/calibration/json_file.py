@@ -19,7 +19,6 @@ from common.errors import CalibrationError
 
 MAX_BYTES = 4 << 20  # the largest file of ours, a hand with its provenance, has 12 kB
 MAX_DEPTH = 32  # ours have 7 levels
-_MAX_TEXT = 600  # of an error: keys of a file may be as long as the file
 
 T = TypeVar("T")
 
@@ -182,7 +181,8 @@ def _printable(text: str) -> str:
 
     Control characters become escapes, the middle of a long text is left out.
     """
+    max_text = 600  # of an error: keys of a file may be as long as the file
     text = "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * _MAX_TEXT]
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * max_text]
     )
-    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT // 2]} ... {text[-_MAX_TEXT // 2 :]}"
+    return text if len(text) <= max_text else f"{text[: max_text // 2]} ... {text[-max_text // 2 :]}"

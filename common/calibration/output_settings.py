@@ -20,7 +20,6 @@ Port = Annotated[int, Meta(ge=1, le=65535)]
 Text = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+(?!\n)$")]
 
 LOOPBACK = "127.0.0.1"
-_UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
 
 
 class OscOutput(Part, frozen=True):
@@ -115,7 +114,8 @@ def check_outputs(settings: OutputSettings, where: str) -> None:
         CalibrationError: With `where` and the key.
     """
     length = math.hypot(*settings.vmc.q_avatar_rig)
-    if abs(length - 1.0) > _UNIT_WITHIN:
+    unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
+    if abs(length - 1.0) > unit_within:
         raise CalibrationError(
             f"{where}: vmc.q_avatar_rig: length {length:.4g}, a rotation is a quaternion wxyz of length 1"
         )

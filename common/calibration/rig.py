@@ -35,9 +35,6 @@ Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)
 # [m px] Baseline times focal length, from 0.1 mm and 10 px to 100 m and 1e7 px.
 DepthFactor = Annotated[float, Meta(ge=1e-3, le=1e9)]
 Drift = Annotated[float, Meta(ge=0.0, le=10.0)]  # [rad/s] far more than the bias of any gyroscope
-MIN_BASELINE_M = (
-    1e-3  # of two cameras: nothing can be triangulated from one place, and no two lenses fit into less
-)
 
 UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
 
@@ -238,10 +235,12 @@ def check_places(rig: RigCalibration, where: str) -> None:
     """
     centres = [(name, rig.camera_pose(name)[:3, 3]) for name in rig.cameras if name in rig.T_rig_camera]
     for (one, a), (other, b) in combinations(centres, 2):
-        if (apart := math.dist(a, b)) < MIN_BASELINE_M:
+        # of two cameras: nothing can be triangulated from one place, and no two lenses fit into less
+        min_baseline_m = 1e-3
+        if (apart := math.dist(a, b)) < min_baseline_m:
             raise CalibrationError(
                 f"{where}: T_rig_camera.{other}: {1e3 * apart:.2g} mm from camera {one!r}; two cameras are at least"
-                f" {1e3 * MIN_BASELINE_M:g} mm apart"
+                f" {1e3 * min_baseline_m:g} mm apart"
             )
 
 

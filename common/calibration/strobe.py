@@ -18,7 +18,6 @@ Power = Annotated[float, Meta(ge=1e-6, le=1000.0)]  # [W], [W/sr] the limits for
 Current = Annotated[float, Meta(ge=1e-6, le=100.0)]  # [A]
 Emitter = Annotated[float, Meta(ge=1e-5, le=0.1)]  # [m] from a bare die to a lamp
 NearInfrared = Annotated[float, Meta(ge=700.0, le=1050.0)]
-HARDWARE_TIMEOUT_S = 0.010  # of the flash driver that `--lights i2c` talks to: a pulse that nobody ends
 
 
 class LaserLight(Part, frozen=True):
@@ -141,7 +140,8 @@ def _laser(laser: LaserLight, fan_rad: float, pulse_s: float, duty: float) -> tu
     single_j = eye_safety.class_1_energy_j(laser.wavelength_nm, pulse_s)
     long_w = eye_safety.class_1_power_w(laser.wavelength_nm)
     trained_j = single_j * eye_safety.train_c5(duty * eye_safety.LONG_S / pulse_s)
-    cut_j = eye_safety.class_1_energy_j(laser.wavelength_nm, HARDWARE_TIMEOUT_S)
+    hardware_timeout_s = 0.010  # of the flash driver that `--lights i2c` talks to: a pulse that nobody ends
+    cut_j = eye_safety.class_1_energy_j(laser.wavelength_nm, hardware_timeout_s)
     pulse, both = "laser.power_w, max_pulse_us", "laser.power_w, max_pulse_us, max_duty"
     energy_j = enters_w * pulse_s
     return (
@@ -155,7 +155,7 @@ def _laser(laser: LaserLight, fan_rad: float, pulse_s: float, duty: float) -> tu
         Limit(
             "laser, pulse cut by the flash driver",
             "laser.power_w",
-            enters_w * HARDWARE_TIMEOUT_S,
+            enters_w * hardware_timeout_s,
             cut_j,
             "J",
             "table 3, 10 ms",

@@ -13,14 +13,9 @@ from common.calibration.parts import Direction, Part
 from common.errors import CalibrationError
 
 FLAT_FIELD_TERMS = (1, 3, 6, 10, 15, 21, 28)  # of polynomials in two variables, by degree
-_UNIT_WITHIN = 1e-2  # of the length of a direction: what rounding leaves of one
-_ACROSS = 0.2  # of a direction that should lie in a plane: 12 degrees, far more than a line laser is bent
 Reach = Annotated[float, Meta(ge=-1.0, le=1.0)]  # [m] the device sees the fingers of the hand that wears it
 Place = tuple[Reach, Reach, Reach]
 Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
-_MIN_OFFSET_M = (
-    1e-3  # of the laser's plane from the camera: nearer, it is seen along itself, and measures no depth
-)
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
@@ -84,23 +79,28 @@ def check_wrist(
         "laser.forward": None if laser is None else laser.forward,
         "laser.right": None if laser is None else laser.right,
     }
-    if plane is not None and abs(plane.offset_m) < _MIN_OFFSET_M:
+    # of the laser's plane from the camera: nearer, it is seen along itself, and measures no depth
+    min_offset_m = 1e-3
+    if plane is not None and abs(plane.offset_m) < min_offset_m:
         raise CalibrationError(
             f"{where}: laser_plane.offset_m: {plane.offset_m:g}, the plane runs through the camera, which then sees no"
-            f" depth on it; it is {_MIN_OFFSET_M:g} or more to either side"
+            f" depth on it; it is {min_offset_m:g} or more to either side"
         )
+    unit_within = 1e-2  # of the length of a direction: what rounding leaves of one
     for key, way in directions.items():
-        if way is not None and abs(math.hypot(*way) - 1.0) > _UNIT_WITHIN:
+        if way is not None and abs(math.hypot(*way) - 1.0) > unit_within:
             raise CalibrationError(f"{where}: {key}: length {math.hypot(*way):.4g}, not 1")
         if way is None or plane is None or not key.startswith("laser."):
             continue
         leaves = abs(sum(a * b for a, b in zip(plane.normal, way, strict=True)))
-        if leaves > _ACROSS:
+        # of a direction that should lie in a plane: 12 degrees, far more than a line laser is bent
+        across = 0.2
+        if leaves > across:
             raise CalibrationError(f"{where}: {key}: leaves laser_plane by {leaves:.2f} of its length")
     for finger, line in lines.items():
         if finger not in _FINGERS:
             raise CalibrationError(f"{where}: finger_lines: {finger!r} is none of {', '.join(_FINGERS)}")
-        if abs(math.hypot(*line.direction) - 1.0) > _UNIT_WITHIN:
+        if abs(math.hypot(*line.direction) - 1.0) > unit_within:
             length = math.hypot(*line.direction)
             raise CalibrationError(f"{where}: finger_lines.{finger}.direction: length {length:.4g}, not 1")
         if line.range_m[0] >= line.range_m[1]:

@@ -16,7 +16,6 @@ from common.errors import CalibrationError
 from common.geometry.lens import Lens, contraction, undistorted
 from common.geometry.transforms import invert
 
-_CONVERGES = 0.5  # 30 steps of the iteration then leave a billionth of what the lens bends
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
 
 
@@ -49,7 +48,8 @@ class CameraModel:
         (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
         k1, k2, p1, p2, k3 = self.distortion.tolist()
         lens = Lens((self.width_px, self.height_px), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3))
-        if contraction(lens) > _CONVERGES:
+        converges = 0.5  # 30 steps of the iteration then leave a billionth of what the lens bends
+        if contraction(lens) > converges:
             object.__setattr__(self, "steep", lens)
 
     @classmethod

@@ -18,11 +18,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 
-_DIRECTIONS, _RADII = 360, 256
-_COARSE = 48  # directions and radii where what is looked for has a wide margin
-_STEPS = 12  # of Newton: quadratic from a start within a thousandth, slower where the picture is shrunk
-_PARTS, _PART_STEPS = 32, 2  # of the way from the axis, and of Newton in each
-_LEAST = 0.01  # eigenvalue: a pixel there covers a hundred times the angle of one on the axis
+_RADII = 256
 _REACH = 9.0 / 4.0 * 1.1  # a tenth more for the tangential terms
 
 
@@ -53,19 +49,21 @@ def fold_of(lens: Lens) -> Fold | None:
     """
     low, high = _borders(lens)
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    directions = 360
     angles = np.concatenate(
-        [np.linspace(0.0, math.tau, _DIRECTIONS, endpoint=False), np.arctan2(corners[:, 1], corners[:, 0])]
+        [np.linspace(0.0, math.tau, directions, endpoint=False), np.arctan2(corners[:, 1], corners[:, 0])]
     )
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     radii = np.linspace(0.0, _reach(lens), _RADII)
     shrunk = _least_eigenvalue(lens, radii[:, None, None] * ways)
-    bad = shrunk <= _LEAST
+    least = 0.01  # eigenvalue: a pixel there covers a hundred times the angle of one on the axis
+    bad = shrunk <= least
     first = np.where(bad.any(axis=0), bad.argmax(axis=0), 0)
     folds = np.flatnonzero(first)
     if len(folds) == 0:
         return None  # nowhere around the picture
     before, at = shrunk[first[folds] - 1, folds], shrunk[first[folds], folds]
-    share = (before - _LEAST) / (before - at)
+    share = (before - least) / (before - at)
     r = radii[first[folds] - 1] + share * (radii[1] - radii[0])
     seen = distorted(lens, r[:, None] * ways[folds])
     inside = seen[_within(seen, low, high)]
@@ -98,14 +96,17 @@ def undistorted(lens: Lens, seen: Float) -> Float:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
         start = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
-        xy, settled = _newton(lens, seen, start, _STEPS, tolerance_px)
+        # of Newton: quadratic from a start within a thousandth, slower where the picture is shrunk
+        steps = 12
+        xy, settled = _newton(lens, seen, start, steps, tolerance_px)
         if not settled.all():
             low, high = _borders(lens)
             rest = np.flatnonzero(~settled & ((seen >= low) & (seen <= high)).all(axis=1))
             way = np.zeros((len(rest), 2))
-            for part in np.linspace(0.0, 1.0, _PARTS + 1)[1:] if len(rest) else ():
-                way, _ = _newton(lens, part * seen[rest], way, _PART_STEPS, tolerance_px)
-            xy[rest], settled[rest] = _newton(lens, seen[rest], way, _STEPS, tolerance_px)
+            parts, part_steps = 32, 2  # of the way from the axis, and of Newton in each
+            for part in np.linspace(0.0, 1.0, parts + 1)[1:] if len(rest) else ():
+                way, _ = _newton(lens, part * seen[rest], way, part_steps, tolerance_px)
+            xy[rest], settled[rest] = _newton(lens, seen[rest], way, steps, tolerance_px)
     return np.where(settled[:, None], xy, np.nan)
 
 
@@ -134,8 +135,9 @@ def contraction(lens: Lens) -> float:
     With x' = g(r) x + t(x), the iteration x <- (x' - t(x)) / g(r) of `cv2.undistortPoints` multiplies an error by
     1 - J / g, where J is the Jacobian of the distortion, tangential terms t among it.
     """
-    angles = np.linspace(0.0, math.tau, _COARSE, endpoint=False)
-    xy = np.linspace(0.0, _reach(lens), _COARSE)[:, None, None] * np.stack(
+    coarse = 48  # directions and radii where what is looked for has a wide margin
+    angles = np.linspace(0.0, math.tau, coarse, endpoint=False)
+    xy = np.linspace(0.0, _reach(lens), coarse)[:, None, None] * np.stack(
         [np.cos(angles), np.sin(angles)], axis=-1
     )
     k1, k2, _, _, k3 = lens.distortion

@@ -18,8 +18,6 @@ from common.arrays import Float, Int
 Plane = npt.NDArray[np.float32]
 Real = TypeVar("Real", Float, Plane)  # double for truth, single for pictures
 
-_ALONG = 1e-6  # a ray within the cone's own angle of its axis meets the spheres only
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsules:
@@ -97,7 +95,8 @@ def first_hits(known: Any, directions: Real) -> Real:
         k1 = d2 * m3 + m2 * lean
         side = (-np.sqrt(k1 * k1 - k0 * k2) - k1) / k2
         foot = shift + side * m2
-        side = np.where((foot > 0.0) & (foot < d2) & (k2 > _ALONG * d2), side, np.inf)
+        along = 1e-6  # a ray within the cone's own angle of its axis meets the spheres only
+        side = np.where((foot > 0.0) & (foot < d2) & (k2 > along * d2), side, np.inf)
         first = -m3 - np.sqrt(m3 * m3 - c1)
         m3 -= m2
         best = np.fmin(np.fmin(first, side), -m3 - np.sqrt(m3 * m3 - c2))

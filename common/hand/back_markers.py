@@ -20,7 +20,6 @@ _PLACES = {
     "back2": ("index-finger-metacarpal", "index-finger-phalanx-proximal", 0.75),
     "back3": ("pinky-finger-metacarpal", "pinky-finger-phalanx-proximal", 0.75),
 }
-_THICKNESS_M = 0.0015  # from skin to the middle of what is painted
 
 
 def with_three_back_markers(profile: HandProfile, name: str) -> HandProfile:
@@ -43,5 +42,6 @@ def _above(model: HandModel, near: str, far: str, share: float) -> tuple[float, 
     a, b = (JOINTS.index(joint) for joint in (near, far))
     middle: Float = (1.0 - share) * model.rest_position_m[a] + share * model.rest_position_m[b]
     radius = (1.0 - share) * model.radius_m[a] + share * model.radius_m[b]
-    x, y, z = np.round(middle + np.array([0.0, radius + _THICKNESS_M, 0.0]), 7).tolist()
+    thickness_m = 0.0015  # from skin to the middle of what is painted
+    x, y, z = np.round(middle + np.array([0.0, radius + thickness_m, 0.0]), 7).tolist()
     return x, y, z

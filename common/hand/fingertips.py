@@ -18,7 +18,6 @@ from common.arrays import Float
 from common.hand.model import CHAINS, TIPS, Chains, HandModel
 
 _BEYOND = np.array([0.166, 0.170, 0.197, 0.180, 0.152])  # thumb ... little
-_DORSAL = 0.02  # the outermost point, of all five
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +39,8 @@ class Fingertips:
             return cls(model.radius_m[TIPS], 0.0)
         knuckles = model.rest_position_m[CHAINS[[1, 4], 0]]
         width = float(np.linalg.norm(knuckles[1] - knuckles[0]))
-        return cls(_BEYOND * width, _DORSAL * width)
+        dorsal = 0.02  # the outermost point, of all five
+        return cls(_BEYOND * width, dorsal * width)
 
     def points(self, chains: Chains) -> Float:
         """Tips (..., 5, 3) [m], in the frame of the chains."""

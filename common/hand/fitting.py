@@ -32,13 +32,8 @@ from common.hand.profiles import THUMB_DORSAL, joint_frame
 _LOG = logging.getLogger(__name__)
 
 _BENT = np.radians(5.0)  # a finger that never bends further has no plane
-_EXTENDED = 0.1  # share of the frames that counts as most extended, of a thumb
 _LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not observable
 _LEAST_SPREAD = np.radians(2.0)  # of a DIP about its share of the PIP: no hand is a gear
-_FOLLOWED_M = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
-_ASIDE_DEG = 15.0  # of a rest heading, from the median of the motion
-_BASE = 0.3  # metacarpal joints lie about there on the way from the wrist to the knuckles
-_BACK_M = 0.012  # the skin of the back above the bones
 _MARKERS = ("thumb", "index", "middle", "ring", "little")
 
 
@@ -71,7 +66,8 @@ def profile_from_rest(
     for k, joint in enumerate(WEBXR_JOINTS):
         joints[joint] = RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(rotated[k]))
     knuckle, base = place[CHAINS[2, 0] - 1], place[METACARPALS[1] - 1]
-    back = 0.5 * (knuckle + base) + [0.0, _BACK_M, 0.0]
+    back_m = 0.012  # the skin of the back above the bones
+    back = 0.5 * (knuckle + base) + [0.0, back_m, 0.0]
     ends: list[int] = TIPS.tolist()
     tips: dict[str, MarkerMount] = {}
     for marker, tip in zip(_MARKERS, ends, strict=True):
@@ -127,7 +123,8 @@ def profile_from_joints(
         position[chain] = roots[f] - ends[:, None] * rest[:, 2]
         rotation[chain] = rest
     for base, knuckle in zip(METACARPALS, CHAINS[1:, 0], strict=True):
-        position[base] = _BASE * position[knuckle]
+        # metacarpal joints lie about there on the way from the wrist to the knuckles
+        position[base] = 0.3 * position[knuckle]
         rotation[base] = joint_frame(position[knuckle], np.array([0.0, 1.0, 0.0]))
     from_palm = np.diag([-1.0, 1.0, -1.0])
     profile = profile_from_rest(
@@ -156,14 +153,16 @@ def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
     aside[opened] = np.nanmedian(azimuth[:, opened], axis=0) - np.arctan2(rest[:, 0], rest[:, 2])[opened]
     aside = np.degrees((aside + np.pi) % (2.0 * np.pi) - np.pi)
     for f, finger in enumerate(_MARKERS):
-        if off[f] > _FOLLOWED_M:
+        followed_m = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
+        if off[f] > followed_m:
             _LOG.warning(
                 "hand %r: the %s of the profile is %.0f mm off the recorded joints: its hinges differ from ours",
                 model.profile.name,
                 finger,
                 1e3 * off[f],
             )
-        if f and abs(aside[f - 1]) > _ASIDE_DEG:
+        aside_deg = 15.0  # of a rest heading, from the median of the motion
+        if f and abs(aside[f - 1]) > aside_deg:
             _LOG.warning(
                 "hand %r: the rest heading of the %s is %.0f degrees off the median of the motion: record it open, too",
                 model.profile.name,
@@ -228,7 +227,8 @@ def _extended(bones: Float) -> Int:
     """
     straight = (bones[:, 0] * bones[:, 1]).sum(axis=1)
     level = 1.0 - np.abs(bones[:, 0, 1])
-    return np.argsort(-(straight + level))[: max(1, round(_EXTENDED * len(bones)))]
+    extended = 0.1  # share of the frames that counts as most extended, of a thumb
+    return np.argsort(-(straight + level))[: max(1, round(extended * len(bones)))]
 
 
 def _vector(value: Float) -> Vector3:

@@ -17,14 +17,10 @@ from common.calibration import FingerLimits, Limits, Posture
 from common.errors import CalibrationError
 from common.hand.model import CHAINS, FINGERS, HandModel
 
-_PRIOR_SAMPLES = 1.0
 # What is expected of any hand: means and standard deviations [deg], rounded, of hands at work.
 _PRIOR_MEAN = np.radians([[5.0, 5.0, 10.0, 15.0], *[[0.0, 20.0, 30.0, 15.0]] * 4])
 _PRIOR_SIGMA = np.radians([[15.0, 15.0, 20.0, 25.0], *[[8.0, 25.0, 30.0, 18.0]] * 4])
-_ALIKE = 0.8  # correlation of an angle with that of the next finger
 _LEAST_RAD = np.radians(0.5)  # no angle is known better by the others, whatever its tracker reports
-_FEWEST = 20  # frames below which a motion carries no information
-_UPRIGHT = 0.3  # cosine of the flexion beyond which a finger shows no abduction
 
 
 def joint_angles(model: HandModel, fingers_m: Float) -> Float:
@@ -55,7 +51,8 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
         beyond = np.abs(angle) > 0.5 * np.pi  # bent by more than a right angle, not turned about
         flexion = np.where(beyond, np.pi - flexion - 2.0 * lean, flexion)
         angle = np.where(beyond, angle - np.copysign(np.pi, angle), angle)
-        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * angle, 0.0)
+        upright = 0.3  # cosine of the flexion beyond which a finger shows no abduction
+        angles[:, f, 0] = np.where(np.cos(flexion) > upright, model.side_sign * angle, 0.0)
         angles[:, f, 1] = flexion
         hinge = _hinge(rest[f], angle, f == 0)
         for k in (1, 2):
@@ -84,11 +81,13 @@ def fit_posture(angles_rad: Float) -> Posture:
     Raises:
         CalibrationError: There are fewer than 20 frames.
     """
-    if len(angles_rad) < _FEWEST:
-        raise CalibrationError(f"posture: a motion of {len(angles_rad)} frames; {_FEWEST} are needed")
+    fewest = 20  # frames below which a motion carries no information
+    if len(angles_rad) < fewest:
+        raise CalibrationError(f"posture: a motion of {len(angles_rad)} frames; {fewest} are needed")
     known = angles_rad.reshape(len(angles_rad), 20)
     count = _independent(known)
-    share = count / (count + _PRIOR_SAMPLES)
+    prior_samples = 1.0
+    share = count / (count + prior_samples)
     off = known.mean(axis=0) - _PRIOR_MEAN.ravel()
     mean = _PRIOR_MEAN.ravel() + share * off
     cov = share * np.cov(known.T) + (1.0 - share) * (_prior_cov() + share * np.outer(off, off))
@@ -99,7 +98,8 @@ def fit_posture(angles_rad: Float) -> Posture:
 def _prior_cov() -> Float:
     """(20, 20) [rad^2]: neighbouring fingers move alike, the thumb by itself."""
     f, g = np.indices((5, 5))
-    alike = np.where((f > 0) & (g > 0), _ALIKE ** np.abs(f - g), f == g)
+    # correlation of an angle with that of the next finger
+    alike = np.where((f > 0) & (g > 0), 0.8 ** np.abs(f - g), f == g)
     joint = np.kron(alike, np.eye(4))
     return np.asarray(joint * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA), np.float64)
 

@@ -32,7 +32,6 @@ _THUMB_HEADING = (0.55, -0.42, 0.72)
 THUMB_DORSAL = (0.62, 0.62, -0.10)  # right hand, palm frame: the way the back of a resting thumb faces
 _THUMB_BONES = (0.180, 0.165, 0.075)
 _TIP_RADIUS = {"thumb": 0.044, "index": 0.038, "middle": 0.038, "ring": 0.036, "pinky": 0.033}
-_CAP_AHEAD = 0.15  # cap centroid ahead of the tip joint, share of the tip radius
 _BACK_MARKER = (0.000, 0.068, 0.290)
 _MARKER_JOINT = {
     "thumb": "thumb-tip",
@@ -69,12 +68,13 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
 
     radius = {joint: round(share * hand_length_m, 6) for joint, share in _radii().items()}
     back = _vector(np.array(_BACK_MARKER) * mirror * hand_length_m)
+    cap_ahead = 0.15  # cap centroid ahead of the tip joint, share of the tip radius
     markers = {
         marker: MarkerMount(
             joint=joint,
-            offset_m=(0.0, 0.0, -round(_CAP_AHEAD * radius[joint], 7)),
+            offset_m=(0.0, 0.0, -round(cap_ahead * radius[joint], 7)),
             # Half a sphere and the cylinder that puts the centroid there, see `master.fabrik.caps`.
-            painted_m=round((2.0 - 2.0 * _CAP_AHEAD) * radius[joint], 7),
+            painted_m=round((2.0 - 2.0 * cap_ahead) * radius[joint], 7),
         )
         for marker, joint in _MARKER_JOINT.items()
     }

@@ -15,12 +15,9 @@ import numpy as np
 
 from common.arrays import Bool, Float
 
-_THUMB, _FINGERS = 0, (1, 2, 3, 4)
-_KNUCKLE_DEG, _CURL_DEG = 88.0, 100.0
+_FINGERS = (1, 2, 3, 4)
 _FLAT = ((10, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0))
 _SPREAD = ((38, 0, 0), (12, 0, 0), (0, 0, 0), (-9, 0, 0), (-14, 0, 0))
-_MOVED_DEG = 1.0
-STRAIGHT_DEG = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +39,14 @@ class Move:
     @property
     def moving(self) -> Bool:
         """(5, 3) which angles change."""
-        return np.abs(self.after - self.before) > _MOVED_DEG
+        moved_deg = 1.0
+        return np.abs(self.after - self.before) > moved_deg
 
     @property
     def straight(self) -> Bool:
         """(5,) which fingers are straight all the way."""
-        return np.maximum(self.before[:, 2], self.after[:, 2]) < STRAIGHT_DEG
+        straight_deg = 5.0
+        return np.maximum(self.before[:, 2], self.after[:, 2]) < straight_deg
 
     def posture(self, share: float) -> Float:
         """Return the posture (5, 3) [deg] after `share` (0 ... 1) of its time.
@@ -76,8 +75,9 @@ def _corners(fingers: tuple[int, ...], knuckle: float, curl: float) -> Float:
 def _script() -> Iterator[tuple[Step, list[Float]]]:
     """Each step with the postures it goes through, evenly in time."""
     flat, spread = np.array(_FLAT, dtype=np.float64), np.array(_SPREAD, dtype=np.float64)
-    table, hook = _corners(_FINGERS, _KNUCKLE_DEG, 0.0), _corners(_FINGERS, 0.0, _CURL_DEG)
-    fist = _corners(_FINGERS, _KNUCKLE_DEG, _CURL_DEG)
+    knuckle_deg, curl_deg = 88.0, 100.0
+    table, hook = _corners(_FINGERS, knuckle_deg, 0.0), _corners(_FINGERS, 0.0, curl_deg)
+    fist = _corners(_FINGERS, knuckle_deg, curl_deg)
     yield Step("flat", "hand flat and still", 1.0), [flat]
     yield Step("spread", "spread the fingers, and close them", 1.2), [spread, flat]
     yield (
@@ -88,9 +88,10 @@ def _script() -> Iterator[tuple[Step, list[Float]]]:
     yield Step("fist", "make a fist, and open it", 1.6), [fist, flat]
     for finger, name in zip(_FINGERS, ("index", "middle", "ring", "little"), strict=True):
         instruction = f"{name} finger alone: bend it straight at its knuckle, and back"
-        yield Step(name, instruction, 1.4), [_corners((finger,), _KNUCKLE_DEG, 0.0), flat]
+        yield Step(name, instruction, 1.4), [_corners((finger,), knuckle_deg, 0.0), flat]
     across, curled = flat.copy(), flat.copy()
-    across[_THUMB, :2], curled[_THUMB, 2] = (20.0, 40.0), 50.0
+    thumb = 0
+    across[thumb, :2], curled[thumb, 2] = (20.0, 40.0), 50.0
     instruction = "thumb alone: lay it straight across the palm, back, bend its two joints, back"
     yield Step("thumb", instruction, 1.8), [across, flat, curled, flat]
 

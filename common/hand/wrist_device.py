@@ -15,11 +15,6 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import intersect_plane, transform
 from common.hand.model import CHAINS, HandModel
 
-_ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
-_ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
-_LEAST_M = 1e-3  # a plane nearer to the lens than this measures no distance
-_FIELD_MARGIN = 1.0  # image sizes from the middle: half an image beside it
-_FARTHEST_M = 0.5  # a forearm
 _ORIGIN = np.zeros(3)
 
 
@@ -85,7 +80,9 @@ def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
     normal = np.array(rig.laser_plane.normal)
     length = float(np.linalg.norm(normal))
     normal, offset_m = normal / length, rig.laser_plane.offset_m / length
-    if abs(normal[1]) < _ACROSS or offset_m * normal[1] < _LEAST_M:
+    across = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
+    least_m = 1e-3  # a plane nearer to the lens than this measures no distance
+    if abs(normal[1]) < across or offset_m * normal[1] < least_m:
         raise CalibrationError(
             f"{where}: laser_plane: normal {', '.join(f'{n:.3f}' for n in normal)}, offset_m {offset_m:.4f}: the plane"
             " must cross the fingers on the palm's side of the lens, its normal about y and y positive where it is"
@@ -100,7 +97,9 @@ def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
     """
     size = np.array([optics.width_px, optics.height_px])
     uv = optics.project(knuckles_m) / size
-    if not (np.abs(uv - 0.5) <= _FIELD_MARGIN).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
+    field_margin = 1.0  # image sizes from the middle: half an image beside it
+    farthest_m = 0.5  # a forearm
+    if not (np.abs(uv - 0.5) <= field_margin).all() or knuckles_m[:, 2].max() > farthest_m:
         places = ", ".join(f"{1e3 * x:.0f} {1e3 * y:.0f} {1e3 * z:.0f}" for x, y, z in knuckles_m)
         raise CalibrationError(
             f"{where}: T_camera_palm: puts the knuckles of index ... little at {places} mm from the camera, where it"
@@ -116,8 +115,9 @@ def _palm(rig: RigCalibration, where: str) -> Float:
         )
     palm = np.array(rig.T_camera_palm, dtype=np.float64)
     rotation = palm[:3, :3]
+    rotation_within = 1e-3  # of a rotation matrix: what rounding leaves of one
     if (
-        not np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_WITHIN)
+        not np.allclose(rotation @ rotation.T, np.eye(3), atol=rotation_within)
         or np.linalg.det(rotation) < 0.0
         or not np.array_equal(palm[3], [0.0, 0.0, 0.0, 1.0])
     ):

@@ -24,12 +24,8 @@ from common.errors import RecordingError
 from common.imu.csv_columns import ACCEL, AXES, GYRO, MAG, QUATERNION, TIME, UNITS, Columns, find_columns
 from common.recording.recorded_files import read_table
 
-_PREAMBLE = 30  # lines in which the header must stand
 _RATES_HZ = (4.0, 4000.0)  # a factor of a thousand: one unit of time fits, no other
 _GRAVITY_M_S2 = (6.0, 15.0)  # median size of the force
-_RATE_RAD_S = 70.0  # 4000 deg/s, beyond any gyroscope: then it is in degrees
-_MOST_NS = 10**18  # what imu.csv can hold
-_UNIT_WITHIN = 0.05
 _EMPTY = frozenset({"", "nan", "na", "null", "none"})
 
 
@@ -92,7 +88,8 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
         ns = [int((one * unit).to_integral_value()) for one in times]
     else:
         ns, units[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
-    if max(abs(ns[0]), abs(ns[-1])) >= _MOST_NS:
+    most_ns = 10**18  # what imu.csv can hold
+    if max(abs(ns[0]), abs(ns[-1])) >= most_ns:
         raise RecordingError(
             f"time: {times[-1]} {units[TIME]} is out of range for any clock: give --time-unit"
         )
@@ -102,7 +99,8 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
         for what, axes in AXES.items()
         if all((what, axis) in columns for axis in axes)
     }
-    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < _UNIT_WITHIN)] = (
+    unit_within = 0.05
+    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < unit_within)] = (
         nan  # no rotation
     )
     t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
@@ -114,7 +112,8 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
 def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
     """How many lines stand before the rows, the delimiter and the columns."""
     best: tuple[int, list[str], dict[tuple[str, str], object]] | None = None
-    for k, line in enumerate(lines[:_PREAMBLE]):
+    preamble = 30  # lines in which the header must stand
+    for k, line in enumerate(lines[:preamble]):
         delimiter = max(",;\t", key=line.count)
         if not line.count(delimiter):
             continue
@@ -132,7 +131,7 @@ def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
                 best = first, header, dict(columns)
     if best is None:
         raise RecordingError(
-            f"line 1: no header: none of the first {_PREAMBLE} lines has a comma, semicolon or tab"
+            f"line 1: no header: none of the first {preamble} lines has a comma, semicolon or tab"
         )
     first, header, found = best
     missing = ", ".join(_missing(found, timed=timed))
@@ -252,7 +251,8 @@ def _refuse_impossible(scaled: Mapping[str, Float], units: Mapping[str, str]) ->
             f"accel: the median force is {force:.3g} m/s^2 in {units[ACCEL]}, gravity is 9.81: another unit "
             f"(--accel-unit {'|'.join(UNITS[ACCEL])}), or gravity was taken away"
         )
-    if fastest > _RATE_RAD_S:
+    rate_rad_s = 70.0  # 4000 deg/s, beyond any gyroscope: then it is in degrees
+    if fastest > rate_rad_s:
         raise RecordingError(
             f"gyro: up to {fastest:.3g} rad/s in {units[GYRO]}, no gyroscope has as much: --gyro-unit deg/s?"
         )

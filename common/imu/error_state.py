@@ -34,17 +34,12 @@ from common.arrays import Float
 
 ATTITUDE, BIAS, SCALE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 BIAS_RAD_S = radians(2.5)
-G_M_S2 = 9.80665
 _SIZE, _HEADING = 11, 2
 _BIAS_PROCESS_NOISE = radians(0.01)  # [rad/s per root second]
 _REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
 _NOISE = radians(0.015)  # [rad per root second]
-_SCALE = 0.01
-_OTHER, _OTHER_S = 0.003, 0.5
-_VELOCITY_M_S, _VELOCITY_S = 0.35, 0.6
-_ACCELEROMETER_RAD = 0.005
+_VELOCITY_M_S = 0.35
 _FIRST_RAD = radians(60.0)
-_UNSEEN_RAD_S = 3.0  # as fast as a forearm turns unseen
 _ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 
 
@@ -53,7 +48,8 @@ class ErrorState:
 
     def __init__(self) -> None:
         """Know nothing yet, but where up is roughly."""
-        first = [_FIRST_RAD, _FIRST_RAD, 0.0, *[BIAS_RAD_S] * 3, *[_SCALE] * 3, *[_VELOCITY_M_S] * 2]
+        scale = 0.01
+        first = [_FIRST_RAD, _FIRST_RAD, 0.0, *[BIAS_RAD_S] * 3, *[scale] * 3, *[_VELOCITY_M_S] * 2]
         self._cov = np.diag(np.square(first))
         self._variance = self._cov.reshape(-1)[:: _SIZE + 1]  # a view of its diagonal
         self._transition = np.eye(_SIZE)
@@ -61,7 +57,8 @@ class ErrorState:
     @property
     def tilt_rad(self) -> float:
         """Standard deviation of the tilt, per axis."""
-        return hypot(sqrt(0.5 * float(self._variance[0] + self._variance[1])), _ACCELEROMETER_RAD)
+        accelerometer_rad = 0.005
+        return hypot(sqrt(0.5 * float(self._variance[0] + self._variance[1])), accelerometer_rad)
 
     @property
     def bias_rad_s(self) -> float:
@@ -78,12 +75,14 @@ class ErrorState:
 
         The sensor rotated at this rate (3,), in this orientation (3, 3), with a force measured or without.
         """
-        change, fallen = -step_s * world_sensor, step_s * G_M_S2 if felt else 0.0
+        g_m_s2 = 9.80665
+        change, fallen = -step_s * world_sensor, step_s * g_m_s2 if felt else 0.0
         self._transition[ATTITUDE, BIAS] = change
         self._transition[ATTITUDE, SCALE] = change * rate_rad_s
         self._transition[9, 1], self._transition[10, 0] = fallen, -fallen
         np.matmul(self._transition @ self._cov, self._transition.T, out=self._cov)
-        noise = _NOISE**2 + _OTHER**2 * _OTHER_S * float(rate_rad_s @ rate_rad_s)
+        other, other_s = 0.003, 0.5
+        noise = _NOISE**2 + other**2 * other_s * float(rate_rad_s @ rate_rad_s)
         self._variance[ATTITUDE] += noise * step_s
         self._warmed(step_s)
 
@@ -92,7 +91,8 @@ class ErrorState:
 
         The sensor may have rotated meanwhile. Returns whether the tilt is now unknown.
         """
-        attitude = self._variance[ATTITUDE] + (_UNSEEN_RAD_S * gap_s) ** 2
+        unseen_rad_s = 3.0  # as fast as a forearm turns unseen
+        attitude = self._variance[ATTITUDE] + (unseen_rad_s * gap_s) ** 2
         for block in (ATTITUDE, VELOCITY):
             self._cov[block] = self._cov[:, block] = 0.0
         most = np.square([_FIRST_RAD, _FIRST_RAD, _ANYWHERE_RAD])
@@ -107,7 +107,8 @@ class ErrorState:
         Forces were integrated for a step to this level velocity (2,), which is zero in truth; returns all corrections
         (11,).
         """
-        noise = 2.0 * _VELOCITY_S * _VELOCITY_M_S**2 / step_s
+        velocity_s = 0.6
+        noise = 2.0 * velocity_s * _VELOCITY_M_S**2 / step_s
         return self._measured(VELOCITY, -velocity_m_s, noise)
 
     def rest(self, step_s: float, off_rad_s: Float) -> Float:

@@ -33,13 +33,8 @@ from common.imu.stillness import Stillness
 from common.messages import ImuSample
 
 _SETTLED_RAD = radians(6.0)  # reached nine tenths of a second after the first sample
-_BRIDGED_S, _BRIDGED_SAMPLES = 0.1, 3.0  # a longer gap may hide a turn that no rate measures
-_CLOCK_S = 1.0  # a sample so much older than the last is not late: a clock was set back
-_RATE_RAD_S, _FORCE_M_S2 = 100.0, 2000.0  # beyond any range there is (4000 deg/s, 200 g)
-_FALLING_M_S2 = 1.0  # shorter forces have no direction
-_BIAS_MOST_RAD_S, _SCALE_MOST = 3.0 * BIAS_RAD_S, 0.03  # three sigma of what they begin with
+_BIAS_MOST_RAD_S = 3.0 * BIAS_RAD_S  # three sigma of what they begin with
 _GATE_RAD_S = radians(0.1)  # three of it beyond what is estimated: rather a slow turn
-_CONTRARY_S = 6.0  # of such rest: an even turn hardly lasts so long, rather the bias was learnt in one
 _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 
 
@@ -60,7 +55,8 @@ class OrientationFilter:
         """
         self.counts: Counter[str] = Counter()
         self._period_s = 1.0 / rate_hz
-        self._bridged_s = max(_BRIDGED_S, _BRIDGED_SAMPLES / rate_hz)
+        bridged_s, bridged_samples = 0.1, 3.0  # a longer gap may hide a turn that no rate measures
+        self._bridged_s = max(bridged_s, bridged_samples / rate_hz)
         self._q: Wxyz | None = None
         self._errors, self._stillness = ErrorState(), Stillness()
         self._bias, self._scale, self._velocity = _ZERO, _ZERO, np.zeros(2)
@@ -107,10 +103,12 @@ class OrientationFilter:
     def _pushed(self, sample: ImuSample) -> Float:
         """Process a sample and return the orientation (4,) at its time."""
         rate, force = sample.gyro_rad_s, sample.accel_m_s2
-        if not np.abs(rate).max() < _RATE_RAD_S:
+        rate_rad_s, force_m_s2 = 100.0, 2000.0  # beyond any range there is (4000 deg/s, 200 g)
+        if not np.abs(rate).max() < rate_rad_s:
             self.counts["fusion.missing"] += 1
             return _NONE
-        falls = not _FALLING_M_S2 < np.abs(force).max() < _FORCE_M_S2
+        falling_m_s2 = 1.0  # shorter forces have no direction
+        falls = not falling_m_s2 < np.abs(force).max() < force_m_s2
         if falls:
             self.counts["fusion.no_gravity"] += 1
         if self._q is None:
@@ -119,7 +117,8 @@ class OrientationFilter:
                 self._last_ns, self._last_rate = sample.t_ns, rate
             return _NONE
         step_s = 1e-9 * (sample.t_ns - self._last_ns)
-        if -_CLOCK_S < step_s <= 0.0:
+        clock_s = 1.0  # a sample so much older than the last is not late: a clock was set back
+        if -clock_s < step_s <= 0.0:
             self.counts["fusion.late"] += 1
             return _NONE
         if 0.0 < step_s <= self._bridged_s:
@@ -160,8 +159,9 @@ class OrientationFilter:
             self._agreed_s = self._contrary_s = 0.0
         else:
             self._contrary_s += step_s
-        if self._contrary_s > _CONTRARY_S:
-            self._errors.contradicted(sqrt(off @ off) * (self._agreed_s + _CONTRARY_S))
+        contrary_s = 6.0  # of such rest: an even turn hardly lasts so long, rather the bias was learnt in one
+        if self._contrary_s > contrary_s:
+            self._errors.contradicted(sqrt(off @ off) * (self._agreed_s + contrary_s))
             self._contrary_s = 0.0
         self._correct(self._errors.rest(step_s, np.clip(off, -most, most)))
 
@@ -171,7 +171,8 @@ class OrientationFilter:
             x, y, z = errors[ATTITUDE].tolist()
             self._q = _unit(quaternion_product(_small(x, y, z), self._q))
         self._bias = np.clip(self._bias + errors[BIAS], -_BIAS_MOST_RAD_S, _BIAS_MOST_RAD_S)
-        self._scale = np.clip(self._scale + errors[SCALE], -_SCALE_MOST, _SCALE_MOST)
+        scale_most = 0.03  # three sigma of what they begin with
+        self._scale = np.clip(self._scale + errors[SCALE], -scale_most, scale_most)
         self._velocity = self._velocity + errors[VELOCITY]
 
 

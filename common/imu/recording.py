@@ -33,7 +33,6 @@ HEADERS = tuple(
     for quaternion in ((), _QUATERNION, (*_QUATERNION, _DRIFT))
 )
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
-_MOST = 1e6  # no sensor gives as much, in any of the units
 _LOG = logging.getLogger(__name__)
 
 
@@ -131,6 +130,7 @@ def _number(where: str, name: str, text: str) -> float:
         value = float(text)
     except ValueError as error:
         raise RecordingError(f"{where}: {name}: {text!r} is not a number") from error
-    if abs(value) > _MOST:
-        raise RecordingError(f"{where}: {name}: {text!r} is not a finite number, or above {_MOST:g}")
+    most = 1e6  # no sensor gives as much, in any of the units
+    if abs(value) > most:
+        raise RecordingError(f"{where}: {name}: {text!r} is not a finite number, or above {most:g}")
     return value

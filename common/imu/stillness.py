@@ -14,10 +14,8 @@ import numpy as np
 
 from common.arrays import Float
 
-_FOR_S = 1.5
-_SAMPLE_RAD_S, _SAMPLE_M_S2 = radians(2.0), 0.5
-_SHORT_S, _SHORT_RAD_S, _SHORT_M_S2 = 0.3, radians(0.5), 0.1
-_LONG_S = 4.0
+_SAMPLE_RAD_S = radians(2.0)
+_SHORT_RAD_S = radians(0.5)
 _BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias (`Doubt`)
 
 
@@ -34,7 +32,8 @@ class Stillness:
     @property
     def still(self) -> bool:
         """Whether it lay still until now."""
-        return self._since_s >= _FOR_S
+        for_s = 1.5
+        return self._since_s >= for_s
 
     def moved(self) -> None:
         """Begin anew: what happened is not known."""
@@ -48,9 +47,11 @@ class Stillness:
             self._rate, self._force = _Means(gyro_rad_s), _Means(accel_m_s2)
             return
         self._since_s += step_s
+        sample_m_s2 = 0.5
+        short_m_s2 = 0.1
         if (
             self._rate.left(self._since_s, step_s, gyro_rad_s, _SAMPLE_RAD_S, _SHORT_RAD_S)
-            or self._force.left(self._since_s, step_s, accel_m_s2, _SAMPLE_M_S2, _SHORT_M_S2)
+            or self._force.left(self._since_s, step_s, accel_m_s2, sample_m_s2, short_m_s2)
             or np.abs(self._rate.long).max() > _BIAS_RAD_S
         ):
             self.moved()
@@ -68,7 +69,9 @@ class _Means:
         True where the value is farther from it than `sample`, or the short mean farther than `short`.
         """
         off = value - self.long
-        self.short = self.short + step_s / min(since_s + step_s, _SHORT_S) * (value - self.short)
-        self.long = self.long + step_s / min(since_s + step_s, _LONG_S) * off
+        short_s = 0.3
+        self.short = self.short + step_s / min(since_s + step_s, short_s) * (value - self.short)
+        long_s = 4.0
+        self.long = self.long + step_s / min(since_s + step_s, long_s) * off
         apart = self.short - self.long
         return bool(off @ off > sample**2 or apart @ apart > short**2)

@@ -27,18 +27,7 @@ import numpy as np
 from common.arrays import Float
 
 AT_LEAST = 5  # echoes before the offset is used
-DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twice this (Pi: +-100 ppm each)
-WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
-SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
-SUSPECTS_AMONG = 20  # so many echoes
-_REFIT_SHARE = 16  # refit when one echo in so many is new: less moves the band by next to nothing
-_REFIT_NS = 500_000_000  # or when the fit is so old
-_FLOOR_NS = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
-_EDGE_SHARE = 8  # one echo in so many determines how sharp the edge of a cloud is
-_SOFT_EDGE = 1.5  # few delays are quite as short as an exponential law would have it
-_WIDEST_DRIFT = 800e-6  # a clock that is slewed by its time service: 500 ppm
 _GRID: Float = np.linspace(-1.0, 1.0, 33)
-_ZOOMS = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +68,8 @@ class ClockEstimate:
 
         It grows with the time since the newest echo, as the drift is known and as a crystal wanders.
         """
-        drift = 1e-6 * hypot(self.drift_sigma_ppm, WANDER_PPM) * (t_local_ns - self.t_ns)
+        wander_ppm = 1.0  # a crystal's rate changes by so much with its temperature within minutes
+        drift = 1e-6 * hypot(self.drift_sigma_ppm, wander_ppm) * (t_local_ns - self.t_ns)
         return hypot(self.sigma_ns, drift)
 
     def sigma_at(self, t_local_ns: int) -> float:
@@ -147,10 +137,12 @@ class OffsetEstimator:
             self._echoes.popleft()
         self._unfitted += 1
         known = self._estimate
+        refit_share = 16  # refit when one echo in so many is new: less moves the band by next to nothing
+        refit_ns = 500_000_000  # or when the fit is so old
         if (
             known is None
-            or self._unfitted * _REFIT_SHARE >= len(self._echoes)
-            or echo.t_ns - known.t_ns >= _REFIT_NS
+            or self._unfitted * refit_share >= len(self._echoes)
+            or echo.t_ns - known.t_ns >= refit_ns
         ):
             self._estimate = _fit(self._echoes)
             self._unfitted = 0
@@ -168,13 +160,15 @@ class OffsetEstimator:
         if wrong or self._suspects:
             self._since.append(echo)
             self._suspects += wrong
-        if self._suspects >= SUSPECTS_TO_RESTART:
+        suspects_to_restart = 3  # echoes that contradict: one may be a freak
+        if self._suspects >= suspects_to_restart:
             self.steps += 1
             self._echoes.clear()
             self._echoes.extend(self._since[:-1])
             self._estimate = None  # of the clock before the step
             wrong = False
-        if self._suspects >= SUSPECTS_TO_RESTART or len(self._since) >= SUSPECTS_AMONG:
+        suspects_among = 20  # so many echoes
+        if self._suspects >= suspects_to_restart or len(self._since) >= suspects_among:
             self._since, self._suspects = [], 0
         return wrong
 
@@ -217,7 +211,9 @@ class _OffsetBounds:
         gap, other_gap = _spacing(there - shift[widest]), _spacing(back + shift[widest])
         middle_time = drift * t_s.mean()
         log = (wall + middle_time) / gap + (other - middle_time) / other_gap
-        log -= 0.5 * (drift * (1e-9 / DRIFT_PRIOR)) ** 2
+        # standard deviation; two crystals differ by less than twice this (Pi: +-100 ppm each)
+        drift_prior = 100e-6
+        log -= 0.5 * (drift * (1e-9 / drift_prior)) ** 2
         share = np.exp(log - log.max())
         share /= share.sum()
         middle = 0.5 * ((wall - gap) - (other - other_gap))
@@ -243,8 +239,10 @@ def _fit(echoes: deque[_Echo]) -> ClockEstimate:
     base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
     t_s = (table[:, 0] - newest).astype(np.float64) * 1e-9
     there, back = (table[:, 1] - base).astype(np.float64), (table[:, 2] + base).astype(np.float64)
-    found = _OffsetBounds.of(t_s, there, back, 0.0, _WIDEST_DRIFT * 1e9)
-    for _ in range(_ZOOMS):
+    widest_drift = 800e-6  # a clock that is slewed by its time service: 500 ppm
+    found = _OffsetBounds.of(t_s, there, back, 0.0, widest_drift * 1e9)
+    zooms = 6
+    for _ in range(zooms):
         if found.drift_sigma > 2.0 * found.step:
             break
         found = _OffsetBounds.of(t_s, there, back, found.drift, 4.0 * max(found.drift_sigma, found.step))
@@ -264,8 +262,11 @@ def _spacing(delay_ns: Float) -> float:
     It estimates how far the shortest delay is from the shortest possible one.
     """
     n = len(delay_ns)
+    floor_ns = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
     if n < AT_LEAST:
-        return max(_FLOOR_NS, float(delay_ns.max() - delay_ns.min()))
-    count = max(AT_LEAST - 1, n // _EDGE_SHARE)
+        return max(floor_ns, float(delay_ns.max() - delay_ns.min()))
+    edge_share = 8  # one echo in so many determines how sharp the edge of a cloud is
+    count = max(AT_LEAST - 1, n // edge_share)
     shortest = np.partition(delay_ns, count)[: count + 1]
-    return max(_FLOOR_NS, _SOFT_EDGE * float(shortest.max() - shortest.min()) / count)
+    soft_edge = 1.5  # few delays are quite as short as an exponential law would have it
+    return max(floor_ns, soft_edge * float(shortest.max() - shortest.min()) / count)

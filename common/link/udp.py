@@ -11,7 +11,6 @@ from common.errors import BusError
 from common.link.datagram import MAX_DATAGRAM, Address
 
 READ_TIMEOUT_S = 0.01  # the grid of everything that a reading thread repeats in between
-_RECEIVE_BUFFER = 1 << 20
 
 
 class UdpSocket:
@@ -36,7 +35,8 @@ class UdpSocket:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if broadcast:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        receive_buffer = 1 << 20
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
         # The kernel's own receive timeout: `settimeout` would make `send` wait as well.
         timeout = struct.pack("ll", 0, round(timeout_s * 1e6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)

@@ -38,7 +38,6 @@ MAX_COUNT = 2**63 - 1
 MAX_TIME_NS = 2**61  # 73 years; sums and differences of two stay within 63 bits
 MAX_NUMBER = 1e18
 _UNIT = 1.001  # an element of a unit quaternion, rounded
-_LENGTH = 0.1  # by how much the squared length of a quaternion may miss 1
 
 
 class OutOfBoundsError(ValueError):
@@ -244,7 +243,8 @@ def refuse_bad_quaternion(message: Message, field: str) -> None:
         OutOfBoundsError: Its squared length misses 1 by more than a tenth.
     """
     w, x, y, z = getattr(message, field).tolist()
-    if abs(w * w + x * x + y * y + z * z - 1.0) > _LENGTH:
+    length = 0.1  # by how much the squared length of a quaternion may miss 1
+    if abs(w * w + x * x + y * y + z * z - 1.0) > length:
         raise OutOfBoundsError(f"{field}: a quaternion of squared length {w * w + x * x + y * y + z * z:g}")
 
 

@@ -13,7 +13,6 @@ from common.calibration import parse
 from common.errors import CalibrationError
 from common.messages import Name
 
-_LONGEST = 64  # of a `Name`
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 
 
@@ -58,8 +57,9 @@ def refuse_strange(name: str, where: str) -> None:
     Raises:
         CalibrationError: It is another; the text begins with `where`.
     """
-    if not _PLAIN.fullmatch(name) or len(name) > _LONGEST:
+    longest = 64  # of a `Name`
+    if not _PLAIN.fullmatch(name) or len(name) > longest:
         raise CalibrationError(
-            f"{where}: {name!r}: must be letters, digits, _ . -, not begin with a dot, and have at most {_LONGEST} "
+            f"{where}: {name!r}: must be letters, digits, _ . -, not begin with a dot, and have at most {longest} "
             "characters"
         )

@@ -25,10 +25,6 @@ SUMMARY_BYTES = 64 << 20  # a day of chunks takes 26 MiB
 AROUND_BYTES = 1024  # of a record, beside its content; and all that a header may have
 
 BEYOND = "more than a file of this size can hold"
-_FREE_BYTES = 16 << 20  # that a pass may unpack of the smallest file
-_RATIO = 256  # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
-_INDEX_BYTES = 16  # of the file, for each message in it
-_NAMED = 5
 
 
 class WorkBudget:
@@ -39,8 +35,12 @@ class WorkBudget:
 
     def __init__(self, file_bytes: int) -> None:
         """Of a file of that size."""
-        self._bytes = _FREE_BYTES + _RATIO * file_bytes
-        self._records = CHUNK_RECORDS + file_bytes // _INDEX_BYTES
+        free_bytes = 16 << 20  # that a pass may unpack of the smallest file
+        # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
+        ratio = 256
+        self._bytes = free_bytes + ratio * file_bytes
+        index_bytes = 16  # of the file, for each message in it
+        self._records = CHUNK_RECORDS + file_bytes // index_bytes
 
     def holds(self, records: int) -> bool:
         """Whether there may be so many records more."""
@@ -76,7 +76,8 @@ class Losses:
     def add(self, what: str) -> None:
         """Count one."""
         self.count += 1
-        if len(self.named) < _NAMED:
+        named = 5
+        if len(self.named) < named:
             text = what[:200]
             if not text.isprintable():
                 text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in text)

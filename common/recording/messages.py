@@ -39,8 +39,6 @@ from common.recording.mcap_file import McapContent, messages_of, read_content
 from common.recording.parts import channel_names, check_files, refuse_misplaced
 
 PROFILE = "phalanx"
-_CHUNK_NS = 500_000_000
-_CHUNK_BYTES = 512 << 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +92,8 @@ class MessageWriter:
         except OSError as error:
             raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
         self._path, self._out = path, Output(self._disk)
-        self._writer = Writer(cast(io.BufferedWriter, self._out), _CHUNK_BYTES)
+        chunk_bytes = 512 << 10
+        self._writer = Writer(cast(io.BufferedWriter, self._out), chunk_bytes)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str, str], int] = {}
         self._chunk_ns: int | None = None
@@ -123,7 +122,8 @@ class MessageWriter:
             self._chunk_ns = t_ns
         data = encode(message)
         self._do(lambda: self._add(stream, message, data, t_ns))
-        if not 0 <= t_ns - self._chunk_ns < _CHUNK_NS:
+        chunk_ns = 500_000_000
+        if not 0 <= t_ns - self._chunk_ns < chunk_ns:
             self.flush()
 
     def flush(self) -> None:

@@ -23,7 +23,6 @@ from common.arrays import Float
 from common.calibration.replacing import replacing
 from common.errors import RecordingError
 
-MOST_BYTES = 4 << 30  # of a file of our own: six hours of poses
 PACKED_BYTES = 256 << 20  # unpacked, of a file that is smaller itself: what a bomb may cost
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can carry: equal content gives equal bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of NumPy; others are unpacked without a bound
@@ -65,7 +64,8 @@ def read_npz(
     fix: str = "",
     also: Iterable[str] = (),
     *,
-    most_bytes: int = MOST_BYTES,
+    # of a file of our own: six hours of poses
+    most_bytes: int = 4 << 30,
 ) -> dict[str, Float]:
     """Arrays by name, as they are stored.
 

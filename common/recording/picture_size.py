@@ -13,7 +13,6 @@ from common.errors import PictureError
 
 MAX_SIDE_PX = 16384  # of any picture: several times the largest sensor
 MAX_PIXELS = 2**26  # of a picture in a message: 64 megapixels, 200 MB in colour
-MAX_SEGMENTS = 512  # before the frame header; a file with an ICC profile of 255 parts has fewer
 MAX_SCANS = 64  # of a JPEG: libjpeg writes 10 at most, and each one costs a pass over the whole picture
 
 Size = tuple[int, int]  # width, height [px]
@@ -22,9 +21,7 @@ _JPEG, _PNG, _BMP = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM"
 _TIFF = {b"II*\0": "little", b"MM\0*": "big"}
 _TABLES = (0xC4, 0xC8, 0xCC)  # in the range of frame headers, but none
 _ALONE = (0x00, 0x01, *range(0xD0, 0xDB))  # without a length, or past the header: SOI, EOI, SOS
-_TIFF_WIDTH, _TIFF_HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323
 _TIFF_BYTES = {3: 2, 4: 4}  # SHORT, LONG: the kinds that a size may have
-_TILE_PX = 1024  # a tile may be larger than a small picture, up to this
 
 
 def is_jpeg_or_png(data: bytes) -> bool:
@@ -60,7 +57,8 @@ def jpeg_size(data: bytes) -> Size:
     if not data.startswith(_JPEG):
         raise PictureError("is no JPEG")
     at = 2
-    for _ in range(MAX_SEGMENTS):
+    max_segments = 512  # before the frame header; a file with an ICC profile of 255 parts has fewer
+    for _ in range(max_segments):
         head = data[at : at + 9]
         if len(head) < 9 or head[0] != 0xFF:
             break
@@ -113,16 +111,18 @@ def _tiff_size(data: bytes) -> Size:
 
     directory = number(4, 4)
     found = dict[int, int]()
+    tiff_width, tiff_height, tile_width, tile_height = 256, 257, 322, 323
     for at in range(directory + 2, directory + 2 + 12 * number(directory, 2), 12):
         tag, width = number(at, 2), _TIFF_BYTES.get(number(at + 2, 2))
-        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, _TILE_WIDTH, _TILE_HEIGHT) and tag not in found:
+        if tag in (tiff_width, tiff_height, tile_width, tile_height) and tag not in found:
             if width is None:
                 raise PictureError("is a TIFF whose header is cut or odd")
             found[tag] = number(at + 8, width)
-    if not {_TIFF_WIDTH, _TIFF_HEIGHT} <= found.keys():
+    if not {tiff_width, tiff_height} <= found.keys():
         raise PictureError("is a TIFF whose header is cut or odd")
-    size = found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
-    tile = found.get(_TILE_WIDTH, 0), found.get(_TILE_HEIGHT, 0)
-    if any(of_tile > max(of_all + 15, _TILE_PX) for of_tile, of_all in zip(tile, size, strict=True)):
+    size = found[tiff_width], found[tiff_height]
+    tile = found.get(tile_width, 0), found.get(tile_height, 0)
+    tile_px = 1024  # a tile may be larger than a small picture, up to this
+    if any(of_tile > max(of_all + 15, tile_px) for of_tile, of_all in zip(tile, size, strict=True)):
         raise PictureError(f"is a TIFF of {size[0]}x{size[1]} px in tiles of {tile[0]}x{tile[1]}")
     return size

@@ -12,8 +12,6 @@ from common.errors import RecordingError
 from common.recording.npz import read_npz
 
 TRUTH = "truth.npz"
-_TABLE_BYTES = 256 << 20  # a row has some 45 bytes; three cameras at 90 Hz write 44 MB of them an hour
-_TRUTH_BYTES = 256 << 20  # unpacked; a frame has some 3 kB: 20 minutes at 60 Hz
 
 
 def read_table(folder: Path, name: str) -> str:
@@ -27,8 +25,9 @@ def read_table(folder: Path, name: str) -> str:
     refuse_links(folder, [name])
     try:
         about = path.stat()
-        if not stat.S_ISREG(about.st_mode) or about.st_size > _TABLE_BYTES:
-            raise RecordingError(f"{path}: must be a plain file of at most {_TABLE_BYTES >> 20} MiB")
+        table_bytes = 256 << 20  # a row has some 45 bytes; three cameras at 90 Hz write 44 MB of them an hour
+        if not stat.S_ISREG(about.st_mode) or about.st_size > table_bytes:
+            raise RecordingError(f"{path}: must be a plain file of at most {table_bytes >> 20} MiB")
         return path.read_bytes().decode()
     except FileNotFoundError:
         raise
@@ -62,7 +61,8 @@ def read_truth(
         RecordingError: It is missing, broken, too large, no plain file, leads out of the folder, or lacks a name.
     """
     refuse_links(folder, [TRUTH])
-    return read_npz(folder / TRUTH, names, fix, also, most_bytes=_TRUTH_BYTES)
+    truth_bytes = 256 << 20  # unpacked; a frame has some 3 kB: 20 minutes at 60 Hz
+    return read_npz(folder / TRUTH, names, fix, also, most_bytes=truth_bytes)
 
 
 def refuse_links(folder: Path, names: Iterable[str]) -> None:

@@ -20,7 +20,6 @@ from common.errors import PictureError
 
 ENDINGS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 _MATROSKA = b"\x1a\x45\xdf\xa3"  # EBML, RFC 8794
-_GIVE_UP = 50  # frames in a row that do not decode, where the container does not state how many it has
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +113,8 @@ class VideoFrames:
         number: list[int] = []
         shown_ms: list[float] = []
         failed = 0
-        while failed < _GIVE_UP:
+        give_up = 50  # frames in a row that do not decode, where the container does not state how many it has
+        while failed < give_up:
             self._step()
             if self._decoded:
                 number.append(self._number)

@@ -24,15 +24,11 @@ from common.sim.light import Float32, SrgbTables
 
 COLUMNS, ROWS = 9, 6  # inner corners
 SQUARE_M = 0.025
-MARGIN_M = 0.0125  # white paper around the squares
 TEXELS_PER_M = 8000.0
 FINE = 3  # rays per pixel and axis
 POSES = 24
 HELD_S, MOVED_S = 1.6, 0.6
-NEAR_M, FAR_M = 0.34, 0.70
 TILT_RAD, ROLL_RAD = np.radians(38.0), np.radians(25.0)
-WHITE, BLACK, WALL = 0.62, 0.035, 0.10  # linear light
-INTO_VIEW = 0.92  # share of the half view that corners may reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,13 +195,15 @@ class BoardRenderer:
 def _printed() -> Print:
     """The board, a share of 1 being all light; its origin is the first inner corner."""
     step = round(SQUARE_M * TEXELS_PER_M)
-    margin = round(MARGIN_M * TEXELS_PER_M)
+    margin_m = 0.0125  # white paper around the squares
+    margin = round(margin_m * TEXELS_PER_M)
     y, x = np.indices(((ROWS + 1) * step, (COLUMNS + 1) * step)) // step
-    squares = np.where((x + y) % 2 == 0, BLACK, WHITE).astype(np.float32)
-    texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(WHITE,))
+    white, black, wall = 0.62, 0.035, 0.10  # linear light
+    squares = np.where((x + y) % 2 == 0, black, white).astype(np.float32)
+    texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(white,))
     # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
     corner = np.full(2, margin + step - 0.5)
-    return Print(np.asarray(texture, np.float32), corner, WALL, np.zeros(3), np.ones(3))
+    return Print(np.asarray(texture, np.float32), corner, wall, np.zeros(3), np.ones(3))
 
 
 def _poses(optics: list[CameraModel], seed: int) -> Float:
@@ -234,9 +232,11 @@ def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
 
     Its middle is anywhere in the view.
     """
-    z = 1.0 / rng.uniform(1.0 / FAR_M, 1.0 / NEAR_M)
+    near_m, far_m = 0.34, 0.70
+    z = 1.0 / rng.uniform(1.0 / far_m, 1.0 / near_m)
     reach = np.array([camera.width_px / camera.matrix[0, 0], camera.height_px / camera.matrix[1, 1]]) / 2.0
-    middle = np.append(rng.uniform(-1.0, 1.0, 2) * INTO_VIEW * reach, 1.0) * z
+    into_view = 0.92  # share of the half view that corners may reach
+    middle = np.append(rng.uniform(-1.0, 1.0, 2) * into_view * reach, 1.0) * z
     T = np.eye(4)
     most = np.array([TILT_RAD, TILT_RAD, ROLL_RAD])
     T[:3, :3] = cv2.Rodrigues(rng.uniform(-most, most))[0]

@@ -16,9 +16,7 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.sim.light import DESK_LINEAR_RGB, to_srgb
 
-TEXEL_M = 0.001
 SIDE = 1536
-NOISE_SIGMA = 1.7  # in sRGB levels: gamma turns shot noise into a nearly constant amplitude
 NOISE_MARGIN = 96
 LENS_SIGMA_PX = 0.62
 
@@ -33,7 +31,8 @@ def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
     along = (depth_m - optics.centre[2]) / np.where(rays[:, 2] > 0.05, rays[:, 2], 0.05)
     points = transform(np.eye(4), optics.centre + along[:, None] * rays)
-    texel = (points[:, :2] / TEXEL_M + SIDE / 2).reshape(height, width, 2).astype(np.float32)
+    texel_m = 0.001
+    texel = (points[:, :2] / texel_m + SIDE / 2).reshape(height, width, 2).astype(np.float32)
     wear = cv2.remap(
         _wear(seed), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
@@ -87,7 +86,8 @@ class NoiseTiles:
             white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3))
             # A colour filter array mixes neighbours.
             mixed: Float = np.asarray(cv2.GaussianBlur(white, (3, 3), 0.45), dtype=np.float64)
-            level = np.rint(mixed * (NOISE_SIGMA * np.array([1.25, 0.85, 1.1]) / float(mixed.std())))
+            noise_sigma = 1.7  # in sRGB levels: gamma turns shot noise into a nearly constant amplitude
+            level = np.rint(mixed * (noise_sigma * np.array([1.25, 0.85, 1.1]) / float(mixed.std())))
             plus.append(np.clip(level, 0, 255).astype(np.uint8))
             minus.append(np.clip(-level, 0, 255).astype(np.uint8))
         return cls(tuple(plus), tuple(minus))

@@ -26,10 +26,8 @@ _REACH_DEG = (
     ((-5, 42, 42), (80, 32)),
 )
 KNOB_DEG = ((26, 22, 18), (8, 38, 44), (2, 42, 46), (-6, 42, 46), (-12, 38, 44))
-PRESSED_M, HOVER_M = 0.0005, 0.020
+PRESSED_M = 0.0005
 KNOB_M = (0.020, 0.026)  # radius of knobs
-_STEPS, _DAMPING, _NUDGE_DEG = 24, 0.05, 0.25
-_OTHERS_CLEAR_M, _KEY_CLEAR_M = 0.016, 0.0035
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +105,8 @@ def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
         face = np.stack(
             [1.0 - np.vecdot(way, posed.palmar(0, 2)), 1.0 + np.vecdot(way, posed.palmar(finger, 2))], axis=1
         )
-        clear = np.maximum(_OTHERS_CLEAR_M - found.gap_m[:, [f - 1 for f in others]], 0.0)
+        others_clear_m = 0.016
+        clear = np.maximum(others_clear_m - found.gap_m[:, [f - 1 for f in others]], 0.0)
         return np.concatenate([(gap[:, None] + PRESSED_M) / 2e-4, face / 0.4, clear / 2e-3], axis=1)
 
     free = np.array([0, 1, 2, *range(3 * finger, 3 * finger + 3)])
@@ -162,7 +161,8 @@ def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
     Straight off the skin.
     """
     there = Posed.of(model, key.posture_deg[None], wobble)
-    target = there.joints_m[0, TIPS[0]] + HOVER_M * there.palmar(key.finger, key.segment)[0]
+    hover_m = 0.020
+    target = there.joints_m[0, TIPS[0]] + hover_m * there.palmar(key.finger, key.segment)[0]
 
     def misses(posed: Posed) -> Float:
         return (posed.joints_m[:, TIPS[0]] - target) / 2e-3
@@ -240,11 +240,14 @@ def _solved(
         return np.concatenate([out, x / width_deg], axis=1)
 
     x = np.zeros(len(free))
-    steps = np.concatenate([np.zeros((1, len(free))), _NUDGE_DEG * np.eye(len(free))])
+    nudge_deg = 0.25
+    steps = np.concatenate([np.zeros((1, len(free))), nudge_deg * np.eye(len(free))])
     here = residuals(x + steps)
-    best_x, best, damping = x, float(here[0] @ here[0]), _DAMPING
-    for _ in range(_STEPS):
-        jacobian = (here[1:] - here[0]) / _NUDGE_DEG
+    # damping
+    best_x, best, damping = x, float(here[0] @ here[0]), 0.05
+    # steps
+    for _ in range(24):
+        jacobian = (here[1:] - here[0]) / nudge_deg
         square = jacobian @ jacobian.T
         move: Float = np.asarray(
             np.linalg.solve(square + damping * np.diag(np.diag(square)), jacobian @ here[0]), np.float64
@@ -287,6 +290,7 @@ def reachable_keys(model: HandModel, wobble: Float) -> tuple[Key, ...]:
             gap, on = found.gap_m[0], float(found.on_b[0, finger - 1, segment])
             others = np.delete(gap, finger - 1, axis=0).min()
             touches = abs(float(gap[finger - 1, segment])) < 1e-3 and float(gap[finger - 1].min()) > -1.5e-3
-            if touches and others > _KEY_CLEAR_M and 0.2 < on < 0.8:
+            key_clear_m = 0.0035
+            if touches and others > key_clear_m and 0.2 < on < 0.8:
                 out.append(Key(finger, segment, posture))
     return tuple(out)

@@ -37,7 +37,6 @@ from common.sim.motion import FIST, POSES, REST, WAVE_CREST, Drift, HandState, W
 
 KEY_NAMES = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
 PERIOD_S = 75.0
-ROTATION_DEG = 14.0
 # Act -> two ways to show it: fingers towards the cameras, and rolled about them, 0: the palm to the cameras.
 _SHOWN_DEG = {
     "pinches": ((15.0, 0.0), (35.0, -30.0)),
@@ -316,10 +315,11 @@ class Gestures:
         """Fingers from posture to posture, the palm from place to place."""
         for _ in range(2):
             seconds = self._some(0.45, 0.7)
+            rotation_deg = 14.0
             place = np.concatenate(
                 [
                     self._rng.uniform(-1.0, 1.0, 3) * REACH_M,
-                    np.radians(ROTATION_DEG) * self._rng.uniform(-1.0, 1.0, 3),
+                    np.radians(rotation_deg) * self._rng.uniform(-1.0, 1.0, 3),
                 ]
             )
             self._place.to(place, self._now, self._now + seconds)

@@ -32,23 +32,17 @@ from common.sim.motion import (
 
 ROUNDS = 5
 ROUND_S = PERIOD_S / ROUNDS
-BAR_RADIUS_M, BAR_LENGTH_M = 0.012, 0.18
 # Seconds since the beginning of a round, before its pace.
 LEAVE_S, ARRIVE_S, CLOSED_S = 0.8, 2.4, 3.3
-LIFT_S, LIFTED_S, LOWER_S, LOWERED_S = 3.7, 4.8, 8.4, 9.5
+LIFT_S, LIFTED_S, LOWER_S = 3.7, 4.8, 8.4
 RELEASE_S, OPEN_S, BACK_S = 9.8, 10.5, 11.8
-_STILL_S = 0.5  # in which the hand comes to stand still, and moves again
-_ROTATION_S, _ROTATION_FADE_S = 1.7, 0.3
-ROTATION_DEG = 25.0
 PACE = (0.92, 1.0)
 LIFT_M = (0.08, 0.12)
 PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
-UP_M = 0.035  # of the bar above the middle of the view
 COMES_M = np.array([0.015, 0.0, -0.13])  # from there, palm axes
 LEAN_DEG = np.array(
     [-26.0, -10.0, 0.0]
 )  # of the whole hand: fingers and thumb a little away from the cameras
-FLEXED_DEG = 3.0
 SWAY_DEG, SWING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
 _OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
@@ -62,7 +56,7 @@ class Grasp:
         pace: (ROUNDS,) by what the times of each round are multiplied.
     """
 
-    def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = BAR_RADIUS_M) -> None:
+    def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = 0.012) -> None:
         """Write the script, and close the hand round the bar once.
 
         Takes some tenths of a second.
@@ -76,7 +70,8 @@ class Grasp:
         rng = np.random.default_rng([seed, 17])
         self._model, self._radius_m = model, radius_m
         self._drift, self._sway = Drift(rng), Waves(rng, 2)
-        place = rng.uniform(-1.0, 1.0, 3) * PLACE_M - np.array([0.0, UP_M, 0.0])
+        up_m = 0.035  # of the bar above the middle of the view
+        place = rng.uniform(-1.0, 1.0, 3) * PLACE_M - np.array([0.0, up_m, 0.0])
         self._centre = np.asarray(centre_m, dtype=np.float64) + place
         self._rest = np.array(REST, dtype=np.float64) + rng.normal(0.0, (1.0, 2.0, 3.0), (5, 3))
         self._open = np.array(_OPEN, dtype=np.float64)
@@ -114,11 +109,13 @@ class Grasp:
         near = _between(s, LEAVE_S, ARRIVE_S, OPEN_S, BACK_S)
         ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, OPEN_S + 0.3, BACK_S)
         closed = _between(s, ARRIVE_S, CLOSED_S, RELEASE_S, OPEN_S)
-        lifted = _between(s, LIFT_S, LIFTED_S, LOWER_S, LOWERED_S)
+        lowered_s = 9.5
+        lifted = _between(s, LIFT_S, LIFTED_S, LOWER_S, lowered_s)
         posture = self._rest + ready * (self._open - self._rest) + closed * (self._grip - self._open)
         angles = angles_of(self._model, posture, wobble + closed * (self._grip_wobble - wobble))
-        still = window(s, ARRIVE_S - _STILL_S, LIFT_S + _STILL_S, _STILL_S)
-        still += window(s, LOWERED_S - _STILL_S, OPEN_S + _STILL_S, _STILL_S)
+        still_s = 0.5  # in which the hand comes to stand still, and moves again
+        still = window(s, ARRIVE_S - still_s, LIFT_S + still_s, still_s)
+        still += window(s, lowered_s - still_s, OPEN_S + still_s, still_s)
         side = np.array([self._model.side_sign, 1.0, 1.0])
         shift = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
         shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
@@ -128,10 +125,12 @@ class Grasp:
         )
         held = CLOSED_S <= s < RELEASE_S
         bar = (pose if held else self._T_grip) @ self._T_palm_object
+        flexed_deg = 3.0
         wrist_angles = np.radians(
-            SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([FLEXED_DEG, 0.0])
+            SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([flexed_deg, 0.0])
         )
-        return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
+        bar_length_m = 0.18
+        return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, bar_length_m, held),))
 
     def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:
         """Return the palm rotation (3,) [rad] and wrist flexion (2,) [deg] of a round.
@@ -140,13 +139,15 @@ class Grasp:
         """
         rotation, swing = np.zeros(3), np.zeros(2)
         for place in (0, 1):
-            start = LIFTED_S + 0.1 + place * _ROTATION_S
-            if not start < s < start + _ROTATION_S:
+            rotation_s, rotation_fade_s = 1.7, 0.3
+            start = LIFTED_S + 0.1 + place * rotation_s
+            if not start < s < start + rotation_s:
                 continue
             which = int(self._first[k]) ^ place
-            inside = window(s, start, start + _ROTATION_S, _ROTATION_FADE_S)
-            swung = self._sign[k, place] * inside * np.sin(2.0 * np.pi * (s - start) / _ROTATION_S)
-            rotation[(2, 0)[which]] = np.radians(ROTATION_DEG) * swung
+            inside = window(s, start, start + rotation_s, rotation_fade_s)
+            swung = self._sign[k, place] * inside * np.sin(2.0 * np.pi * (s - start) / rotation_s)
+            rotation_deg = 25.0
+            rotation[(2, 0)[which]] = np.radians(rotation_deg) * swung
             swing[(1, 0)[which]] = SWING_DEG[(1, 0)[which]] * swung
         return rotation, swing
 

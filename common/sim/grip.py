@@ -14,14 +14,11 @@ from common.hand.model import CHAINS, MIDDLE_PROXIMAL, HandModel
 from common.sim.motion import angles_of
 
 MCP_PER_PIP = 0.54  # Kamper's ratio, in Kim et al. 2012
-ALONG_HAND = 1.04  # how far the bar's middle is from the wrist, against the middle knuckle
-BELOW_KNUCKLES = 0.92  # how far its back lies below that, in lengths of the middle finger's first phalanx
 ASLANT = np.radians(15.0)  # further from the wrist on the side of the thumb
 SPREAD_DEG = (0.0, 2.0, 0.0, 1.0, 4.0)  # closing fingers come together
 _ALONG = np.linspace(0.0, 1.0, 13)  # where on a bone its distance is taken
 _PIP_DEG = np.arange(0.0, 110.1, 1.0)
 _THUMB_DEG = (np.arange(-15.0, 45.1, 5.0), np.arange(-12.5, 45.1, 2.5), np.arange(0.0, 55.1, 5.0))
-_NEAR, _TOUCHES_M, _PRESSED_M, _ACROSS_M = 200, 0.0012, 0.0010, 0.012
 
 
 def bar_in_palm(model: HandModel, radius_m: float) -> Float:
@@ -33,7 +30,9 @@ def bar_in_palm(model: HandModel, radius_m: float) -> Float:
     rotation = np.stack([np.cross([0.0, 1.0, 0.0], axis), [0.0, 1.0, 0.0], axis], axis=1)
     _, y, z = model.rest_position_m[MIDDLE_PROXIMAL].tolist()
     phalanx_m = float(np.linalg.norm(model.bone_m[2, 0]))
-    return rigid(rotation, np.array([0.0, y - BELOW_KNUCKLES * phalanx_m - radius_m, ALONG_HAND * z]))
+    along_hand = 1.04  # how far the bar's middle is from the wrist, against the middle knuckle
+    below_knuckles = 0.92  # how far its back lies below that, in lengths of the middle finger's first phalanx
+    return rigid(rotation, np.array([0.0, y - below_knuckles * phalanx_m - radius_m, along_hand * z]))
 
 
 def gaps_m(model: HandModel, angles_rad: Float, T_palm_object: Float, radius_m: float) -> Float:
@@ -86,15 +85,17 @@ def _thumb(
     angles = angles_of(model, posture, wobble)
     bones, girth = _phalanges(model, angles)
     to_bar = _clear_of(bones[:, 0], girth[:, 0], T_palm_object, radius_m).min(axis=(-1, -2))
-    near = np.argsort(np.abs(to_bar))[:_NEAR]
+    # near
+    near = np.argsort(np.abs(to_bar))[:200]
     own, own_girth = (
         bones[near, 0, 1:].reshape(len(near), -1, 1, 3),
         girth[near, 0, 1:].reshape(len(near), -1, 1),
     )
     others, other_girth = bones[0, 1:].reshape(-1, 3), girth[0, 1:].ravel()
     to_fingers = (np.linalg.norm(own - others, axis=-1) - own_girth - other_girth).min(axis=(1, 2))
-    out = np.maximum(np.abs(to_bar[near]) - _TOUCHES_M, 0.0) + np.maximum(-_PRESSED_M - to_fingers, 0.0)
-    tip = np.abs(bones[near, 0, 2, -1, 0] - _ACROSS_M * model.side_sign)
+    touches_m, pressed_m, across_m = 0.0012, 0.0010, 0.012
+    out = np.maximum(np.abs(to_bar[near]) - touches_m, 0.0) + np.maximum(-pressed_m - to_fingers, 0.0)
+    tip = np.abs(bones[near, 0, 2, -1, 0] - across_m * model.side_sign)
     return grid[near[int((tip + 100.0 * out).argmin())]]
 
 

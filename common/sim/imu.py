@@ -26,9 +26,7 @@ from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.scene import WristScene
 
 GRAVITY_M_S2 = 9.81
-_WANDER_RAD_S, _WANDER_S = radians(0.03), 200.0
-_HALF_STEP_S = 1e-3  # for accelerations
-_BEFORE_S, _AFTER_S = 2.0, 0.1  # a filter has to settle before the first frame
+_WANDER_RAD_S = radians(0.03)
 _NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
 
@@ -112,21 +110,24 @@ class SimulatedImu:
         `t_ns` counts from scene time 0 at `zero_ns`; there is none before that.
         """
         rate = self._imu.rate_hz
-        for seq in range(max(ceil((start_s - _BEFORE_S) * rate), 0), floor((stop_s + _AFTER_S) * rate) + 1):
+        before_s, after_s = 2.0, 0.1  # a filter has to settle before the first frame
+        for seq in range(max(ceil((start_s - before_s) * rate), 0), floor((stop_s + after_s) * rate) + 1):
             t_s = seq / rate
             yield self.sample(seq, t_s, zero_ns + round(t_s * 1e9))
 
     def bias_rad_s(self, t_s: float) -> Float:
         """Return the gyroscope bias (3,) [rad/s]: its reading at rest."""
-        return self._zero + _WANDER_RAD_S * np.sin(2.0 * pi * t_s / _WANDER_S + self._phase)
+        wander_s = 200.0
+        return self._zero + _WANDER_RAD_S * np.sin(2.0 * pi * t_s / wander_s + self._phase)
 
     def sample(self, seq: int, t_s: float, t_ns: int) -> ImuSample:
         """Sample `seq`, at scene time `t_s` [s], stamped `t_ns`."""
-        before, now, after = (self._motion.at(t_s + h).T_rig_palm for h in (-_HALF_STEP_S, 0.0, _HALF_STEP_S))
+        half_step_s = 1e-3  # for accelerations
+        before, now, after = (self._motion.at(t_s + h).T_rig_palm for h in (-half_step_s, 0.0, half_step_s))
         rig_imu = now[:3, :3] @ self._palm_imu
         last = self._motion.at(t_s - 1.0 / self._imu.rate_hz).T_rig_palm[:3, :3]
         step = matrix_to_rotation_vector(last.T @ now[:3, :3])  # palm axes
-        moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / _HALF_STEP_S**2
+        moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / half_step_s**2
         new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
         rate = (
             self._palm_imu.T @ step * self._imu.rate_hz

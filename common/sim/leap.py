@@ -24,7 +24,6 @@ from common.sim.motion import HandState, smooth_step
 KEYS = ("t", "hand0_joints", "hand0_palm", "hand0_normal", "hand0_direction", "hand0_type")
 RIG_FROM_LEAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 GRID_S = 0.02  # raw samples jitter; this is as fine as a hand moves
-RETURN_S = 1.0  # from the last pose smoothly back to the first
 REACH_M = np.array([0.13, 0.08, 0.10])
 
 
@@ -168,7 +167,8 @@ def _resample(even: Float, t: Float, values: Float) -> Float:
 
 def _close(values: Float) -> Float:
     """The samples with a smooth way from the last back to the first."""
-    steps = round(RETURN_S / GRID_S)
+    return_s = 1.0  # from the last pose smoothly back to the first
+    steps = round(return_s / GRID_S)
     share = np.array([smooth_step((k + 1) / (steps + 1)) for k in range(steps)])[:, None]
     first = values[0]
     if values.shape[1] == 4 and float(first @ values[-1]) < 0.0:

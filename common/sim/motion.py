@@ -23,9 +23,6 @@ from common.sim.held import Cylinder
 
 PERIOD_S = 60.0
 PEAK_SPEED_M_S = 1.0
-PALM_SWING_DEG = 20.0
-DRIFT_M = 0.006
-DRIFT_DEG = 2.0
 
 # Postures in degrees: rows thumb, index, middle, ring, little; columns abduction, flexion (MCP), PIP.
 # The thumb's columns are CMC abduction, CMC flexion, MCP and its IP follows the MCP.
@@ -221,7 +218,9 @@ class Drift:
     def at(self, t_s: float) -> tuple[Float, Float, Float]:
         """Wobble (5, 4) in -1..1, shift (3,) [m], turn (3,) [rad]."""
         value = self._waves.at(t_s)
-        return value[:20].reshape(5, 4), DRIFT_M * value[20:23], np.radians(DRIFT_DEG) * value[23:]
+        drift_m = 0.006
+        drift_deg = 2.0
+        return value[:20].reshape(5, 4), drift_m * value[20:23], np.radians(drift_deg) * value[23:]
 
 
 def _still(posture: Float) -> Change:
@@ -283,7 +282,8 @@ def _travel(direction: Float, rate_hz: float) -> Callable[[float], Change]:
 
 
 def _rotate_about(axes: tuple[int, ...], each_s: float) -> Callable[[float], Change]:
-    swing = np.radians(PALM_SWING_DEG)
+    palm_swing_deg = 20.0
+    swing = np.radians(palm_swing_deg)
 
     def change(s: float) -> Change:
         rotation = np.zeros(3)

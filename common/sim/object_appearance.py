@@ -17,7 +17,6 @@ from common.sim.surface import rim, unit
 from common.sim.things import LAYER_SINES
 
 Project = Callable[[Float], Float]
-FACING_LEAST = 0.02  # cosine to the line of sight from which on a sheet shows its front
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,13 +148,14 @@ class Appearances:
         at, uv = points.at[sheet.corners], points.uv[sheet.corners]
         middle = at[:4].mean(axis=0)
         out = unit(cross(at[3] - at[0], at[1] - at[0]))  # the corners go clockwise as it is printed
+        facing_least = 0.02  # cosine to the line of sight from which on a sheet shows its front
         return SeenSheet(
             sheet,
             middle,
             uv[:4],
             uv[4:],
             points.speed_uv[sheet.corners].mean(axis=0),
-            -float(out @ middle) / float(np.linalg.norm(middle)) > FACING_LEAST,
+            -float(out @ middle) / float(np.linalg.norm(middle)) > facing_least,
             float(out @ self.to_light),
             float(points.t_s[sheet.corners].mean()),
         )

@@ -20,8 +20,6 @@ from common.sim.view import Snapshot, View
 
 Float32 = npt.NDArray[np.float32]
 Box = tuple[int, int, int, int]
-SHINE_SHARE = 0.15  # radius of the glossy spot, share of the bead's
-TOUCHING_M = 0.001  # a tag lies on what it is stuck on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +110,8 @@ class ObjectPainter:
         for k, surface in enumerate(hand_before(snapshot, places)):
             depth = float(places.depth[k])
             over = (away < depth) & raster.overlaps(boxes[:, 0], boxes[:, 1], places.low[k], places.high[k])
-            things = things_before(snapshot, places, k, depth - TOUCHING_M, features[k][1])
+            touching_m = 0.001  # a tag lies on what it is stuck on
+            things = things_before(snapshot, places, k, depth - touching_m, features[k][1])
             nearer = (*things, *surface, *(hand[int(n)][0] for n in np.flatnonzero(over)), *cards)
             markers.append(raster.Marker(shapes[k], nearer))
         covers = raster.cover(markers, self._view.exposure_s, self._size)
@@ -135,7 +134,8 @@ class ObjectPainter:
         appearance[:] = shades[0]
         for band, shade in zip(bead.bands[1:], shades[1:], strict=True):
             raster.fill(appearance, raster.fixed(band - corner), shade)
-        spot = bead.shine_uv - corner + SHINE_SHARE * bead.shine_px * self._view.circle
+        shine_share = 0.15  # radius of the glossy spot, share of the bead's
+        spot = bead.shine_uv - corner + shine_share * bead.shine_px * self._view.circle
         raster.fill(appearance, raster.fixed(spot), self._shine[bead.bead.marker])
         return self._tables.decode(appearance)
 

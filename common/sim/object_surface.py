@@ -25,7 +25,6 @@ from common.geometry.transforms import invert, transform
 from common.sim.tracked import TrackedObjects
 
 PAPER_CELLS = 1.0  # of white about the black square of a tag
-ON_M = 0.003  # a tag as near as this to a block's surface is stuck on it
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +185,7 @@ def _block_under(shapes: Sequence[Shape], point: Float) -> int | None:
                 else transform(invert(np.array(shape.T_object_part)), point)
             )
             beyond = np.abs(own) - 0.5 * np.array(shape.size_m)
-            if abs(float(beyond.max())) < ON_M:
+            on_m = 0.003  # a tag as near as this to a block's surface is stuck on it
+            if abs(float(beyond.max())) < on_m:
                 return k
     return None

@@ -22,11 +22,8 @@ Complex = npt.NDArray[np.complex128]
 
 FIXED_BITS = 4
 SUPER = 6
-ARC_POINTS = 8
 HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
-BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
-ROOM_PX = 2.0  # around what a marker covers
 # Middles of 1 ... MAX_STEPS equal parts of an exposure of length 1, from its middle.
 _MOMENTS = tuple((np.arange(n) + 0.5) / n - 0.5 for n in range(1, MAX_STEPS + 1))
 
@@ -98,15 +95,16 @@ def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
     cosine = (radius_a - radius_b) / np.maximum(distance, 1e-9)
     tangent = np.arccos(cosine)
     sine = np.sqrt(1.0 - cosine * cosine)
-    arcs = np.empty((*distance.shape, 2, ARC_POINTS), dtype=np.complex128)
+    arc_points = 8
+    arcs = np.empty((*distance.shape, 2, arc_points), dtype=np.complex128)
     arcs[..., 0, 0] = radius_a * heading * (cosine + 1j * sine)
     arcs[..., 1, 0] = radius_b * heading * (cosine - 1j * sine)
-    step = np.array([np.pi - tangent, tangent]) * (2.0j / (ARC_POINTS - 1))
+    step = np.array([np.pi - tangent, tangent]) * (2.0j / (arc_points - 1))
     arcs[..., 1:] = np.moveaxis(np.exp(step), 0, -1)[..., None]
     arcs = arcs.cumprod(axis=-1)
     arcs[..., 0, :] += start[..., None]
     arcs[..., 1, :] += stop[..., None]
-    return arcs.view(np.float64).reshape(*distance.shape, 2 * ARC_POINTS, 2)
+    return arcs.view(np.float64).reshape(*distance.shape, 2 * arc_points, 2)
 
 
 def discs(centre: Float, radius: Float, circle: Float) -> Float:
@@ -166,7 +164,8 @@ def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -
     for marker in markers:
         stop = first + len(marker.shapes)
         offsets_s = moments(marker.outline, exposure_s)
-        reach = offsets_s[-1] * np.abs(marker.outline.velocity) + ROOM_PX
+        room_px = 2.0  # around what a marker covers
+        reach = offsets_s[-1] * np.abs(marker.outline.velocity) + room_px
         x0, y0 = map(floor, (low[first] - reach).tolist())
         x1, y1 = (ceil(edge) + 1 for edge in (high[first] + reach).tolist())
         own = slice(starts[first], starts[stop])
@@ -220,7 +219,8 @@ def moments(shape: Shape, exposure_s: float) -> Float:
     Moments (n,) [s] from the middle of the exposure: about one per pixel of motion.
     """
     way = hypot(*shape.velocity.tolist()) * exposure_s
-    n = min(max(ceil(way / BLUR_STEP_PX), 1), MAX_STEPS)
+    blur_step_px = 1.2
+    n = min(max(ceil(way / blur_step_px), 1), MAX_STEPS)
     return _MOMENTS[n - 1] * exposure_s
 
 

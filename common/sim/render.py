@@ -33,8 +33,6 @@ Box = tuple[int, int, int, int]
 
 _PALM = list(PALM_HULL)
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
-ROUND_LAYER = 2
-BEND_COSINE = 0.6  # a finger bent more than this is drawn in two parts, each at its own depth
 
 
 class Renderer:
@@ -152,7 +150,8 @@ class Renderer:
                 continue
             for layer in range(LAYERS):
                 shapes = [corners[k, layer] for k in part] if part else [*palm[layer]]
-                if not part and layer >= ROUND_LAYER:
+                round_layer = 2
+                if not part and layer >= round_layer:
                     shapes += [corners[k, layer] for k in ROOTS]  # knuckles and thumb flow out of the palm
                 for shape in shapes:
                     raster.fill(image, shape, self._skin[layer])
@@ -257,7 +256,8 @@ def _finger_parts(snapshot: Snapshot) -> list[tuple[int, ...]]:
     """Capsules of every finger, cut where it is strongly bent."""
     way = snapshot.points[CAPSULES[:, 1]] - snapshot.points[CAPSULES[:, 0]]
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-    straight = (way[1:] * way[:-1]).sum(axis=1) >= BEND_COSINE
+    bend_cosine = 0.6  # a finger bent more than this is drawn in two parts, each at its own depth
+    straight = (way[1:] * way[:-1]).sum(axis=1) >= bend_cosine
     parts: list[tuple[int, ...]] = []
     for f in range(5):
         part = (3 * f,)

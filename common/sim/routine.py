@@ -17,7 +17,6 @@ REACTION_S, TAIL_S = 1.0, 0.8
 PERIOD_S = REACTION_S + ROUTINE_S + TAIL_S
 LATE_S = (0.05, 0.45)  # by how much a step is begun late, least and most
 REST = 0.1  # share of the drift of a hand in the air that is left when the palm rests on something
-TILT_DEG = 15.0  # of the fingers towards the cameras
 
 
 class HandRoutine:
@@ -62,8 +61,9 @@ class HandRoutine:
     def _pose(self, shift_m: Float, rotation_rad: Float) -> Float:
         """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
         to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        tilt_deg = 15.0  # of the fingers towards the cameras
         rotation = (
-            rotation_vector_to_matrix(rotation_rad) @ axis_rotation(0, np.radians(TILT_DEG)) @ to_cameras
+            rotation_vector_to_matrix(rotation_rad) @ axis_rotation(0, np.radians(tilt_deg)) @ to_cameras
         )
         middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
         return rigid(rotation, self._centre + shift_m - rotation @ middle)

@@ -22,7 +22,6 @@ CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
 # The skin below the marker is a little smaller and shorter, so that it does not shine out around it.
 SKIN_UNDER_CAP = 0.86
-SKIN_BACK_SHARE = 0.4
 
 # Sphere indices: 4 f + k is joint k of finger f; then the rest of palm, web and sleeve.
 WRIST_SPHERES = (20, 21)
@@ -33,7 +32,6 @@ SPHERE_COUNT = 29
 PALM_HULL = (0, 4, 8, 12, 16, *WRIST_SPHERES, *METACARPAL_SPHERES)
 WEB_HULL = (0, 1, WEB_SPHERE)
 CAPSULES = np.array([[4 * f + k, 4 * f + k + 1] for f in range(5) for k in range(3)])
-SLEEVE_M = 0.45
 ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
 TO_ELBOW = 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
 
@@ -119,7 +117,8 @@ class HandSurface:
                 centroid = _JOINTS[4 * finger + 3] + mount.offset_m @ _AXES[4 * finger + 3]
                 centre = centroid - cap_centroid_ahead(1.0) * ahead
                 rows += [centre, centre - CYLINDER_SHARE * ahead]
-                rows[4 * finger + 3] = centre - SKIN_BACK_SHARE * ahead
+                skin_back_share = 0.4
+                rows[4 * finger + 3] = centre - skin_back_share * ahead
             else:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
@@ -136,7 +135,8 @@ class HandSurface:
         points = (self.weights @ _chain_rows(chains) + self.still) @ R
         way = unit(points[..., end, :] + TO_ELBOW)
         points += T_rig_palm[..., None, :3, 3]
-        points[..., end, :] = points[..., cuff, :] + SLEEVE_M * way
+        sleeve_m = 0.45
+        points[..., end, :] = points[..., cuff, :] + sleeve_m * way
         return points
 
 

@@ -19,7 +19,6 @@ from common.sim.objects_seen import SeenSheet
 Float32 = npt.NDArray[np.float32]
 INK, PAPER = 0.035, 0.72  # reflectance of toner and of office paper
 PAPER_BGR = np.array([0.97, 1.0, 1.0])
-FINE = 4  # rays per pixel and axis
 TEXELS = 8  # of a cell, when the tag is near
 _BLEED = 4  # texels of paper beyond its edge: what covers it decides where it ends
 
@@ -46,11 +45,12 @@ def sheet_appearance(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int
     texture = printed(seen.sheet.family, seen.sheet.number)
     own = len(texture) - 2 * _BLEED
     edge = _BLEED - 0.5 + own * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    size = (FINE * (x1 - x0), FINE * (y1 - y0))
+    fine = 4  # rays per pixel and axis
+    size = (fine * (x1 - x0), fine * (y1 - y0))
     total = np.zeros(size[::-1], np.float32)
     for moment in moments_s:
         # A pixel's middle is a whole number, its rays lie evenly about it.
-        uv = (seen.paper_uv + moment * seen.speed - [x0, y0] + 0.5) * FINE - 0.5
+        uv = (seen.paper_uv + moment * seen.speed - [x0, y0] + 0.5) * fine - 0.5
         way = cv2.getPerspectiveTransform(edge.astype(np.float32), uv.astype(np.float32))
         drawn = cv2.warpPerspective(
             texture, way, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

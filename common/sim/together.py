@@ -38,13 +38,10 @@ from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])
-CURL_S, STRAIGHT_DEG, CURL_PIP_DEG = 10.0, 4.0, 101.0
-MCP_PER_PIP = 0.54  # Kamper's ratio, in Kim et al. 2012
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
 _THUMB_DEG = np.array([[14.0, -6.0, 0.0], [6.0, 26.0, 26.0]])  # open, closed
-CURL_ROTATION_DEG = 14.0
-TRAVEL_S, TRAVEL_FADE_S = 6.0, 0.6
+TRAVEL_S = 6.0
 TRAVEL_HZ = (1.3, 1.8)
 MOVES_S = 10.0
 MOVES_ROTATION_DEG = np.array([26.0, 24.0, 30.0])
@@ -108,8 +105,10 @@ class Curls:
         rng = np.random.default_rng([seed, 23])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
         self._drift, self._rotations = Drift(rng), Waves(rng, 3)
-        self._most = CURL_PIP_DEG * (1.0 - rng.uniform(0.0, 0.06, 4))
-        self._ratio = MCP_PER_PIP * (1.0 + rng.normal(0.0, 0.06, 4))
+        curl_pip_deg = 101.0
+        self._most = curl_pip_deg * (1.0 - rng.uniform(0.0, 0.06, 4))
+        mcp_per_pip = 0.54  # Kamper's ratio, in Kim et al. 2012
+        self._ratio = mcp_per_pip * (1.0 + rng.normal(0.0, 0.06, 4))
 
     @property
     def period_s(self) -> float:
@@ -119,14 +118,16 @@ class Curls:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / CURL_S - _CURL_LAG_RAD)
+        curl_s, straight_deg = 10.0, 4.0
+        share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / curl_s - _CURL_LAG_RAD)
         pip = share[1:] * self._most
         posture = np.empty((5, 3))
         posture[0] = _THUMB_DEG[0] + share[0] * (_THUMB_DEG[1] - _THUMB_DEG[0])
         posture[1:, 0] = _CURL_SPREAD_DEG[1:] * (1.0 - share[1:])
-        posture[1:, 1], posture[1:, 2] = STRAIGHT_DEG + self._ratio * pip, STRAIGHT_DEG + pip
+        posture[1:, 1], posture[1:, 2] = straight_deg + self._ratio * pip, straight_deg + pip
         wobble, shift, rotation = self._drift.at(t)
-        rotation = rotation + np.radians(CURL_ROTATION_DEG) * self._rotations.at(t)
+        curl_rotation_deg = 14.0
+        rotation = rotation + np.radians(curl_rotation_deg) * self._rotations.at(t)
         return HandState(
             base_pose(self._model, self._centre, shift, rotation), angles_of(self._model, posture, wobble)
         )
@@ -158,7 +159,8 @@ class Travel:
         t = max(t_s, 0.0) % PERIOD_S
         k = min(int(t / TRAVEL_S), len(self._way) - 1)
         s, rate = t - k * TRAVEL_S, 2.0 * np.pi * float(self._rate_hz[k])
-        size = window(s, 0.0, TRAVEL_S, TRAVEL_FADE_S) * 0.98 * PEAK_SPEED_M_S / rate
+        travel_fade_s = 0.6
+        size = window(s, 0.0, TRAVEL_S, travel_fade_s) * 0.98 * PEAK_SPEED_M_S / rate
         wobble, shift, rotation = self._drift.at(t)
         share = 0.35 + 0.35 * self._wrist.at(t)
         rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)

@@ -23,7 +23,6 @@ WANDER_M, WANDER_RAD = 3e-4, np.radians(0.05)
 WHITE_M, WHITE_RAD = 1e-4, np.radians(0.01)
 _WAVES = 6  # of each wandering quantity
 _RATES_HZ = (0.5, 8.0)
-HIDDEN_EVERY_S, HIDDEN_S = 17.0, 0.5
 # Set up by somebody: the stations' frame has y up and its origin behind the cameras, turned by some angle; the rig's
 # y points down. The tracker is screwed to the object's side.
 SET_UP_TRACKING = rigid(axis_rotation(1, 0.96) @ np.diag([1.0, -1.0, -1.0]), np.array([0.62, 1.35, -0.84]))
@@ -70,8 +69,9 @@ class SimulatedTracker:
 
         Shape (4, 4) [m], time in [s]; None: it sees no base station.
         """
-        phase = np.random.default_rng([self.seed, 5]).uniform(0.0, HIDDEN_EVERY_S)
-        if (t_s + phase) % HIDDEN_EVERY_S < HIDDEN_S:
+        hidden_every_s, hidden_s = 17.0, 0.5
+        phase = np.random.default_rng([self.seed, 5]).uniform(0.0, hidden_every_s)
+        if (t_s + phase) % hidden_every_s < hidden_s:
             return None
         truth = self.scene.truth(t_s).objects[self.name]
         place = invert(self.T_rig_tracking) @ truth @ self.T_object_tracker

@@ -44,7 +44,6 @@ WANDERS_S = ((0.3, 12.0), (35.0, 46.4), (51.6, 59.7))
 SHUTTLE_S, SHUTTLE_M_S, SHUTTLE_HZ = (15.0, 23.0), 0.6, (0.8, 1.1)
 SPINS_S = ((23.2, 27.4), (27.6, 31.8))
 COMES_S = (45.0, 46.6, 51.4, 53.0)
-FADE_S = 1.0
 CARDS = (Card(middle_s=40.0, width_m=0.09, top_m=-0.40, bottom_m=0.005, depth_m=0.36, speed_m_s=0.09),)
 
 
@@ -92,11 +91,12 @@ class ObjectTravel:
 
     def object_at(self, t_s: float) -> Float:
         """`T_rig_object` (4, 4) [m] at a time within the period [s]."""
-        inside = sum(window(t_s, start, stop, FADE_S) for start, stop in WANDERS_S)
+        fade_s = 1.0
+        inside = sum(window(t_s, start, stop, fade_s) for start, stop in WANDERS_S)
         waves = inside * self._wander.at(t_s)
         place = self._place + WANDER_M * waves[:3]
         start, stop = SHUTTLE_S
-        size = window(t_s, start, stop, FADE_S) * SHUTTLE_M_S / self._rate
+        size = window(t_s, start, stop, fade_s) * SHUTTLE_M_S / self._rate
         place = place + size * np.sin(self._rate * (t_s - start)) * self._way
         rotation = rotation_vector_to_matrix(np.radians(WANDER_DEG) * waves[3:])
         for axis, (start, stop) in zip(self._spins, SPINS_S, strict=True):

@@ -42,8 +42,6 @@ from common.sim.surface import (
 from common.sim.things import LAYER_SINES, SeenThing, seen, tube_rims
 
 NEAREST_M = 0.05
-FURTHEST_PX = 4000.0
-SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
 PHALANGES = len(CAPSULES)
@@ -157,7 +155,8 @@ class View:
         Points (..., 3) [m] to pixels (..., 2); points too near or too far outside are clamped there.
         """
         uv = self.optics.distort(points[..., :2] / np.maximum(points[..., 2:], NEAREST_M))
-        return np.minimum(np.maximum(uv, -FURTHEST_PX), FURTHEST_PX)
+        furthest_px = 4000.0
+        return np.minimum(np.maximum(uv, -furthest_px), furthest_px)
 
     def snapshot(self, t_s: float) -> Snapshot:
         """Geometry of the frame whose row 0 is exposed around `t_s` [s]."""
@@ -179,7 +178,8 @@ class View:
         discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = self._project_all(parts)
         a, b, own = self._from, self._to, slice(self.surface.count, None)
         outlines = raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b])
-        spots = raster.discs(shine_uv, SHINE_SHARE * discs_px[SPHERE_COUNT::2, 0], self.circle)
+        shine_share = 0.17  # radius of the glossy spot, share of the cap's
+        spots = raster.discs(shine_uv, shine_share * discs_px[SPHERE_COUNT::2, 0], self.circle)
         bands = np.concatenate([outlines[PHALANGES:, 1:], spots[:, None]], axis=1)
         discs = raster.discs(discs_uv, discs_px, self.circle)
         sleeve = np.concatenate([cuff_uv, discs[_ELBOW]], axis=1)

@@ -27,21 +27,10 @@ Float32 = npt.NDArray[np.float32]
 
 TRUTH = "truth.npz"
 ILLUMINATIONS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
-FIRST_NS, PERIOD_NS, HELD_NS = 10**9, 11_111_111, 500_000_000
-FINE = 3  # rays per pixel and axis
-WHITE, BLACK, WALL = 0.75, 0.06, 0.35  # reflectance at 850 nm
-MARGIN = 0.5  # white paper around the squares, of a square
-WALL_M = 0.8
+WHITE = 0.75  # reflectance at 850 nm
 LED_AT_M = 0.20  # where white paper before the lens fills LED_LEVEL of the range
-LED_LEVEL = 0.55
-LASER_LEVEL = 0.65  # on white paper at LED_AT_M; falls with the distance, as a fan spreads
-SHEET_SIGMA_M = 4e-4
 LED_LOBE = 1.0  # LEDs behind a diffuser: power of the cosine
 LENS_POWER = 2.2  # of the cosine: a wide lens keeps more light at its rim than the natural fourth power
-LENS_SIGMA_PX = 0.55
-BLACK_LEVEL, FULL = 2.0, 255.0
-READ_SIGMA, ELECTRONS = 0.7, 40.0  # levels; electrons per level
-NEAR_M, FAR_M = 0.14, 0.34
 TILT_RAD, ROLL_RAD = np.radians(40.0), np.radians(25.0)
 
 
@@ -108,7 +97,8 @@ def board_poses(
     most = np.array([TILT_RAD, TILT_RAD, ROLL_RAD])
     found: list[Float] = []
     for _ in range(500 * count):
-        z = 1.0 / rng.uniform(1.0 / FAR_M, 1.0 / NEAR_M)
+        near_m, far_m = 0.14, 0.34
+        z = 1.0 / rng.uniform(1.0 / far_m, 1.0 / near_m)
         reach = 0.9 * np.array([optics.width_px, optics.height_px]) / np.diag(optics.matrix)[:2] / 2.0
         T = np.eye(4)
         T[:3, :3] = rotation_vector_to_matrix(rng.uniform(-most, most))
@@ -152,8 +142,9 @@ class WristBoardRenderer:
         xy = optics.undistort(np.stack([u, v], axis=-1))
         down, along = np.gradient(xy, axis=0), np.gradient(xy, axis=1)
         rays: list[Float32] = []
-        for dv in (np.arange(FINE) + 0.5) / FINE - 0.5:
-            for du in (np.arange(FINE) + 0.5) / FINE - 0.5:
+        fine = 3  # rays per pixel and axis
+        for dv in (np.arange(fine) + 0.5) / fine - 0.5:
+            for du in (np.arange(fine) + 0.5) / fine - 0.5:
                 rays.append(np.moveaxis(xy + du * along + dv * down, -1, 0).astype(np.float32))
         self._rays = rays
         self._lens = ((1.0 + (xy**2).sum(axis=-1)) ** (-0.5 * LENS_POWER)).astype(np.float32)
@@ -178,12 +169,15 @@ class WristBoardRenderer:
         i = depth * (a[0] * x + a[1] * y + a[2]) - a0
         j = depth * (b[0] * x + b[1] * y + b[2]) - b0
         n, m = scene.columns, scene.rows
-        rim = np.float32(1.0 + MARGIN)
+        margin = 0.5  # white paper around the squares, of a square
+        rim = np.float32(1.0 + margin)
         on = (depth > 0) & (i > -rim) & (i < n - 1 + rim) & (j > -rim) & (j < m - 1 + rim)
         squares = (i > -1) & (i < n) & (j > -1) & (j < m)
         dark = squares & ((np.floor(i) + np.floor(j)) % 2 == 0)
-        reflectance = np.where(on, np.where(dark, BLACK, WHITE), WALL).astype(np.float32)
-        z = np.where(on, depth, np.float32(WALL_M))
+        black, wall = 0.06, 0.35  # reflectance at 850 nm
+        reflectance = np.where(on, np.where(dark, black, WHITE), wall).astype(np.float32)
+        wall_m = 0.8
+        z = np.where(on, depth, np.float32(wall_m))
         facing = np.where(on, normal[:, None, None], np.array([0, 0, 1], np.float32)[:, None, None])
         points = np.stack([z * x, z * y, z])
         total = np.full(x.shape, np.float32(scene.ambient / WHITE))
@@ -203,7 +197,8 @@ class WristBoardRenderer:
             cosine = np.maximum((way * facing).sum(axis=0), 0.0) / np.sqrt(square)
             lobe = (np.maximum(way[2], 0.0) / np.sqrt(square)) ** np.float32(LED_LOBE)
             total += cosine * lobe / square
-        scale = LED_LEVEL / WHITE * LED_AT_M**2 / len(self._scene.rig.led)
+        led_level = 0.55
+        scale = led_level / WHITE * LED_AT_M**2 / len(self._scene.rig.led)
         return np.asarray(total * np.float32(scale), np.float32)
 
     def _laser(self, points: Float32, facing: Float32) -> Float32:
@@ -218,13 +213,15 @@ class WristBoardRenderer:
         way = points - origin.astype(np.float32)[:, None, None]
         distance = np.sqrt((way**2).sum(axis=0))
         along = np.abs((way * facing).sum(axis=0)) / distance
-        sheet = np.exp(-0.5 * (off / np.float32(SHEET_SIGMA_M)) ** 2)
+        sheet_sigma_m = 4e-4
+        sheet = np.exp(-0.5 * (off / np.float32(sheet_sigma_m)) ** 2)
         ahead = np.array(laser.forward) if laser.forward is not None else np.array([0, 0, 1.0]) - n[2] * n
         ahead = ahead / np.linalg.norm(ahead)
         toward = (way * ahead.astype(np.float32)[:, None, None]).sum(axis=0) / distance
         lit = toward > np.float32(np.cos(0.5 * (laser.fan_rad or np.pi)))
+        laser_level = 0.65  # on white paper at LED_AT_M; falls with the distance, as a fan spreads
         return np.asarray(
-            lit * sheet * along * np.float32(LASER_LEVEL / WHITE * LED_AT_M) / distance, np.float32
+            lit * sheet * along * np.float32(laser_level / WHITE * LED_AT_M) / distance, np.float32
         )
 
     def _exposed(self, light: Float32, pose: int, lit: Illumination) -> Image:
@@ -234,11 +231,14 @@ class WristBoardRenderer:
         """
         import cv2
 
-        blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), LENS_SIGMA_PX), np.float64)
+        lens_sigma_px = 0.55
+        blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), lens_sigma_px), np.float64)
         rng = np.random.default_rng([self._scene.seed, pose, ILLUMINATIONS.index(lit)])
-        level = BLACK_LEVEL + (FULL - BLACK_LEVEL) * blurred
-        sigma = np.sqrt(READ_SIGMA**2 + np.maximum(level - BLACK_LEVEL, 0.0) / ELECTRONS)
-        return np.clip(np.rint(level + sigma * rng.standard_normal(level.shape)), 0.0, FULL).astype(np.uint8)
+        black_level, full = 2.0, 255.0
+        level = black_level + (full - black_level) * blurred
+        read_sigma, electrons = 0.7, 40.0  # levels; electrons per level
+        sigma = np.sqrt(read_sigma**2 + np.maximum(level - black_level, 0.0) / electrons)
+        return np.clip(np.rint(level + sigma * rng.standard_normal(level.shape)), 0.0, full).astype(np.uint8)
 
 
 def record_wrist_board(
@@ -273,7 +273,8 @@ def record_wrist_board(
             for k, lit in enumerate(ILLUMINATIONS):
                 if lit not in illuminations:
                     continue
-                t_ns = FIRST_NS + pose * HELD_NS + k * PERIOD_NS
+                first_ns, period_ns, held_ns = 10**9, 11_111_111, 500_000_000
+                t_ns = first_ns + pose * held_ns + k * period_ns
                 writer.add(scene.camera.name, 3 * pose + k, t_ns, lit, encode_png(renderer.render(pose, lit)))
     finally:
         writer.close()

@@ -26,11 +26,6 @@ from common.hand.palmar_surface import ROOT, PalmarSurface
 from master.estimator.laser_plane import PlaneAxes
 from master.rig.wrist import WristSetup
 
-RAYS = 64
-_SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
-_STRETCH = 0.25  # share of the finger's breadth that one chord may span: more is a jump from part to part
-_INSIDE = 1.0 - 1e-5  # of the fan between its tangents, where rays surely meet the finger
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserLine:
@@ -53,9 +48,10 @@ class LaserIntersection:
     Its state was prepared by the constructor.
     """
 
-    def __init__(self, setup: WristSetup, rays: int = RAYS) -> None:
+    def __init__(self, setup: WristSetup, rays: int = 64) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        self._nodes = -_INSIDE * np.cos(np.pi * np.arange(rays) / (rays - 1))
+        inside = 1.0 - 1e-5  # of the fan between its tangents, where rays surely meet the finger
+        self._nodes = -inside * np.cos(np.pi * np.arange(rays) / (rays - 1))
 
     def flexed(self, setup: WristSetup) -> "LaserIntersection":
         """The same hand before another palm pose of this device."""
@@ -101,11 +97,14 @@ class LaserIntersection:
         lines_of_sight, from_camera = points / distance, _known(chain, np.zeros(3))
         before = _hits(from_camera, lines_of_sight)
         seen_at = before.min(axis=0)
+        seen_m = 3e-4  # a lit point this near behind the first the camera sees is seen
         # How clearly it is seen [m]: at most _SEEN_M, and not at all below 0.
-        clear = np.where(lit, np.minimum(seen_at - distance, 0.0) + _SEEN_M, -np.inf)
+        clear = np.where(lit, np.minimum(seen_at - distance, 0.0) + seen_m, -np.inf)
         step = points[:, 1:] - points[:, :-1]
         whole = lit[1:] & lit[:-1]
-        whole &= (step * step).sum(axis=0) < (_STRETCH * broad) ** 2
+        # share of the finger's breadth that one chord may span: more is a jump from part to part
+        stretch = 0.25
+        whole &= (step * step).sum(axis=0) < (stretch * broad) ** 2
         first, last = _seen_part(clear[:-1], clear[1:])
         edges = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
         _at_edge(first, last, edges, clear, lines_of_sight, before, from_camera)

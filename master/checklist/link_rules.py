@@ -10,19 +10,7 @@ from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow, Verdi
 from master.checklist.slave_reports import SlaveReports
 from master.checklist.window import Window
 
-GRACE_NS = 5_000_000_000  # from the first look: processes come up one after another
 SETTLED_NS = 2_000_000_000  # a sender that has just come has a clock, and frames, after that
-SPAN_NS = 1_400_000_000  # what counts as now: with two looks to notice it stays below two seconds
-CLOCK_SETTLED_NS = 1_000_000_000  # a clock is known after five echoes, a hundred a second
-MUTE_NS = 1_200_000_000  # connected and nothing comes: the sensor is away
-LOSS, LOSS_WELL = (
-    0.03,
-    0.01,
-)  # share of the messages; tracks bridge single frames, at 3 % two in a row are daily
-LOSS_LEAST = 2  # messages in the window: one that is lost is no trend
-SLOW, SLOW_WELL = 0.85, 0.92  # of the rate of the file; a camera that halves its rate for the light has 0.5
-CLOCK_NS, CLOCK_WELL_NS = 1.0e6, 0.7e6  # 1.5 ms between two cameras cost 2 % of depth at 1 m/s (docs/sync.md)
-RESERVE_MB, RESERVE_WELL_MB = 200.0, 250.0  # as much as a recording leaves free
 
 
 class _Received:
@@ -32,9 +20,10 @@ class _Received:
         self.since_ns: int | None = None  # connected since
         self.ever = False
         self.came_ns = 0  # last message
-        self.messages = Window(SPAN_NS)
+        span_ns = 1_400_000_000  # what counts as now: with two looks to notice it stays below two seconds
+        self.messages = Window(span_ns)
         self.frames = Window(
-            SPAN_NS
+            span_ns
         )  # of the slave's reports: of a wrist device not every frame is a message
         self.report = 0
 
@@ -144,13 +133,15 @@ class LinkRules:
         assert self._first_ns is not None
         if sender.connected:
             return False
-        return self._received[name].ever or t_ns - self._first_ns >= GRACE_NS or None
+        grace_ns = 5_000_000_000  # from the first look: processes come up one after another
+        return self._received[name].ever or t_ns - self._first_ns >= grace_ns or None
 
     def _mute(self, name: str, t_ns: int) -> bool:
         """Return true if a sender is connected and sends nothing though it should."""
         received = self._received[name]
         started = self._started_ns is not None and t_ns - self._started_ns >= SETTLED_NS
-        return started and received.settled(t_ns) and t_ns - received.came_ns >= MUTE_NS
+        mute_ns = 1_200_000_000  # connected and nothing comes: the sensor is away
+        return started and received.settled(t_ns) and t_ns - received.came_ns >= mute_ns
 
     def _camera_absent(
         self, camera: CameraPlan, sender: SenderNow, reports: SlaveReports | None, t_ns: int
@@ -208,7 +199,9 @@ class LinkRules:
         elif received.settled(t_ns) and received.messages.full and received.messages.moved:
             rate_hz = sum(received.messages.increase()) / received.messages.seconds
         share = rate_hz / camera.rate_hz
-        wrong = beyond(-share, -SLOW, -SLOW_WELL) if share == share else None
+        # of the rate of the file; a camera that halves its rate for the light has 0.5
+        slow, slow_well = 0.85, 0.92
+        wrong = beyond(-share, -slow, -slow_well) if share == share else None
         return Verdict(
             "rate_low",
             camera.name,
@@ -222,11 +215,15 @@ class LinkRules:
         """Loss, and the clock."""
         received = self._received[name]
         settled = received.settled(t_ns)
-        clocked = received.settled(t_ns, CLOCK_SETTLED_NS)
+        clock_settled_ns = 1_000_000_000  # a clock is known after five echoes, a hundred a second
+        clocked = received.settled(t_ns, clock_settled_ns)
         came, missed = received.messages.increase() or (0, 0)
         share = missed / max(came + missed, 1)
-        lossy = beyond(share, LOSS, LOSS_WELL) if settled and received.messages.full else None
-        if lossy and missed < LOSS_LEAST:
+        # share of the messages; tracks bridge single frames, at 3 % two in a row are daily
+        loss, loss_well = 0.03, 0.01
+        lossy = beyond(share, loss, loss_well) if settled and received.messages.full else None
+        loss_least = 2  # messages in the window: one that is lost is no trend
+        if lossy and missed < loss_least:
             lossy = None
         yield Verdict(
             "packet_loss",
@@ -240,7 +237,9 @@ class LinkRules:
             reports, wrong = "is not known", clocked or None
         else:
             reports = f"is known to {1e-6 * sigma:.1f} ms only"
-            wrong = beyond(sigma, CLOCK_NS, CLOCK_WELL_NS) if clocked else None
+            # 1.5 ms between two cameras cost 2 % of depth at 1 m/s (docs/sync.md)
+            clock_ns, clock_well_ns = 1.0e6, 0.7e6
+            wrong = beyond(sigma, clock_ns, clock_well_ns) if clocked else None
         yield Verdict(
             "clock_unsynchronised",
             name,
@@ -252,10 +251,11 @@ class LinkRules:
 
 def disk_verdict(subject: str, free_mb: float) -> Verdict:
     """Whether a disk is full."""
+    reserve_mb, reserve_well_mb = 200.0, 250.0  # as much as a recording leaves free
     return Verdict(
         "disk_full",
         subject,
-        beyond(-free_mb, -RESERVE_MB, -RESERVE_WELL_MB),
-        f"The disk of {subject} has {free_mb:.0f} MB left; below {RESERVE_MB:g} MB nothing is recorded.",
+        beyond(-free_mb, -reserve_mb, -reserve_well_mb),
+        f"The disk of {subject} has {free_mb:.0f} MB left; below {reserve_mb:g} MB nothing is recorded.",
         "Move recordings away, or delete some.",
     )

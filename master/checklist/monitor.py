@@ -22,7 +22,6 @@ from master.checklist.slave_reports import SlaveReports
 from master.checklist.slave_rules import SlaveRules
 
 CODES: tuple[CheckCode, ...] = get_args(CheckCode)
-AFTER_NS, BACK_NS = 2_500_000_000, 500_000_000
 HOLD_NS: dict[CheckCode, int] = {
     "exposure_drift": 300_000_000,
     "background_in_range": 300_000_000,
@@ -135,8 +134,10 @@ class ChecklistMonitor:
         self._causes = {key: cause for key, cause in self._causes.items() if cause[1] > t_ns}
         reported = [verdict for verdict in shown if not self._follows(verdict, shown)]
         for verdict in reported:
+            # after ns
+            back_ns = 500_000_000
             after_ns = (
-                BACK_NS if verdict.code in _ABSENT else AFTER_NS
+                back_ns if verdict.code in _ABSENT else 2_500_000_000
             )  # who comes back settles by its own rules
             self._causes[verdict.key] = verdict, t_ns + after_ns
         reported.sort(key=lambda one: (CODES.index(one.code), one.subject))

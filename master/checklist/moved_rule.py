@@ -8,12 +8,6 @@ from collections.abc import Iterator, Mapping
 from master.checklist.facts import Verdict, beyond
 from master.checklist.window import Window
 
-SPAN_NS = 1_000_000_000
-LEAST_POSES = 6  # in the window: fewer are a hand that comes or goes
-APART, APART_WELL = 0.15, 0.05  # share of the hand's markers whose rays miss each other, two cameras
-MOSTLY, MOSTLY_WELL = 0.5, 0.2  # share of the poses that leave most of what a camera sees out, three or more
-_NAME = 64  # characters of a name in counts
-
 
 class MovedRule:
     """Push machine over the counters of one pipeline.
@@ -23,7 +17,8 @@ class MovedRule:
 
     def __init__(self) -> None:
         """Nothing was counted yet."""
-        self._window = Window(SPAN_NS)
+        span_ns = 1_000_000_000
+        self._window = Window(span_ns)
         self._cameras: tuple[str, ...] = ()
 
     def clear(self) -> None:
@@ -37,23 +32,29 @@ class MovedRule:
         if cameras != self._cameras:
             self._cameras = cameras
             self._window.clear()
-        out = [counts.get(f"mostly_rejected.{name}"[:_NAME], 0) for name in cameras]
+        # characters of a name in counts
+        out = [counts.get(f"mostly_rejected.{name}"[:64], 0) for name in cameras]
         self._window.push(t_ns, counts.get("poses", 0), counts.get("epipolar_outliers", 0), *out)
         poses, outliers, *rejected = self._window.increase()
-        enough = self._window.full and poses >= LEAST_POSES
+        least_poses = 6  # in the window: fewer are a hand that comes or goes
+        enough = self._window.full and poses >= least_poses
         if len(cameras) == 2:
             share = outliers / max(poses * markers, 1)
+            # share of the hand's markers whose rays miss each other, two cameras
+            apart, apart_well = 0.15, 0.05
             yield _verdict(
                 cameras,
-                beyond(share, APART, APART_WELL) if enough else None,
+                beyond(share, apart, apart_well) if enough else None,
                 f"What cameras {' and '.join(cameras)} see does not fit together: the rays of"
                 f" {100.0 * share:.0f} % of the markers miss each other.",
             )
             return
         for name, number in zip(cameras, rejected, strict=True):
+            # share of the poses that leave most of what a camera sees out, three or more
+            mostly, mostly_well = 0.5, 0.2
             yield _verdict(
                 (name,),
-                beyond(number / max(poses, 1), MOSTLY, MOSTLY_WELL) if enough else None,
+                beyond(number / max(poses, 1), mostly, mostly_well) if enough else None,
                 f"What camera {name} sees does not fit what the others see; it is left out.",
             )
 

@@ -24,10 +24,6 @@ from master.run.quarantine import Quarantine
 from master.run.rejected_peers import MarkerCounts, RejectedPeer
 from master.run.sequence import CameraCounts
 
-POLL_S = 0.2
-EVERY_NS = 1_000_000_000  # and at once where it changes
-DEPTH = 64  # reports of slaves that may wait for a look: 32 senders, twice a second
-
 
 class Received(Protocol):
     """Interface to what the master receives; an `Ingest`."""
@@ -118,7 +114,8 @@ class ChecklistPublisher:
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._plan = plan_of(setups)
         self._monitor = ChecklistMonitor(self._plan)
-        self._reports = bus.subscribe("health", depth=DEPTH)
+        depth = 64  # reports of slaves that may wait for a look: 32 senders, twice a second
+        self._reports = bus.subscribe("health", depth=depth)
         self._session, self._machine = session, Machine(writes_to)
         self._published: tuple[CheckItem, ...] | None = None
         self._published_ns = 0
@@ -128,7 +125,8 @@ class ChecklistPublisher:
 
         `setups` returns which are in use.
         """
-        while not stop.wait(POLL_S):
+        poll_s = 0.2
+        while not stop.wait(poll_s):
             try:
                 self.look(None if setups is None else setups())
             except BusError:
@@ -158,7 +156,8 @@ class ChecklistPublisher:
             self._monitor.push_health(health, t_ns)
         self._monitor.push(self._now(t_ns))
         items = self._monitor.look(t_ns)
-        if _keys(items) != _keys(self._published) or t_ns - self._published_ns >= EVERY_NS:
+        every_ns = 1_000_000_000  # and at once where it changes
+        if _keys(items) != _keys(self._published) or t_ns - self._published_ns >= every_ns:
             self._published, self._published_ns = items, t_ns
             self._bus.publish("checklist", MASTER, Checklist(MASTER, self._session, t_ns, items))
         return items

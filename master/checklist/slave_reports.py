@@ -7,11 +7,6 @@ from collections.abc import Mapping
 
 from common.messages import Health
 
-STALE_NS = 3_000_000_000  # reports come twice a second; of an older one nothing is concluded
-LEAST_NS = (
-    400_000_000  # between two reports that are compared: an answer to a command may come just after one
-)
-
 
 class SlaveReports:
     """Push machine over the reports of one process.
@@ -33,9 +28,11 @@ class SlaveReports:
         """Take a report that came at `t_ns` [ns]."""
         now = self._now
         self._came_ns = t_ns
+        # between two reports that are compared: an answer to a command may come just after one
+        least_ns = 400_000_000
         if now is None or health.session != now.session:
             self._before = None
-        elif health.t_ns - now.t_ns < LEAST_NS:
+        elif health.t_ns - now.t_ns < least_ns:
             return
         else:
             self._before = now
@@ -44,7 +41,8 @@ class SlaveReports:
 
     def is_recent(self, t_ns: int) -> bool:
         """Return true if the newest report is recent."""
-        return self._now is not None and t_ns - self._came_ns < STALE_NS
+        stale_ns = 3_000_000_000  # reports come twice a second; of an older one nothing is concluded
+        return self._now is not None and t_ns - self._came_ns < stale_ns
 
     @property
     def session(self) -> int | None:

@@ -20,21 +20,12 @@ OFF = {
     "red_gain": (0.03, 0.03),
     "blue_gain": (0.03, 0.03),
 }
-DIGITAL = 1.3  # gain behind the sensor: rounding needs less
-BRIGHT, BRIGHT_WELL = (
-    1.5,
-    1.35,
-)  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
 ALIKE = "alike."  # metrics of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
 AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker
 UNCOLOURED = "uncalibrated."  # count: 1 of a marker without a colour
-AMBIGUOUS_SHARE, AMBIGUOUS_WELL = 0.5, 0.1  # of the frames
-HOT_WELL_C = 5.0
 FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is throttled", 8: "it is too warm"}
-CYCLE = 3  # frames: ambient, laser, LEDs
-SLIPPED, SLIPPED_LEAST = 0.04, 2  # share and number of the cycles between two reports that are out of order
 
 
 class SlaveRules:
@@ -85,7 +76,8 @@ def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
         want, got = metrics.get(WANTED + setting), metrics.get(setting)
         if want is not None and got is not None and abs(got - want) > max(share * want, least):
             wrong.append(f"{setting} is {got:.4g}, not {want:.4g}")
-    if (digital := metrics.get("digital_gain", 1.0)) > DIGITAL:
+    # gain behind the sensor: rounding needs less
+    if (digital := metrics.get("digital_gain", 1.0)) > 1.3:
         wrong.append(f"digital_gain is {digital:.3g}")
     wrong += [
         f"{auto.removeprefix('auto.')} is on"
@@ -107,10 +99,12 @@ def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     exposure = reports.metrics.get("light_exposure")
     if exposure is None or exposure <= 0.0:
         return
+    # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
+    bright, bright_well = 1.5, 1.35
     yield Verdict(
         "exposure_drift",
         name,
-        beyond(abs(log(exposure)), log(BRIGHT), log(BRIGHT_WELL)),
+        beyond(abs(log(exposure)), log(bright), log(bright_well)),
         f"The picture of camera {name} is {exposure:.2g} times as bright as when its colours were calibrated.",
         "Light the scene as then, set the exposure back, or calibrate the colours under this light.",
     )
@@ -179,10 +173,11 @@ def _background(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         share = (reports.increase(event) or 0) / frames
         u, v = reports.metrics.get(f"{event}.u"), reports.metrics.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
+        ambiguous_share, ambiguous_well = 0.5, 0.1  # of the frames
         yield Verdict(
             "background_in_range",
             f"{camera.name}.{marker}",
-            beyond(share, AMBIGUOUS_SHARE, AMBIGUOUS_WELL),
+            beyond(share, ambiguous_share, ambiguous_well),
             f"Camera {camera.name} sees something else in the colour of marker {marker}{where}.",
             "Take it away or cover it; or paint the marker in another colour.",
             (camera.name,),
@@ -197,9 +192,12 @@ def _strobe(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     )
     if not frames or out is None:
         return
-    cycles = frames / CYCLE
-    wrong = beyond(out / cycles, SLIPPED, 0.5 * SLIPPED)
-    if wrong and (out < SLIPPED_LEAST or (unlit or 0) > 0.5 * cycles):
+    cycle = 3  # frames: ambient, laser, LEDs
+    cycles = frames / cycle
+    # share and number of the cycles between two reports that are out of order
+    slipped, slipped_least = 0.04, 2
+    wrong = beyond(out / cycles, slipped, 0.5 * slipped)
+    if wrong and (out < slipped_least or (unlit or 0) > 0.5 * cycles):
         wrong = None  # one frame that slipped; or nothing is lit, because there is no hand
     yield Verdict(
         "strobe_slipped",
@@ -217,7 +215,8 @@ def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     hot: bool | None = False
     why: list[str] = []
     if now is not None and limit is not None:
-        hot = beyond(now, limit, limit - HOT_WELL_C)
+        hot_well_c = 5.0
+        hot = beyond(now, limit, limit - hot_well_c)
         why = [f"{now:.0f} °C, {limit:.0f} are its limit"] if now >= limit else []
     flags = int(metrics.get("throttled", 0.0))
     held = [text for bit, text in FLAGS.items() if flags & bit]

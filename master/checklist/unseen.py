@@ -17,9 +17,7 @@ from collections.abc import Iterator
 from master.checklist.facts import Verdict
 from master.checklist.slave_reports import SlaveReports
 
-CHANGED_S, NEVER_S, GONE_S = 0.9, 5.0, 30.0
-OTHERS = 3
-HALF = 0.5  # of the frames between two reports
+GONE_S = 30.0
 COLOUR = "colour."  # metrics of the slave: a number that changes with the range of a marker
 SEEN = "seen."
 
@@ -35,7 +33,8 @@ class _Marker:
     @property
     def limit_s(self) -> float:
         """How long it may be missing."""
-        return GONE_S if self.ever else CHANGED_S if self.before_change else NEVER_S
+        changed_s, never_s = 0.9, 5.0
+        return GONE_S if self.ever else changed_s if self.before_change else never_s
 
 
 class UnseenMarkers:
@@ -59,13 +58,15 @@ class UnseenMarkers:
         if not frames:
             return
         share = {name: (reports.increase(SEEN + name) or 0) / frames for name in self._markers}
-        needed = min(OTHERS, len(share) - 1)
+        others = 3
+        needed = min(others, len(share) - 1)
         for name, one in self._markers.items():
+            half = 0.5  # of the frames between two reports
             if self._recoloured(one, reports.metrics.get(COLOUR + name)):
                 pass  # of the frames of this report some were looked at with the colours of before
             elif share[name]:
                 one.ever, one.without_s = True, 0.0
-            elif needed and sum(other >= HALF for key, other in share.items() if key != name) >= needed:
+            elif needed and sum(other >= half for key, other in share.items() if key != name) >= needed:
                 one.without_s += reports.seconds
             yield Verdict(
                 "marker_unseen",

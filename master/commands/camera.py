@@ -22,11 +22,9 @@ ANSWER_S = (
     15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table
 )
 APPEAR_S = 4.0  # whoever has just connected is not known everywhere yet
-STEP_S = 0.1
 _ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us", "roi_margin")
 _MORE = ("control.", "marker.", "pick.")
 _EVENTS = ("camera.", "reload.")
-_MOST = 1e9
 
 
 def camera(options: Namespace) -> None:
@@ -138,10 +136,11 @@ def _appear(bus: Bus, name: str) -> None:
     Raises:
         BusError: It is not there; the text names those that are.
     """
-    for _ in range(round(APPEAR_S / STEP_S)):
+    step_s = 0.1
+    for _ in range(round(APPEAR_S / step_s)):
         if name in bus.alive():
             return
-        time.sleep(STEP_S)
+        time.sleep(step_s)
     there = ", ".join(sorted(bus.alive() - {MASTER})) or "none"
     raise BusError(
         f"no camera {name!r} is on the bus; there are: {there}. Is its slave running, and named so?"
@@ -149,8 +148,9 @@ def _appear(bus: Bus, name: str) -> None:
 
 
 def _positive(value: float | None, option: str) -> float | None:
-    if value is not None and not 0.0 < value <= _MOST:
-        raise PhalanxError(f"{option} {value:g}: must be positive and at most {_MOST:g}")
+    most = 1e9
+    if value is not None and not 0.0 < value <= most:
+        raise PhalanxError(f"{option} {value:g}: must be positive and at most {most:g}")
     return value
 
 

@@ -22,9 +22,6 @@ from master.commands.options import HERE_BUS, bus_end
 from master.run.master_bus import join_bus
 from master.run.stopping import stop_on_signals
 
-_POLL_S = 0.1
-_SILENT_S = 3.0  # three reports
-_ONCE_S = 3.0
 _HEAD = ("device", "host", "version", "temperature", "throttled", "rate", "clock offset", "state")
 _HOME = "\x1b[H\x1b[J"  # to the top of the screen, and clear it
 USUAL_KEYS = ".config/phalanx/keys"  # where `phalanx fleet deploy` makes them
@@ -93,7 +90,8 @@ class Roll:
         if own is None:
             known = "streaming" if rate else "unknown"
             return Device(name, known, rate_hz=rate, offset_us=clock[0], sigma_us=clock[1])
-        silent = now_s - self._at[name] > _SILENT_S
+        silent_s = 3.0  # three reports
+        silent = now_s - self._at[name] > silent_s
         state = (
             "silent"
             if silent and not rate
@@ -156,7 +154,8 @@ def status(options: Namespace) -> int:
 
         return wait_for_senders(options)
     show = _as_json if options.as_json else _as_table if not options.watch else _on_screen
-    period_s = 1.0 if options.watch else options.seconds or _ONCE_S
+    once_s = 3.0
+    period_s = 1.0 if options.watch else options.seconds or once_s
     connection = join_bus(options.bus)
     try:
         _listen(
@@ -226,7 +225,8 @@ def _listen(
     inbox = bus.subscribe("health", depth=256)
     due_s = time.monotonic() + period_s
     while not stop.is_set():
-        health = inbox.get(_POLL_S)
+        poll_s = 0.1
+        health = inbox.get(poll_s)
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
         if time.monotonic() >= due_s:

@@ -18,8 +18,6 @@ from master.commands.relay_bus import Relay
 from master.run.master_bus import bus_of_master
 from master.run.stopping import stop_on_signals
 
-_POLL_S = 0.5
-
 
 def relay(options: Namespace) -> None:
     """Run a router, or a relay beside a master.
@@ -63,7 +61,8 @@ def _route(listen: str, connect: Sequence[str]) -> None:
     try:
         _notify("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect))
         joined = 0
-        while not stop.wait(_POLL_S):
+        poll_s = 0.5
+        while not stop.wait(poll_s):
             if bus.peers != joined:
                 joined = bus.peers
                 _notify("router", f"joined with {joined} of other routers")

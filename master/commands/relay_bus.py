@@ -19,10 +19,6 @@ from common.messages.streams import sender_of
 
 STREAMS = ("hand", "object", "contact", "gesture", "health", "checklist")
 NAME = "relay"
-DEPTH = 256  # messages of a stream that may wait: 1.4 s of a hand at 90 Hz with its contact
-REPORT_S = 1.0
-_WAIT_S = 0.2
-_JOIN_S = 2.0
 
 
 class Relay:
@@ -43,7 +39,8 @@ class Relay:
         self._below, self._above, self._clock = below, above, clock
         self._repeated: Counter[str] = Counter(dict.fromkeys(STREAMS, 0))
         self._stop = threading.Event()
-        self._from = {stream: below.subscribe(stream, depth=DEPTH) for stream in STREAMS}
+        depth = 256  # messages of a stream that may wait: 1.4 s of a hand at 90 Hz with its contact
+        self._from = {stream: below.subscribe(stream, depth=depth) for stream in STREAMS}
         self._threads = [
             threading.Thread(target=self._repeat, args=(stream, source), name=f"relay {stream}", daemon=True)
             for stream, source in self._from.items()
@@ -71,7 +68,8 @@ class Relay:
         Health is published below, from where it is repeated above as all health is; a line is printed each minute.
         """
         minute = 0
-        while not stop.wait(REPORT_S):
+        report_s = 1.0
+        while not stop.wait(report_s):
             health = self.health()
             self._below.publish("health", NAME, health)
             minute += 1
@@ -84,7 +82,8 @@ class Relay:
         for source in self._from.values():
             source.close()
         for thread in self._threads:
-            thread.join(_JOIN_S)
+            join_s = 2.0
+            thread.join(join_s)
 
     def _answer(self, command: Command) -> Health:
         """How it is.
@@ -98,7 +97,8 @@ class Relay:
 
     def _repeat(self, stream: str, source: Subscription) -> None:
         while not self._stop.is_set():
-            message = source.get(_WAIT_S)
+            wait_s = 0.2
+            message = source.get(wait_s)
             if message is not None:
                 self._above.publish(stream, sender_of(message), message)
                 self._repeated[stream] += 1

@@ -11,7 +11,6 @@ from pathlib import Path
 from common.errors import PhalanxError
 from master.commands.service_unit import ERROR_WAIT_S, UNIT
 
-_COMMAND_S = 90.0  # more than the unit gives to a start
 _LOG = f"journalctl --user -u {UNIT} -n 20"
 
 
@@ -22,14 +21,15 @@ def systemctl(words: Sequence[str]) -> str:
         PhalanxError: There is none, it failed, or takes too long.
     """
     command = ["systemctl", "--user", *words]
+    command_s = 90.0  # more than the unit gives to a start
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_COMMAND_S, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=command_s, check=False
         )
     except FileNotFoundError as error:
         raise PhalanxError("systemctl: missing; a service needs systemd") from error
     except subprocess.TimeoutExpired as error:
-        raise PhalanxError(f"{' '.join(command[:3])}: no end after {_COMMAND_S:.0f} s") from error
+        raise PhalanxError(f"{' '.join(command[:3])}: no end after {command_s:.0f} s") from error
     if done.returncode != 0:
         last = (done.stderr.strip() or done.stdout.strip() or f"exit {done.returncode}").splitlines()[-1]
         advice = ""

@@ -29,11 +29,7 @@ from master.run.ingest import Ingest
 from master.run.master_bus import join_bus
 from master.run.stopping import stop_on_signals
 
-_APPEAR_S = 1.5  # whoever has just connected is not known everywhere yet
 _POLL_S = 0.1
-_START_S = 1.0
-_MOST_S = 20.0
-_RATE_S = 1.0  # how long datagrams are counted after the first of each
 Received = dict[str, float]
 
 
@@ -44,7 +40,8 @@ def wait_for_senders(options: Namespace) -> int:
     """
     stop = stop_on_signals()
     names: list[str] = options.wait
-    seconds = options.seconds or _MOST_S
+    most_s = 20.0
+    seconds = options.seconds or most_s
     connection = _running(options.bus)
     if connection is not None:
         try:
@@ -117,7 +114,8 @@ def here(
             raise PhalanxError(f"rig {rig.name!r} has no camera or IMU {name!r}")
     wrists = rig.cameras if rig.kind == "wrist" else ()
     try:
-        ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", _START_S, imus=imus, wrists=wrists)
+        start_s = 1.0
+        ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", start_s, imus=imus, wrists=wrists)
     except BusError as error:
         raise BusError(f"{error}; if a master runs here, give its address: --bus ENDPOINT") from error
     try:
@@ -139,8 +137,9 @@ def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threadi
             count = ingest.counts_of(name).received
             if count:
                 passed_s = now - first.setdefault(name, now)
-                if passed_s >= _RATE_S or now - began > seconds - _POLL_S:
-                    received[name] = count / max(passed_s, _RATE_S)
+                rate_s = 1.0  # how long datagrams are counted after the first of each
+                if passed_s >= rate_s or now - began > seconds - _POLL_S:
+                    received[name] = count / max(passed_s, rate_s)
     return received
 
 
@@ -152,7 +151,8 @@ def _running(endpoint: str) -> ZenohBus | None:
         if error.__cause__ is None:  # the endpoint is malformed, or keys are missing
             raise
         return None
-    end = time.monotonic() + _APPEAR_S
+    appear_s = 1.5  # whoever has just connected is not known everywhere yet
+    end = time.monotonic() + appear_s
     while time.monotonic() < end:
         if MASTER in bus.alive():
             return bus

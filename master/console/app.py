@@ -26,7 +26,6 @@ from master.console.state import ConsoleSettings, ConsoleState
 from master.outputs.web.listening import is_loopback, page_certificate, places_of, private_folder
 
 TITLE = "Phalanx"
-_AWAY_S = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +158,7 @@ def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> 
     """
     app = FastAPI(openapi_url=None)
     serve_sockets(app, state)
+    away_s = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was
     ui.run_with(
         app,
         title=TITLE,
@@ -166,7 +166,7 @@ def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> 
         favicon="🖐",
         language="en-US",
         show_welcome_message=False,
-        reconnect_timeout=_AWAY_S,
+        reconnect_timeout=away_s,
     )
     if login.password is not None:
         app.add_middleware(

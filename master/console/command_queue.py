@@ -12,7 +12,6 @@ from nicegui import background_tasks
 from common.errors import PhalanxError
 
 AnswerT = TypeVar("AnswerT")
-QUIET_S = 0.12  # so long nothing more changes until the change is sent
 
 
 class CommandQueue(Generic[AnswerT]):
@@ -51,7 +50,8 @@ class CommandQueue(Generic[AnswerT]):
 
     async def _work(self) -> None:
         while self._waiting:
-            await asyncio.sleep(QUIET_S)
+            quiet_s = 0.12  # so long nothing more changes until the change is sent
+            await asyncio.sleep(quiet_s)
             waiting, self._waiting = self._waiting, {}
             try:
                 answer = await asyncio.to_thread(self._send, _merged(waiting))

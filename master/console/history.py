@@ -16,7 +16,6 @@ SPAN_S = 60.0
 STEP_S = 0.5
 MAX_SERIES = 256  # senders times quantities; what is beyond is not kept
 _CAMERA_HZ, _RECEIVED = "camera_hz.", ".received"
-_COUNT_NS = 900_000_000  # of a master that reports once a second
 _CLOCK = {".clock_offset_us": ("offset_ms", 1e-3), ".clock_sigma_us": ("offset_sigma_us", 1.0)}
 
 
@@ -88,7 +87,8 @@ class History:
         """What a count grew by per second, between two reports; NaN: not known yet."""
         now = report.counts.get(name, 0)
         then_ns, then, rate = self._counts.get(name, (report.t_ns, now, math.nan))
-        if report.t_ns - then_ns >= _COUNT_NS:
+        count_ns = 900_000_000  # of a master that reports once a second
+        if report.t_ns - then_ns >= count_ns:
             rate = max(0, now - then) * 1e9 / (report.t_ns - then_ns)
             then_ns, then = report.t_ns, now
         if report.t_ns < then_ns:  # another master

@@ -12,10 +12,7 @@ from common.errors import BusError
 from common.messages import Command, Health, Message
 
 POLL_S = 0.5  # between two looks at who is alive
-MISSED_POLLS = 4  # so often nobody was alive: the connection is made anew
 ANSWER_S = 20.0  # a slow camera shows its new settings after some seconds
-_DEPTH = 64
-_READ_S = 0.2
 
 _LOG = logging.getLogger(__name__)
 Take = Callable[[Message], None]
@@ -90,7 +87,8 @@ class Link:
     def _wait(self, bus: Bus) -> None:
         """Read and look around until the others are gone or the console ends."""
         ended = threading.Event()
-        inboxes = {stream: bus.subscribe(stream, depth=_DEPTH) for stream in self._take}
+        depth = 64
+        inboxes = {stream: bus.subscribe(stream, depth=depth) for stream in self._take}
         readers = [
             threading.Thread(target=_read, args=(inbox, self._take[stream], ended), name=f"read {stream}")
             for stream, inbox in inboxes.items()
@@ -101,7 +99,8 @@ class Link:
         self._bus = bus
         empty = 0
         try:
-            while empty < MISSED_POLLS and not self._closing.is_set():
+            missed_polls = 4  # so often nobody was alive: the connection is made anew
+            while empty < missed_polls and not self._closing.is_set():
                 self._alive = bus.alive()
                 empty = 0 if self._alive else empty + 1
                 self._closing.wait(POLL_S)
@@ -118,6 +117,7 @@ class Link:
 
 def _read(inbox: Subscription, take: Take, ended: threading.Event) -> None:
     while not ended.is_set():
-        message = inbox.get(_READ_S)
+        read_s = 0.2
+        message = inbox.get(read_s)
         if message is not None:
             take(message)

@@ -20,7 +20,6 @@ from typing import IO, TypeVar
 from common.errors import PhalanxError
 from master.console.process_supervisor import ENDS_S
 
-TAIL = 200
 T = TypeVar("T")
 _KILLED_S = 2.0
 _CHUNK = 8192
@@ -44,7 +43,8 @@ class LocalProcess:
             PhalanxError: The program cannot be started.
         """
         self.name, self.command = name, tuple(command)
-        self.lines: deque[str] = deque(maxlen=TAIL)
+        tail = 200
+        self.lines: deque[str] = deque(maxlen=tail)
         self.prompt = ""
         self._stopped = False
         try:

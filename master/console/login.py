@@ -17,12 +17,9 @@ from common.errors import PhalanxError
 from master.outputs.web.listening import read_private, write_private
 
 HASH_FILE = "console.password"
-LEAST_CHARACTERS = 12
 MOST_BYTES = 1024
 _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 that are not taken for one another: 5 bits each
-_GROUPS, _GROUP = 4, 5  # 100 bits
-_N, _R, _P, _BYTES = 2**15, 8, 1, 32  # 32 MiB and about 0.1 s
-_MOST_N = 2**20
+_BYTES = 32  # 32 MiB and about 0.1 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +32,13 @@ class PasswordHash:
     salt: bytes
     digest: bytes
 
+    # 32 MiB and about 0.1 s
     @classmethod
-    def of(cls, password: str, n: int = _N) -> "PasswordHash":
+    def of(cls, password: str, n: int = 2**15) -> "PasswordHash":
         """Hash a password with a salt of its own; n is the cost, a power of two."""
         salt = secrets.token_bytes(16)
-        return cls(n, _R, _P, salt, _scrypt(password, salt, n, _R, _P))
+        r, p = 8, 1
+        return cls(n, r, p, salt, _scrypt(password, salt, n, r, p))
 
     @classmethod
     def parse(cls, text: str, where: str) -> "PasswordHash":
@@ -55,7 +54,8 @@ class PasswordHash:
             raise PhalanxError(
                 f"{where}: not the hash of a password; delete it, and a new one is made"
             ) from error
-        if kind != "scrypt" or not 2 <= found.n <= _MOST_N or len(found.digest) != _BYTES:
+        most_n = 2**20
+        if kind != "scrypt" or not 2 <= found.n <= most_n or len(found.digest) != _BYTES:
             raise PhalanxError(f"{where}: not the hash of a password; delete it, and a new one is made")
         return found
 
@@ -70,7 +70,8 @@ class PasswordHash:
 
 def new_password() -> str:
     """A password of 100 random bits, in groups that can be read aloud."""
-    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
+    groups, group = 4, 5  # 100 bits
+    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(group)) for _ in range(groups))
 
 
 def password_from(file: Path) -> PasswordHash:
@@ -81,9 +82,10 @@ def password_from(file: Path) -> PasswordHash:
     """
     text = _text(file)
     password = text.splitlines()[0].strip() if text.strip() else ""
-    if len(password) < LEAST_CHARACTERS:
+    least_characters = 12
+    if len(password) < least_characters:
         raise PhalanxError(
-            f"{file}: the password needs at least {LEAST_CHARACTERS} characters in the first line"
+            f"{file}: the password needs at least {least_characters} characters in the first line"
         )
     return PasswordHash.of(password)
 

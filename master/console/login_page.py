@@ -25,8 +25,6 @@ from master.console.login import MOST_BYTES, PasswordHash
 from master.console.login_sessions import Backoff, Session, Sessions
 
 LOGIN, LOGOUT = "/login", "/logout"
-_BODY_S = 10.0
-_BUSY = 4  # passwords that wait to be checked; one is at a time, as each takes 32 MiB
 _FOLDER = Path(__file__).parent / "static"
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -109,7 +107,8 @@ class LoginRequired:
             return login_page(goal, "That was no password.", 400)
         if (wait_s := self._backoff.wait_s(address, self._clock())) > 0.0:
             return _later(goal, wait_s)
-        if self._waiting >= _BUSY:
+        busy = 4  # passwords that wait to be checked; one is at a time, as each takes 32 MiB
+        if self._waiting >= busy:
             return _later(goal, 1.0)
         self._waiting += 1
         try:
@@ -179,7 +178,8 @@ async def _password(request: Request) -> str | None:
     """
     body = b""
     try:
-        async with asyncio.timeout(_BODY_S):
+        body_s = 10.0
+        async with asyncio.timeout(body_s):
             async for part in request.stream():
                 body += part
                 if len(body) > MOST_BYTES:

@@ -10,12 +10,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address, ip_network
 
-LIFE_S = 12 * 3600.0  # a working day
-MOST_SESSIONS = 64
-FREE_TRIES = 3
-FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 300.0
-MOST_ADDRESSES = 1024
-_TOKEN_BYTES = 32
+LONGEST_WAIT_S = 300.0
 
 
 @dataclass(eq=False, slots=True)
@@ -32,14 +27,16 @@ class Sessions:
     Thus a lookup reveals nothing about which token would have matched.
     """
 
-    def __init__(self, life_s: float = LIFE_S, most: int = MOST_SESSIONS) -> None:
+    # a working day
+    def __init__(self, life_s: float = 12 * 3600.0, most: int = 64) -> None:
         """Nobody is logged in. With more than `most` the oldest is logged out."""
         self._life_s, self._most = life_s, most
         self._by_hash: OrderedDict[bytes, Session] = OrderedDict()
 
     def begin(self, now_s: float) -> str:
         """Log in; the token is for the browser alone."""
-        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        token_bytes = 32
+        token = secrets.token_urlsafe(token_bytes)
         while len(self._by_hash) >= self._most:
             self._by_hash.popitem(last=False)[1].ended.set()
         self._by_hash[_hash(token)] = Session(now_s + self._life_s)
@@ -69,7 +66,7 @@ class Backoff:
     The address that was quiet for longest is forgotten first.
     """
 
-    def __init__(self, most: int = MOST_ADDRESSES) -> None:
+    def __init__(self, most: int = 1024) -> None:
         """Nobody failed."""
         self._most = most
         self._failures: OrderedDict[str, tuple[int, float]] = OrderedDict()
@@ -86,8 +83,10 @@ class Backoff:
         """
         key = _network(address)
         count = self._failures.pop(key, (0, 0.0))[0] + 1
-        wait_s = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(count - FREE_TRIES, 30))
-        self._failures[key] = (count, now_s + (wait_s if count >= FREE_TRIES else 0.0))
+        free_tries = 3
+        first_wait_s = 1.0
+        wait_s = min(LONGEST_WAIT_S, first_wait_s * 2.0 ** min(count - free_tries, 30))
+        self._failures[key] = (count, now_s + (wait_s if count >= free_tries else 0.0))
         while len(self._failures) > self._most:
             self._failures.popitem(last=False)
 

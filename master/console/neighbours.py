@@ -9,7 +9,6 @@ from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 
 _TABLES = ("tcp", "tcp6")
-_ROOT = 0
 _WORD = 8  # hexadecimal digits of 32 bits, which the kernel writes in the machine's own byte order
 Peer = tuple[str, int]
 
@@ -34,7 +33,8 @@ def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool
                 continue
             fields = line.split()
             if (_socket(fields[1]), _socket(fields[2])) == wanted:
-                return int(fields[7]) in (os.getuid(), _ROOT)
+                root = 0
+                return int(fields[7]) in (os.getuid(), root)
     return False
 
 

@@ -16,7 +16,6 @@ from master.outputs.network.outputs import OUTPUTS, switched_on
 from master.outputs.network.sender import NAME, settings_of
 
 PROCESS = "send"
-_GONE_S = 3.0  # so long one that has ended is still seen on the bus
 
 
 def outputs_path(state: ConsoleState) -> Path:
@@ -76,7 +75,8 @@ def _of_others(state: ConsoleState) -> bool:
 
     Our own process that has just ended stays visible a moment longer, so this waits until it is gone.
     """
-    until = time.monotonic() + (_GONE_S if state.local.get(PROCESS) is not None else 0.0)
+    gone_s = 3.0  # so long one that has ended is still seen on the bus
+    until = time.monotonic() + (gone_s if state.local.get(PROCESS) is not None else 0.0)
     while NAME in state.alive and time.monotonic() < until:
         time.sleep(0.1)
     return NAME in state.alive

@@ -25,7 +25,6 @@ _TITLES = {
     "lsl": ("LSL", "Lab Streaming Layer: a stream for each hand"),
     "web": ("WebSocket", "JSON in the joint order of WebXR, and a page with the hand"),
 }
-_UPDATE_S = 1.0
 
 
 def output_panel(state: ConsoleState) -> None:
@@ -83,7 +82,8 @@ def output_panel(state: ConsoleState) -> None:
             log.set_text("\n".join(process.tail(4)))
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 1.0
+    ui.timer(update_s, update)
 
 
 def status_words(name: str, report: Health | None) -> str:

@@ -11,9 +11,6 @@ from common.errors import CalibrationError
 from common.messages import Preview
 from common.recording.picture_size import Size, jpeg_size
 
-_POLL_S = 2.0  # a camera file is not read more often
-_MOST = 64  # cameras: a bus on which names are invented costs no memory
-
 
 class PictureSizes:
     """Compares the sizes of previews with those of the camera files.
@@ -51,14 +48,16 @@ class PictureSizes:
         return self._refused.get(camera, "")
 
     def _size(self, name: str) -> Size | None:
-        read_s, size = self._known.get(name, (-_POLL_S, None))
-        if time.monotonic() - read_s < _POLL_S:
+        poll_s = 2.0  # a camera file is not read more often
+        read_s, size = self._known.get(name, (-poll_s, None))
+        if time.monotonic() - read_s < poll_s:
             return size
         try:
             file = self._camera(name)
             size = file.width_px, file.height_px
         except CalibrationError:
             size = None  # not calibrated yet, or half written
-        if name in self._known or len(self._known) < _MOST:
+        most = 64  # cameras: a bus on which names are invented costs no memory
+        if name in self._known or len(self._known) < most:
             self._known[name] = time.monotonic(), size
         return size

@@ -21,11 +21,8 @@ from master.console.recording_panel import recordings_folder
 from master.console.state import ConsoleState
 
 PROCESS = "play"
-_UPDATE_S = 0.5
 _SPEEDS = {0.25: "¼ ×", 0.5: "½ ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×", 0.0: "as fast as it goes"}
-_MOST_FILES = 200
-# A jump may take so long; so near to where it went it has arrived; so long a hand rests between two steps.
-_JUMP_S, _NEAR_S, _REST_S = 5.0, 2.0, 1.5
+_JUMP_S = 5.0
 
 
 def recordings(state: ConsoleState) -> list[str]:
@@ -34,7 +31,8 @@ def recordings(state: ConsoleState) -> list[str]:
     if not folder.is_dir():
         return []
     files = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-    return [path.stem for path in files[:_MOST_FILES]]
+    most_files = 200
+    return [path.stem for path in files[:most_files]]
 
 
 def start_playing(state: ConsoleState, name: str) -> None:
@@ -93,9 +91,11 @@ class Controls:
         if now is None or position is None or self._command_queue.busy:
             return
         if self._wanted_s is not None:
-            there = abs(position - self._wanted_s) < _NEAR_S
+            # A jump may take so long; so near to where it went it has arrived; so long a hand rests between two steps.
+            near_s, rest_s = 2.0, 1.5
+            there = abs(position - self._wanted_s) < near_s
             left_s = self._until_s - time.monotonic()
-            if left_s > (_JUMP_S - _REST_S if there else 0.0):
+            if left_s > (_JUMP_S - rest_s if there else 0.0):
                 return  # still being moved by hand, or on its way
             self._wanted_s = None
         length = now.metrics.get("play.length_s", 0.0)
@@ -183,4 +183,5 @@ def play_panel(state: ConsoleState) -> None:
         log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 0.5
+    ui.timer(update_s, update)

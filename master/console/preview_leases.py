@@ -8,10 +8,6 @@ from common.errors import BusError
 from common.messages import Command, Health
 from common.messages.preview_wish import PreviewWish
 
-LEASE_S = 3.0  # so long a lease holds: whoever still looks renews it before
-ASK_EVERY_S = 1.0  # a camera shows itself for 3 s after each request
-_ANSWER_S = 1.5
-
 
 class PreviewLeases:
     """Viewers of each camera, with the time until which each looks.
@@ -33,7 +29,8 @@ class PreviewLeases:
         The pixels of these markers are tinted. Never waits.
         """
         with self._lock:
-            self._until.setdefault(camera, {})[mask] = time.monotonic() + LEASE_S
+            lease_s = 3.0  # so long a lease holds: whoever still looks renews it before
+            self._until.setdefault(camera, {})[mask] = time.monotonic() + lease_s
             if camera not in self._threads:
                 thread = threading.Thread(
                     target=self._work, args=(camera,), name=f"look {camera}", daemon=True
@@ -54,11 +51,13 @@ class PreviewLeases:
         while (mask := self._mask(camera)) is not None:
             body = PreviewWish(mask=mask, found=True).body() if mask else ""
             try:
-                self._ask(Command(camera, "preview", body), _ANSWER_S)
+                answer_s = 1.5
+                self._ask(Command(camera, "preview", body), answer_s)
                 self._errors.pop(camera, None)
             except BusError as error:
                 self._errors[camera] = str(error)
-            time.sleep(ASK_EVERY_S)
+            ask_every_s = 1.0  # a camera shows itself for 3 s after each request
+            time.sleep(ask_every_s)
 
     def _mask(self, camera: str) -> tuple[str, ...] | None:
         """Return all markers that somebody wants tinted.

@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterable
 
 ENDS_S = 4.0
-_POLL_S = 0.05
 
 
 def watch(lines: Iterable[str]) -> set[int]:
@@ -33,7 +32,8 @@ def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
     left = {group for group in groups if _send(group, signal.SIGTERM)}
     deadline = time.monotonic() + ends_s
     while left and time.monotonic() < deadline:
-        time.sleep(_POLL_S)
+        poll_s = 0.05
+        time.sleep(poll_s)
         left = {group for group in left if _send(group, 0)}
     for group in left:
         _send(group, signal.SIGKILL)

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 
 from common.messages import Gesture
 
-HOLD_S = 0.5  # a gesture is repeated with every pose of its hand: not received for so long, it is over
 KEPT = 30
-_MOST = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,18 +37,21 @@ class ReceivedGestures:
         received = ReceivedGesture(now_s, gesture)
         if gesture.phase != "update":
             self._events.append(received)
+        most = 64
         if gesture.phase == "end":
             self._held.pop(key, None)
-        elif key in self._held or len(self._held) < _MOST:
+        elif key in self._held or len(self._held) < most:
             self._held[key] = received
 
     def held(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> what lasts at `now_s` [s], by default now."""
         now_s = time.monotonic() if now_s is None else now_s
+        # a gesture is repeated with every pose of its hand: not received for so long, it is over
+        hold_s = 0.5
         return {
             key: received.gesture
             for key, received in list(self._held.items())
-            if now_s - received.received_s < HOLD_S
+            if now_s - received.received_s < hold_s
         }
 
     def events(self) -> list[ReceivedGesture]:

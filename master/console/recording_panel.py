@@ -18,7 +18,6 @@ from master.console.state import ConsoleState
 PROCESS = "record"
 RECORDER = "recorder"  # its name on the bus
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,62}")
-_UPDATE_S = 0.5
 
 
 def recordings_folder(state: ConsoleState) -> Path:
@@ -107,7 +106,8 @@ def recording_panel(state: ConsoleState) -> None:
             status.set_text("\n".join(process.tail(3)) or ("starting …" if running else ""))
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 0.5
+    ui.timer(update_s, update)
 
 
 def _new_name() -> str:

@@ -20,8 +20,6 @@ MOST_CONNECTIONS = 256  # a page has about ten; whoever opens more finds a 503, 
 MOST_OF_ONE = 128  # of one address: the other half is left for others
 OPEN_S = 5.0  # from a connection, or the first byte of a request, to the end of its headers; and for TLS before that
 MOST_HEAD_BYTES = 64 * 1024  # of the address that is asked for, and all headers
-MOST_MESSAGE_BYTES = 1 << 20  # of a web socket: pages send words, not files
-_LEAVE_S = 2  # pages that are open do not keep the console from ending
 
 
 class BoundedHttp(HttpToolsProtocol):
@@ -110,15 +108,17 @@ class ConsoleServer(uvicorn.Server):
 
 def console_server(app: FastAPI, tls: ssl.SSLContext | None) -> ConsoleServer:
     """The server of `app`, not yet running; plain where there is no `tls`."""
+    most_message_bytes = 1 << 20  # of a web socket: pages send words, not files
+    leave_s = 2  # pages that are open do not keep the console from ending
     config = uvicorn.Config(
         app,
         http=BoundedHttp,
         log_level="error",  # junk of a port scan is no news, and must not fill the disk
-        timeout_graceful_shutdown=_LEAVE_S,
+        timeout_graceful_shutdown=leave_s,
         access_log=False,
         lifespan="on",
         limit_concurrency=MOST_CONNECTIONS,
-        ws_max_size=MOST_MESSAGE_BYTES,
+        ws_max_size=most_message_bytes,
         proxy_headers=False,  # who asks is who is connected, whatever a header states
     )
     config.load()

@@ -21,9 +21,6 @@ from master.console.state import ConsoleState
 from master.outputs.web import object_json, static_dir, three_js_path, webxr_json
 
 _POLL_S = 0.03
-_RENEW_S = 1.0
-_MOST_CHARACTERS = 8192
-_NOT_OURS = 4004
 _TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
 
 
@@ -46,9 +43,10 @@ class Shown:
 
     def on_text(self, text: str) -> None:
         """Take one message of the page; what is none of ours is left alone."""
+        most_characters = 8192
         if text == "next":
             self.ready = True
-        elif len(text) <= _MOST_CHARACTERS:
+        elif len(text) <= most_characters:
             self.mask = _mask(text, self.mask)
 
 
@@ -66,7 +64,8 @@ def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
 
     async def camera_socket(socket: WebSocket, camera: str) -> None:
         if camera not in state.cameras():
-            await socket.close(_NOT_OURS)
+            not_ours = 4004
+            await socket.close(not_ours)
             return
         async with _page(socket) as shown:
             await _send_pictures(socket, state, camera, shown)
@@ -112,7 +111,8 @@ async def _send_pictures(socket: WebSocket, state: ConsoleState, camera: str, sh
     asked = shown.mask
     while True:
         if loop.time() >= look_at or shown.mask != asked:
-            asked, look_at = shown.mask, loop.time() + _RENEW_S
+            renew_s = 1.0
+            asked, look_at = shown.mask, loop.time() + renew_s
             state.look(camera, shown.mask)
         picture = state.preview(camera)
         if picture is None:

@@ -36,8 +36,6 @@ from master.console.tuner import Tuner
 from master.run.master_bus import join_bus
 
 STALE_S = 3.0  # what was not reported again for so long is no longer shown as present
-MAX_NAMES = 64  # kept of each kind: a bus on which names are invented costs no memory
-_LATENCIES = 4096
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -78,7 +76,8 @@ class Newest(Generic[MessageT]):
 
     def put(self, name: str, message: MessageT) -> None:
         """Receive one message."""
-        if name in self._received or len(self._received) < MAX_NAMES:
+        max_names = 64  # kept of each kind: a bus on which names are invented costs no memory
+        if name in self._received or len(self._received) < max_names:
             self._received[name] = (time.monotonic(), message)
 
     def get(self, name: str, within_s: float = STALE_S) -> MessageT | None:
@@ -116,7 +115,8 @@ class ConsoleState:
         self._poses, self._health = Newest[HandPose](), Newest[Health]()
         self._objects, self._contacts = Newest[ObjectPose](), Newest[Contact]()
         self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
-        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
+        latencies = 4096
+        self._latencies_ms: deque[float] = deque(maxlen=latencies)
         self._closing = threading.Event()
         self._sizes = PictureSizes(self.camera)
         self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))

@@ -19,13 +19,6 @@ from master.estimator.observation_sources import BY_MARKERS
 
 PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
-_SUDDEN_M = 3e-3  # from one epoch to the next, beside motion
-_SPEED_S = 0.03  # of the shown hand, which is smooth
-_GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goes on
-_STALE_S = 0.1  # after such a gap nothing of a speed is left
-_STEP_M = 5e-3  # is the most that is led between two poses
-_EASE_S = 0.04  # in which the last of what is led fades
-_BLENDED_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
 
 
 class Blend:
@@ -56,23 +49,30 @@ class Blend:
             points_m: (M, 3) the markers; NaN: not seen.
         """
         if gap_s > 0.0:
-            goes_on = shown + _GOES_ON * min(gap_s, _STALE_S) * self._speed
+            # of it: a motion that is not seen any more rather ends than goes on
+            stale_s = 0.1  # after such a gap nothing of a speed is left
+            goes_on = shown + 0.5 * min(gap_s, stale_s) * self._speed
             went = (points_m - self._points_m)[self._on_palm]
             went = went[np.isfinite(went[:, 0])]
-            if len(went) and gap_s <= _STALE_S:
+            if len(went) and gap_s <= stale_s:
                 goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
             triangulated = (sources & self._sources & BY_MARKERS) > 0
-            led = np.bincount(PARTS, np.abs(self._offset)) > _BLENDED_M
-            leaps = ((sources != self._sources) | ~triangulated | led) & (off > _SUDDEN_M)
+            blended_m, nothing_m = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
+            led = np.bincount(PARTS, np.abs(self._offset)) > blended_m
+            sudden_m = 3e-3  # from one epoch to the next, beside motion
+            leaps = ((sources != self._sources) | ~triangulated | led) & (off > sudden_m)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
-            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
-            left = 1.0 - min(self._blend_m_s * gap_s, _STEP_M) / size_m
-            self._offset = self._offset * np.maximum(left, exp(-gap_s / _EASE_S))[PARTS]
+            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), nothing_m)
+            step_m = 5e-3  # is the most that is led between two poses
+            left = 1.0 - min(self._blend_m_s * gap_s, step_m) / size_m
+            ease_s = 0.04  # in which the last of what is led fades
+            self._offset = self._offset * np.maximum(left, exp(-gap_s / ease_s))[PARTS]
         self._sources, self._points_m = sources, points_m
         return self._offset
 
     def moved(self, gap_s: float, step: Float) -> None:
         """Learn from the step (26,) [m] of what was shown."""
         if gap_s > 0.0:
-            self._speed = self._speed + (1.0 - exp(-gap_s / _SPEED_S)) * (step / gap_s - self._speed)
+            speed_s = 0.03  # of the shown hand, which is smooth
+            self._speed = self._speed + (1.0 - exp(-gap_s / speed_s)) * (step / gap_s - self._speed)

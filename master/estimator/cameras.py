@@ -13,10 +13,6 @@ from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.kernels import inlined
 
-_NEWTON_STEPS = 12
-_SETTLED = 1e-10  # normalised: the error after a step so small is its square, about
-_LEAST_DEPTH_M = 1e-9
-
 
 class CameraArrays(NamedTuple):
     """C cameras of the pinhole model with five distortion coefficients.
@@ -75,7 +71,8 @@ def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) ->
         x += cameras.R[c, 0, i] * point[i]
         y += cameras.R[c, 1, i] * point[i]
         z += cameras.R[c, 2, i] * point[i]
-    if not z > _LEAST_DEPTH_M:
+    least_depth_m = 1e-9
+    if not z > least_depth_m:
         return False
     x, y = x / z, y / z
     k1, k2, p1, p2, k3 = (
@@ -124,7 +121,8 @@ def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> 
     seen_x = (u - cameras.principal[c, 0]) / cameras.focal[c, 0]
     seen_y = (v - cameras.principal[c, 1]) / cameras.focal[c, 1]
     x, y = seen_x, seen_y
-    for _ in range(_NEWTON_STEPS):
+    newton_steps = 12
+    for _ in range(newton_steps):
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
@@ -138,7 +136,8 @@ def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> 
         step_y = (a * off_y - b * off_x) / determinant
         x += step_x
         y += step_y
-        if sqrt(step_x * step_x + step_y * step_y) < _SETTLED:
+        settled = 1e-10  # normalised: the error after a step so small is its square, about
+        if sqrt(step_x * step_x + step_y * step_y) < settled:
             out[0], out[1] = x, y
             return determinant > 0.0 and radial > 0.0
         if not np.isfinite(x + y):

@@ -28,8 +28,6 @@ from master.rig.wrist import WristSetup
 
 ROOT_MM = 102.06
 _POLYNOMIAL = (-0.0003, 0.059, -4.07, 119.75)
-_CURLS = 31
-_BRANCH = 0.75  # of a curl: after that the last phalanx folds into the light, and the line jumps to it
 
 
 def cubic_pip(distance_m: Float) -> Float:
@@ -80,10 +78,12 @@ def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
     NaN where the laser misses a finger.
     """
     model = setup.model
-    share = np.linspace(0.0, _BRANCH, _CURLS)[:, None]
+    curls = 31
+    branch = 0.75  # of a curl: after that the last phalanx folds into the light, and the line jumps to it
+    share = np.linspace(0.0, branch, curls)[:, None]
     curl = synergy.range_rad[:, 0] + share * (synergy.range_rad[:, 1] - synergy.range_rad[:, 0])
-    angles = synergy.angles(curl, np.zeros_like(curl)).reshape(_CURLS, 20)
-    points = np.empty((_CURLS, 5, 3))
+    angles = synergy.angles(curl, np.zeros_like(curl)).reshape(curls, 20)
+    points = np.empty((curls, 5, 3))
     tables = HandTables.of(model, HandParameters.of(model))
     _laser_points(boxed(tables), boxed(Device.of(setup)), angles, boxed(Surface.empty()), points)
     return points

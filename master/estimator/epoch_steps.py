@@ -31,12 +31,7 @@ from master.estimator.wrist_device import EXTRAS, HEADING, NO_EXTRAS, Device, ob
 from master.estimator.wrist_model import WristModel
 from master.estimator.wrist_update import prepare_epoch
 
-_STEP = 16
 _STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
-_STANDS_M = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
-_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
-_LENGTH_M = 20e-3  # a line shorter than this has no direction
-_ACROSS = 0.9  # cosine to the sight, at most
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 
 
@@ -193,7 +188,8 @@ class EpochSteps:
             epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         epoch_prior.place_w2[0] = 0.0
         if at.place is not None:
-            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, _STANDS_M**-2.0
+            stands_m = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
+            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, stands_m**-2.0
 
     def predict(self) -> float:
         """Write where the state has the hand; as `predict_epoch`."""
@@ -237,16 +233,19 @@ class EpochSteps:
         if len(points) < 2:
             return False
         off = points - points.mean(axis=0)
+        spread_m = 5e-3  # markers nearer than this to one line do not turn a hand about it
         if len(points) > 2:  # plainly not in one line, without what a decomposition takes
             length2 = np.vecdot(off, off)
             along, longest2 = off @ off[length2.argmax()], float(length2.max())
-            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2:
+            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * spread_m) ** 2:
                 return True
         _, extent, axes = np.linalg.svd(off)
-        if len(points) > 2 and extent[1] > _SPREAD_M:
+        if len(points) > 2 and extent[1] > spread_m:
             return True
         back = self.at.ground.back[0]
-        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.back_normal) < _ACROSS)
+        length_m = 20e-3  # a line shorter than this has no direction
+        across = 0.9  # cosine to the sight, at most
+        return bool(back and extent[0] > length_m and abs(axes[0] @ at.back_normal) < across)
 
     def has_outlier(self) -> bool:
         """Return whether a marker is too far from what was found."""
@@ -272,4 +271,5 @@ class EpochSteps:
 
 def _capacity(markers: int) -> int:
     """Round a count of markers up, so that kernels are compiled once for most rigs."""
-    return max(-(-markers // _STEP), 1) * _STEP
+    step = 16
+    return max(-(-markers // step), 1) * step

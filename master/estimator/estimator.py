@@ -18,7 +18,6 @@ from master.estimator.update import Estimate
 from master.estimator.wrist_device import HEADING, LED_SCALE, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel
 
-_SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
 _SURE_RAD2 = 3.0 * np.radians(5.0) ** 2  # of the turn of a palm that markers place well
 
 
@@ -186,7 +185,8 @@ class Estimator:
 
     def _knows_place(self) -> bool:
         """Return whether the position of a hand measured only by its fingers is known."""
-        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
+        somewhere_m = 0.1  # about each axis: a hand that is known no better than this is lost
+        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * somewhere_m**2
 
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`.

@@ -31,8 +31,6 @@ from master.estimator.settings import Settings
 from master.estimator.state import HandState
 from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 
-_CONSTANT_S = 1e4
-
 
 class ExtrasScratch:
     """Scratch for the extras' steps."""
@@ -75,7 +73,8 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
 
 @inlined
 def _correlation_time(settings: Settings, i: int) -> float:
-    return settings.tilt_s if TILT <= i < TILT + 2 else _CONSTANT_S
+    constant_s = 1e4
+    return settings.tilt_s if TILT <= i < TILT + 2 else constant_s
 
 
 @inner

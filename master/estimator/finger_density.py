@@ -17,7 +17,6 @@ from master.estimator.settings import Settings
 from master.estimator.wrist_device import LinesOfSight
 
 _NATURAL, _STRAIGHT, _FREE = 0, 1, 2
-_FAR = 1e9  # logarithm of what is not searched
 
 
 @inlined
@@ -45,7 +44,8 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
         pip = low + (high - low) * k / (FINE * (NODES - 1))
         if node < scan.first[f] or node + 1 > scan.last[f]:
             for h in range(HANDS):
-                log_p[h, k] = -_FAR
+                far = 1e9  # logarithm of what is not searched
+                log_p[h, k] = -far
             continue
         chi2 = 0.0
         for i in range(ROWS):

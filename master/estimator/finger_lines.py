@@ -16,10 +16,6 @@ from common.arrays import Float
 from common.calibration.wrist import FingerLine
 from common.errors import FitError
 
-_MIN_POINTS = 5
-_MIN_RANGE_M = 5e-3  # below this the direction is that of the noise
-_STRAIGHT = 0.25  # residual per range above which it is a cloud and no line
-
 
 def principal_line(points_m: Float) -> FingerLine:
     """Fit the line through the laser points of one finger.
@@ -36,8 +32,9 @@ def principal_line(points_m: Float) -> FingerLine:
         FitError: Fewer than five points, less than 5 mm of motion, or points on no line.
     """
     points = points_m[np.isfinite(points_m).all(axis=1)]
-    if len(points) < _MIN_POINTS:
-        raise FitError(f"finger line: {len(points)} points of the laser, at least {_MIN_POINTS} are needed")
+    min_points = 5
+    if len(points) < min_points:
+        raise FitError(f"finger line: {len(points)} points of the laser, at least {min_points} are needed")
     mean = points.mean(axis=0)
     direction = np.linalg.svd(points - mean, full_matrices=False)[2][0]
     along = (points - mean) @ direction
@@ -51,11 +48,13 @@ def principal_line(points_m: Float) -> FingerLine:
         )
     )
     low, high = float(along.min()), float(along.max())
-    if high - low < _MIN_RANGE_M:
+    min_range_m = 5e-3  # below this the direction is that of the noise
+    if high - low < min_range_m:
         raise FitError(
             f"finger line: the laser's point moved by {1e3 * (high - low):.1f} mm only: bend the finger fully"
         )
-    if residual > _STRAIGHT * (high - low):
+    straight = 0.25  # residual per range above which it is a cloud and no line
+    if residual > straight * (high - low):
         raise FitError(
             f"finger line: the points deviate {1e3 * residual:.1f} mm from a line of {1e3 * (high - low):.1f} mm:"
             " only this finger should move"

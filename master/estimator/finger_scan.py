@@ -32,14 +32,7 @@ from master.estimator.wrist_device import LinesOfSight
 NODES, FINE = 16, 4
 ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
 HANDS = 3
-_STEPS, _STEPS_RESTART = 3, 5  # from the pose of the PIP before, and from one that was tried
-_RESTART = 5  # every so many nodes others are tried
-_FARTHEST_RAD = 0.3  # of one step
 _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
-_COARSE = 4
-_ROLLED_RAD = 0.25  # no hinges are askew by more
-_ANYWHERE_RAD = 2.0  # of a flexion of which nothing is known
-_HIDDEN_M = 1.5e-3  # of a fingertip behind the skin that the camera sees: its own roundness
 
 
 class Prior:
@@ -270,7 +263,8 @@ def _normal(scan: Scan) -> bool:
     for u in range(4):
         scan.g[u] = 0.0
         for v in range(4):
-            scan.H[u, v] = _ANYWHERE_RAD**-2 if u == v and u == 1 else 0.0
+            anywhere_rad = 2.0  # of a flexion of which nothing is known
+            scan.H[u, v] = anywhere_rad**-2 if u == v and u == 1 else 0.0
         for i in range(ROWS):
             scan.g[u] += scan.J[i, u] * scan.r[i]
             for v in range(u + 1):
@@ -285,7 +279,8 @@ def _put(hand: HandTables, f: int, x0: float, x1: float, x3: float, twist: float
     a[4 * f] = min(max(x0, hand.limits[f, 0, 0]), hand.limits[f, 0, 1])
     a[4 * f + 1] = min(max(x1, hand.limits[f, 1, 0]), hand.limits[f, 1, 1])
     a[4 * f + 3] = min(max(x3, hand.limits[f, 3, 0]), hand.limits[f, 3, 1])
-    scan.twist[f] = min(max(twist, -_ROLLED_RAD), _ROLLED_RAD)
+    rolled_rad = 0.25  # no hinges are askew by more
+    scan.twist[f] = min(max(twist, -rolled_rad), rolled_rad)
     twist_hand(hand, scan.twist)
 
 
@@ -319,9 +314,11 @@ def scan_finger(
             prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip,
             prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip,
         )
-        best, at = inf, _COARSE
-        if (node - scan.first[f]) % _RESTART == 0:
-            for start in range(_COARSE):
+        coarse = 4
+        best, at = inf, coarse
+        restart = 5  # every so many nodes others are tried
+        if (node - scan.first[f]) % restart == 0:
+            for start in range(coarse):
                 _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
                 look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
                 cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
@@ -330,13 +327,15 @@ def scan_finger(
         if node > scan.first[f]:
             before = x[f, node - 1]
             _put(hand, f, before[0], before[1], before[3], before[4], scan)
-            if at < _COARSE:
+            if at < coarse:
                 look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
                 if _rows(settings, lines_of_sight, prior, f, tip, scan) < best:
-                    at = _COARSE
-        if at < _COARSE:
+                    at = coarse
+        if at < coarse:
             _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
-        steps = _STEPS if at == _COARSE else _STEPS_RESTART
+        # from the pose of the PIP before, and from one that was tried
+        steps_restart = 5
+        steps = 3 if at == coarse else steps_restart
         length = cost = 0.0
         for k in range(steps + 1):
             look(hand, device, prior.palm, prior.wrist_axes, a, f, OWN_MOVES, surface)
@@ -356,7 +355,8 @@ def scan_finger(
                 scan.S[0, u] = -scan.g[u]
             substitute(scan.L, 4, scan.S[0])
             for u in range(4):
-                scan.S[0, u] = min(max(scan.S[0, u], -_FARTHEST_RAD), _FARTHEST_RAD)
+                farthest_rad = 0.3  # of one step
+                scan.S[0, u] = min(max(scan.S[0, u], -farthest_rad), farthest_rad)
             _put(
                 hand,
                 f,
@@ -404,6 +404,7 @@ def _shows(device: Any, prior: Prior, length: float, scan: Scan) -> bool:
         return True
     away = sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
     for k in range(7):
-        if first_hit(scan.surface.camera[k], t[0] / away, t[1] / away, t[2] / away) < away - _HIDDEN_M:
+        hidden_m = 1.5e-3  # of a fingertip behind the skin that the camera sees: its own roundness
+        if first_hit(scan.surface.camera[k], t[0] / away, t[1] / away, t[2] / away) < away - hidden_m:
             return False
     return True

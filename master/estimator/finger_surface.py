@@ -28,15 +28,8 @@ from master.estimator.kinematics import abduction_axis, finger_chain
 # Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
 MOVES, OWN_MOVES, NO_MOVES = constant(7), constant(5), constant(0)
 _BONE = np.array([0, 0, 0, 0, 1, 1, 2, 2])
-_PULLED_IN = 0.77
-_CAP_ALONG, _CAP_OUT = 0.7, 0.5  # radii from the last sphere to where the skin turns away
-_LEVEL = 0.05  # a chain less inclined to the plane slides along it without an end
-_FARTHEST = 6.0  # lengths of its last stretch that a chain which ends before the plane is prolonged
 _ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
 RAYS = 16
-_SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
-_ROUNDED_M = 1e-9
-_STRETCH = 0.5  # share of the finger's breadth that one chord may span: more is a jump from part to part
 
 
 class Surface:
@@ -141,10 +134,12 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         dot = x * along[k, 0] + y * along[k, 1] + z * along[k, 2]
         x, y, z = x - dot * along[k, 0], y - dot * along[k, 1], z - dot * along[k, 2]
         scale = device.radius[f, k] / sqrt(x * x + y * y + z * z)
-        pulled_in = _PULLED_IN * scale
+        # pulled in
+        pulled_in = 0.77 * scale
         Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + pulled_in * x, S[k, 1] + pulled_in * y, S[k, 2] + pulled_in * z
         if k == 7:
-            out, ahead = _CAP_OUT * scale, _CAP_ALONG * device.radius[f, k]
+            cap_along, cap_out = 0.7, 0.5  # radii from the last sphere to where the skin turns away
+            out, ahead = cap_out * scale, cap_along * device.radius[f, k]
             Q[8, 0] = S[7, 0] + out * x + ahead * along[7, 0]
             Q[8, 1] = S[7, 1] + out * y + ahead * along[7, 1]
             Q[8, 2] = S[7, 2] + out * z + ahead * along[7, 2]
@@ -168,7 +163,8 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         at = 7 if device.before[0] * near > 0.0 else 0
     x, y, z = Q[at + 1, 0] - Q[at, 0], Q[at + 1, 1] - Q[at, 1], Q[at + 1, 2] - Q[at, 2]
     rise, length = n[0] * x + n[1] * y + n[2] * z, sqrt(x * x + y * y + z * z)
-    least = _LEVEL * length
+    level = 0.05  # a chain less inclined to the plane slides along it without an end
+    least = level * length
     held = rise
     if abs(rise) < least:
         held = least if rise >= 0.0 else -least
@@ -176,7 +172,8 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         height = near if at == 7 else first
         if at == 7:
             height -= rise  # of the beginning of the stretch
-        share = min(max(-height / held, -_FARTHEST), _FARTHEST)
+        farthest = 6.0  # lengths of its last stretch that a chain which ends before the plane is prolonged
+        share = min(max(-height / held, -farthest), farthest)
     for i in range(3):
         w = Q[at + 1, i] - Q[at, i]
         work.q[i] = Q[at, i] + share * w
@@ -255,7 +252,8 @@ def laser_centroid(device: Any, f: int, work: Surface) -> float:
     for k in range(7):
         r1, r2 = device.radius[f, k], device.radius[f, k + 1]
         _terms(S, k, r1, r2, 0.0, 0.0, 0.0, work.camera[k])
-        work.begins[k] = _away(S, k) - max(r1, r2) - _ROUNDED_M
+        rounded_m = 1e-9
+        work.begins[k] = _away(S, k) - max(r1, r2) - rounded_m
     near = 0.0
     for k in range(7):
         work.reached[k] = 0.0
@@ -313,7 +311,8 @@ def laser_centroid(device: Any, f: int, work: Surface) -> float:
         for k in range(7):
             if work.begins[k] < distance:  # what is farther hides nothing
                 seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
-        lit[ray, 3] = min(seen - distance, 0.0) + _SEEN_M
+        seen_m = 3e-4  # a lit point this near behind the first the camera sees is seen
+        lit[ray, 3] = min(seen - distance, 0.0) + seen_m
     total = u = v = 0.0
     for ray in range(RAYS - 1):
         here, there = lit[ray, 3], lit[ray + 1, 3]
@@ -324,7 +323,9 @@ def laser_centroid(device: Any, f: int, work: Surface) -> float:
             lit[ray + 1, 1] - lit[ray, 1],
             lit[ray + 1, 2] - lit[ray, 2],
         )
-        if dx * dx + dy * dy + dz * dz > (_STRETCH * broad) ** 2:
+        # share of the finger's breadth that one chord may span: more is a jump from part to part
+        stretch = 0.5
+        if dx * dx + dy * dy + dz * dz > (stretch * broad) ** 2:
             continue
         begin, end = 0.0, 1.0
         if here <= 0.0:

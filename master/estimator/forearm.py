@@ -31,9 +31,6 @@ LOST_RAD = 1.0  # a heading less sure than this may point anywhere
 _PROCESS_NOISE2, _MOST2 = (
     np.radians([0.2, 5.0]) ** 2
 )  # [rad^2/s] a heading walks at least and, unless evenly, at most
-_CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
-_RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
-_SMALL_RAD = 1e-9  # a tilt by less is taken as small
 _EYE = np.eye(3)
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
 
@@ -80,7 +77,8 @@ class Forearm:
         if isnan(sum(wxyz.tolist())):
             return
         silent_s = 1e-9 * abs(t_ns - self._sample_ns)
-        if silent_s > _RESTARTED_S and heading_sigma_rad < self._sample_drift_rad:
+        restarted_s = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
+        if silent_s > restarted_s and heading_sigma_rad < self._sample_drift_rad:
             # A drift does not shrink in silence: the IMU counts from a new beginning, in a new world.
             self.lost, self._drift_rad = True, heading_sigma_rad
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
@@ -133,8 +131,9 @@ class Forearm:
             return False
         self.counts["forearm.outlier"] += 1
         self._contrary_ns.append(t_ns)
-        long = abs(t_ns - self._contrary_ns[0]) > _CONTRARY_NS
-        return long and len(self._contrary_ns) >= _CONTRARY
+        contrary_ns, contrary = 500_000_000, 5  # what contradicts for so long, and so often, is right
+        long = abs(t_ns - self._contrary_ns[0]) > contrary_ns
+        return long and len(self._contrary_ns) >= contrary
 
     def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
         """Return the palm orientation at a time in the IMU's own world.
@@ -178,7 +177,8 @@ class Forearm:
         """Return the IMU's world in the rig, tilted by the estimated tilt."""
         x, y = z[TILT : TILT + 2].tolist()
         angle = hypot(x, y)
-        share = sin(0.5 * angle) / angle if angle > _SMALL_RAD else 0.5
+        small_rad = 1e-9  # a tilt by less is taken as small
+        share = sin(0.5 * angle) / angle if angle > small_rad else 0.5
         return quaternion_product(rig_world, (cos(0.5 * angle), share * x, share * y, 0.0))
 
     def _process_noise_rad2(self, t_ns: int, found: Between) -> float:

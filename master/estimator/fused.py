@@ -23,10 +23,7 @@ from master.estimator.pipeline import MarkerPipeline, SolvedPose
 from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.rig.wrist import WristSetup
 
-_SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's strobe cycles lead
 _MAX_AGE_NS = 70_000_000  # an older strobe cycle constrains no finger now
-_OWN_NS = 17_000_000  # half the period of the strobe cycles: of epochs that are unrelated
-_KEPT = 8
 
 
 class WristSide:
@@ -54,7 +51,8 @@ class WristSide:
         forearm = None if setup.imu is None else Forearm(setup.imu, counts)
         self.forearm = forearm if forearm is not None and forearm.placed else None
         self.reader = reader
-        self._waiting: deque[WristDetections] = deque(maxlen=_KEPT)
+        kept = 8
+        self._waiting: deque[WristDetections] = deque(maxlen=kept)
         self._last_ns = -(2**62)
         self.laser_m, self.laser_ns = np.full((5, 3), nan), -(2**62)
         self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
@@ -80,7 +78,8 @@ class WristSide:
         late_ns, message = self._setup.late_ns, None
         if not self._continuous:
             near = min(self._waiting, key=lambda one: abs(one.t_ns + late_ns - t_ns), default=None)
-            message = near if near is not None and abs(near.t_ns + late_ns - t_ns) <= _OWN_NS else None
+            own_ns = 17_000_000  # half the period of the strobe cycles: of epochs that are unrelated
+            message = near if near is not None and abs(near.t_ns + late_ns - t_ns) <= own_ns else None
         else:
             while self._waiting and self._waiting[0].t_ns + late_ns <= t_ns:
                 message = self._waiting.popleft()
@@ -180,7 +179,9 @@ class FusedPipeline:
             slowest_hz: Frame rate of the slowest marker camera.
         """
         self.counts, self._markers, self._side = markers.counts, markers, side
-        self._silent_ns = round(_SILENT_FRAMES * 1e9 / slowest_hz)
+        # of the slowest camera: when so long no epoch came, the device's strobe cycles lead
+        silent_frames = 2.2
+        self._silent_ns = round(silent_frames * 1e9 / slowest_hz)
         self._last_ns: int | None = None
 
     def push(self, message: Detections) -> list[SolvedPose]:

@@ -10,8 +10,6 @@ from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
 from common.messages.records import filled
 from master.estimator.parameters import REACH, HandParameters
 
-_STIFF_RAD = 1e-9  # an angle whose highest flexion is 0 narrows nothing
-
 
 class HandTables:
     """A hand profile with n free angles.
@@ -89,6 +87,7 @@ class HandTables:
             complete[4 * f : 4 * f + 4, : own.shape[1]] = own
         most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
         first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
+        stiff_rad = 1e-9  # an angle whose highest flexion is 0 narrows nothing
         tables: dict[str, Float | Int | Bool] = {
             "swing": model.swing,
             "tip_rotation": model.link_rotation[:, 2],
@@ -98,7 +97,7 @@ class HandTables:
             "first": first,
             "complete": complete,
             "narrows": (model.spread_at_full_flexion < 1.0) & (most > 0.0),
-            "most": np.maximum(most, _STIFF_RAD),
+            "most": np.maximum(most, stiff_rad),
             "left": model.spread_at_full_flexion,
             "low": parameters.low,
             "high": parameters.high,

@@ -12,8 +12,6 @@ from common.calibration import UNIT_WITHIN
 from common.geometry.transforms import Wxyz
 
 REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
-_KEPT = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
-_STRAIGHT = 1e-9  # sine of an angle below which an arc is a straight line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +52,8 @@ class OrientationSamples:
             late_us: How much later samples were taken than their time stamps; added to these.
         """
         self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
-        self._samples: deque[_Sample] = deque(maxlen=_KEPT)
+        kept = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
+        self._samples: deque[_Sample] = deque(maxlen=kept)
         self._first_ns: int | None = None
 
     def __len__(self) -> int:
@@ -124,7 +123,8 @@ def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
     cosine = a * w + b * x + c * y + d * z
     angle = acos(min(abs(cosine), 1.0))
     sine = sin(angle)
-    if sine < _STRAIGHT:
+    straight = 1e-9  # sine of an angle below which an arc is a straight line
+    if sine < straight:
         return first
     p, q = sin((1.0 - share) * angle) / sine, sin(share * angle) / sine
     q = q if cosine >= 0.0 else -q

@@ -19,7 +19,6 @@ from master.estimator.matrices import cholesky, eigen
 from master.estimator.settings import Settings
 from master.estimator.state import Hidden
 
-_QUANTILE_95 = 7.815  # chi square of three numbers
 _LAST = constant(3)  # joint of a finger: its tip
 MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
@@ -259,5 +258,6 @@ def is_small(hand: HandTables, cov: Float, joint: int, most_m: float) -> bool:
 
     And that of its finger's PIP: a tip may be known to millimetres, and not how the finger is bent.
     """
-    most_m2 = most_m * most_m / _QUANTILE_95
+    quantile_95 = 7.815  # chi square of three numbers
+    most_m2 = most_m * most_m / quantile_95
     return _widest(cov[joint]) < most_m2 and _widest(cov[hand.middle[joint]]) < most_m2

@@ -7,8 +7,6 @@ import numpy as np
 from common.arrays import Float
 from common.kernels import inlined, inner, kernel
 
-_SWEEPS, _NOTHING = 30, 1e-36  # of Jacobi; squares of what is beside the diagonal, by those on it
-
 
 @inner
 def cholesky(A: Float, n: int, L: Float) -> bool:
@@ -161,13 +159,14 @@ def diagonalise(A: Float, V: Float) -> None:
     for i in range(n):
         for j in range(n):
             V[i, j] = 1.0 if i == j else 0.0
-    for _ in range(_SWEEPS):
+    sweeps, nothing = 30, 1e-36  # of Jacobi; squares of what is beside the diagonal, by those on it
+    for _ in range(sweeps):
         off, on = 0.0, 0.0
         for i in range(n):
             on += A[i, i] * A[i, i]
             for j in range(i):
                 off += A[i, j] * A[i, j]
-        if not off > _NOTHING * on:
+        if not off > nothing * on:
             return
         for q in range(1, n):
             for p in range(q):

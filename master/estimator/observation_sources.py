@@ -9,9 +9,6 @@ from master.estimator.hand_tables import Mounts
 from master.estimator.residuals import Observations
 
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
-_FIRST_MARKER = 8  # bit
-_PALM_BY = 3  # markers
-_BACK_NUMBERS = 2.0  # a marker on the back measures where that looks, by two angles
 
 
 class Ground:
@@ -73,10 +70,13 @@ def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
         out.back[0] = out.back[0] or mounts.on_back[m]
         if f >= 0:
             out.sources[f] |= ON_MARKERS | (BY_MARKERS if rays > 1 else 0)
-        out.sources[5] |= 1 << (_FIRST_MARKER + m)
+        first_marker = 8  # bit
+        out.sources[5] |= 1 << (first_marker + m)
     for f in range(5):
         out.shown[f] = out.sources[f] > 0
-    out.numbers[0] += _BACK_NUMBERS if out.back[0] else 0.0
-    out.by_markers[0] = out.seen[0] >= _PALM_BY or (out.seen[0] == _PALM_BY - 1 and out.back[0] > 0)
+    back_numbers = 2.0  # a marker on the back measures where that looks, by two angles
+    out.numbers[0] += back_numbers if out.back[0] else 0.0
+    palm_by = 3  # markers
+    out.by_markers[0] = out.seen[0] >= palm_by or (out.seen[0] == palm_by - 1 and out.back[0] > 0)
     if out.by_markers[0]:
         out.sources[5] |= ON_MARKERS | BY_MARKERS

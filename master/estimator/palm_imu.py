@@ -30,8 +30,6 @@ from master.estimator.imu_samples import OrientationSamples
 from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import SolvedHand
 
-_LOST_RAD = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
-_FREE_RAD = 10.0  # constrains nothing beside any marker
 SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it determines how the palm lies
 _EYE = np.eye(3)
 
@@ -83,7 +81,8 @@ class OrientationTrack:
         if heading_rad is None and near is not None:
             rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
         tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.away_s) ** 2
-        about_2 = max((_FREE_RAD if heading_rad is None else heading_rad) ** 2, tilt_2)
+        free_rad = 10.0  # constrains nothing beside any marker
+        about_2 = max((free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)
         information = _EYE / tilt_2 + (1.0 / about_2 - 1.0 / tilt_2) * along
         return OrientationMeasurement(rotation, information, sure=about_2 < SURE_RAD**2)
@@ -93,7 +92,8 @@ class OrientationTrack:
         if self._imu.heading_sigma_rad is None:
             return None
         predicted = hypot(self._imu.heading_sigma_rad, drift_rad)
-        return predicted if predicted < _LOST_RAD else None
+        lost_rad = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
+        return predicted if predicted < lost_rad else None
 
 
 def _twist_about(axis: Float, rotation: Float) -> Float:

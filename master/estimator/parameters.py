@@ -20,10 +20,8 @@ from common.arrays import Bool, Float, Int
 from common.hand.limits import ABDUCTION, FLEXION, spread_left
 from common.hand.model import HandModel
 
-_LEAST_SHARE = 1e-6  # an abduction that is narrowed to nothing may come from any
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
 REACH = 3.0  # standard deviations beyond a limit, where there is no hand
-_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +77,8 @@ class HandParameters:
                 high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / ratio)
         low, high, tolerance = low.reshape(20), high.reshape(20), model.tolerance_rad.reshape(20)[free]
         inverse = np.where(tolerance > 0.0, tolerance, np.inf) ** -2.0
-        span = np.maximum(high - low, _NARROWEST_RAD)[free]
+        narrowest_rad = 1e-3  # limits that leave an angle no room
+        span = np.maximum(high - low, narrowest_rad)[free]
         most = model.limits_rad[:, FLEXION, 1]
         narrows = np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0))
         return cls(
@@ -130,7 +129,8 @@ class HandParameters:
         """The parameters (n,) of legal angles (5, 4)."""
         x = self.free_of(angles_rad)
         if len(self.most):
-            x[self.abduction] /= np.maximum(self._share(self._flexed(x)), _LEAST_SHARE)
+            least_share = 1e-6  # an abduction that is narrowed to nothing may come from any
+            x[self.abduction] /= np.maximum(self._share(self._flexed(x)), least_share)
         return np.minimum(np.maximum(x, self.low), self.high)
 
     def _flexed(self, x: Float) -> Float:

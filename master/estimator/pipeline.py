@@ -39,7 +39,6 @@ from master.fabrik.sync import FrameSet
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
-_NEVER_NS = -(2**62)
 
 
 class WristSideOf(Protocol):
@@ -140,7 +139,8 @@ class MarkerPipeline:
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._last: Fitted | None = None
         self._was_m = np.full((len(markers), 3), np.nan)
-        self._was_ns: Int = np.full(len(markers), _NEVER_NS, np.int64)
+        never_ns = -(2**62)
+        self._was_ns: Int = np.full(len(markers), never_ns, np.int64)
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""

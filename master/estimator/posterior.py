@@ -38,7 +38,6 @@ from master.estimator.settings import Settings
 from master.estimator.solve import descend, linearise, own_cost, past_cost
 from master.estimator.truncated import truncated_mean
 
-_DIFFERENCE_STEP = 1e-4  # of a step: what a difference is taken over
 _ONLY = constant(0)  # hypothesis of `Blank`
 
 
@@ -259,8 +258,9 @@ def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
     """
     markers_of(rig.hand, rig.mounts, one.palm, one.x, scratch.search.rows, scratch.here)
     moves = False
+    difference_step = 1e-4  # of a step: what a difference is taken over
     for i in range(one.step.shape[0]):
-        scratch.search.step[i] = _DIFFERENCE_STEP * one.step[i]
+        scratch.search.step[i] = difference_step * one.step[i]
         moves = moves or one.step[i] != 0.0
     if not moves:
         return
@@ -272,7 +272,7 @@ def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
     )
     for m in range(rig.mounts.finger.shape[0]):
         for i in range(3):
-            scratch.here[m, i] += (scratch.there[m, i] - scratch.here[m, i]) / _DIFFERENCE_STEP
+            scratch.here[m, i] += (scratch.there[m, i] - scratch.here[m, i]) / difference_step
 
 
 @inner

@@ -19,7 +19,6 @@ from common.hand.model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 
-_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 Row = tuple[dict[int, float], float, float]
 
 
@@ -80,7 +79,8 @@ def posture_prior_of(
     volume = normal.copy()
     if model.posture is None:
         flexion = np.flatnonzero((parameters.free >= 4) & (parameters.free % 4 == 1))
-        span = np.maximum(parameters.legal_high - parameters.legal_low, _NARROWEST_RAD)[flexion]
+        narrowest_rad = 1e-3  # limits that leave an angle no room
+        span = np.maximum(parameters.legal_high - parameters.legal_low, narrowest_rad)[flexion]
         # The highest density of a normal distribution of this width is that of any angle within the span.
         volume[1, flexion, flexion] += 2.0 * np.pi / span**2
     share = np.log([settings.natural_prior_weight, 1.0 - settings.natural_prior_weight])

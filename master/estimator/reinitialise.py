@@ -21,9 +21,6 @@ from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.wrist_device import WRIST_ANGLES
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a reinitialising search begins: open to closed
-_MCP_PER_PIP = 0.6
-_ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
-_EVEN = 0.5  # probability
 _AT_ORIGIN = np.eye(4)
 NONE = frozenset[int]()
 
@@ -66,7 +63,8 @@ class Reinitialiser:
             settings,
         )
         postures = np.zeros((len(_BENDS_RAD), 5, 4))
-        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
+        mcp_per_pip = 0.6
+        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (mcp_per_pip, 1.0))[:, None]
         self._postures = np.array([parameters.of_angles(angles) for angles in postures])
         self._finger_of_free = parameters.free // 4
         any_finger = posture_prior.unlike(NONE)
@@ -98,7 +96,8 @@ class Reinitialiser:
         )
         fingers = np.isin(np.arange(5), list(outliers))
         epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
-        task.natural_weight[0], task.counts[0] = _EVEN, 0.0
+        even = 0.5  # probability
+        task.natural_weight[0], task.counts[0] = even, 0.0
         posture_prior = self._posture_prior.unlike(outliers)
         try:
             if start is not None:
@@ -132,7 +131,8 @@ class Reinitialiser:
             T[:3, :3], T[:3, 3] = measured, epoch.place
             return [(T, self._with_scanned(self._natural.copy()))]
         triangulated = steps.triangulated
-        weight = np.where(steps.finger[triangulated] >= 0, 1.0, _PALM_WEIGHT)
+        above_m, above_weight, palm_weight = 0.05, 0.3, 3.0
+        weight = np.where(steps.finger[triangulated] >= 0, 1.0, palm_weight)
         observed = epoch.points_m[steps.on_hand][triangulated]
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
@@ -144,12 +144,12 @@ class Reinitialiser:
                 T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
             elif steps.at.epoch_prior.back_normal_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
-                above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
-                towards = observed.mean(axis=0) + _ABOVE_M * epoch.back_normal
+                above = expected.mean(axis=0) + np.array([0.0, above_m, 0.0])
+                towards = observed.mean(axis=0) + above_m * epoch.back_normal
                 T = fit_rigid(
                     np.vstack([observed, towards]),
                     np.vstack([expected, above]),
-                    np.append(weight, _ABOVE_WEIGHT),
+                    np.append(weight, above_weight),
                 )
             else:
                 T = fit_rigid(observed, expected, weight)

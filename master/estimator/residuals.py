@@ -22,9 +22,6 @@ from master.estimator.cameras import CameraArrays, project
 from master.estimator.kinematics import Scratch
 from master.estimator.matrices import inverse_3
 
-_BEHIND = 1e4  # half chi square of a marker behind a camera that sees it
-_NOWHERE = 1.0  # [1/m^2] information about a marker that no row constrains
-
 
 class Observations(NamedTuple):
     """What is measured of M markers of a hand at one epoch.
@@ -69,7 +66,7 @@ def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: F
     """Add one RAY row to information and gradient by place; return half chi square."""
     J, g, H = work.J, work.g, work.H
     if not project(cameras, c, point, work.uv, J):
-        return _BEHIND
+        return 1e4  # half chi square of a marker behind a camera that sees it
     w, r0, r1 = observed.weight[c, m], work.uv[0] - observed.uv[c, m, 0], work.uv[1] - observed.uv[c, m, 1]
     for a in range(3):
         g[a] += w * (J[0, a] * r0 + J[1, a] * r1)
@@ -112,7 +109,8 @@ def marker_rows(
             cost += _ray(cameras, observed, c, m, point, work)
     for i in range(3):
         for j in range(3):
-            K[i, j] = _NOWHERE if i == j else 0.0
+            nowhere = 1.0  # [1/m^2] information about a marker that no row constrains
+            K[i, j] = nowhere if i == j else 0.0
     inverse_3(H, K, K)
     whole, shared = 0.0, 0.0
     for i in range(3):

@@ -34,8 +34,6 @@ from master.estimator.wrist_device import EXTRAS, WRIST_ANGLES, flexed_palm
 from master.estimator.wrist_rows import finger_rows, orientation_row
 
 MAX_ITERATIONS = 25
-_ROLLED_RAD = 0.25  # no hinges are askew by more
-_FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
 
 
 @inlined
@@ -323,8 +321,9 @@ def descend(
     """
     n, K, hand = x.shape[0], z.shape[0], rig.hand
     cost = linearise(rig, posture_prior, epoch_prior, observed, h, T, x, z, gradient, normal, search)
-    damping, growth, iterations = _FIRST_DAMPING, 2.0, 0
-    while iterations < MAX_ITERATIONS and damping <= _MOST_DAMPING:
+    first_damping, most_damping = 1e-3, 1e6
+    damping, growth, iterations = first_damping, 2.0, 0
+    while iterations < MAX_ITERATIONS and damping <= most_damping:
         iterations += 1
         hoped = _step(rig, x, damping, gradient, normal, search)
         least_gain = tolerance + share * cost
@@ -337,8 +336,9 @@ def descend(
         for i in range(K):
             search.z[i] = z[i] + search.step[6 + n + i]
         for i in range(5 if K == EXTRAS else 0):
-            search.z[i] = min(max(search.z[i], -_ROLLED_RAD), _ROLLED_RAD)
-        if damping <= _FIRST_DAMPING and hoped < least_gain:
+            rolled_rad = 0.25  # no hinges are askew by more
+            search.z[i] = min(max(search.z[i], -rolled_rad), rolled_rad)
+        if damping <= first_damping and hoped < least_gain:
             copy(search.next_palm, T)
             for i in range(n):
                 x[i] = search.x[i]

@@ -17,11 +17,6 @@ from common.messages.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.matrices import cholesky, inverse
 
-_SWEEPS, _DAMPING = 6, 0.8
-_FIXED_RAD, _FIXED_WEIGHT = 1e-6, 1e10  # limits that leave no room, and how that is weighed
-_FAR = 30.0  # standard deviations, beyond which the normal distribution underflows
-_ON_LIMIT_RAD = 1e-9
-
 
 class Cut:
     """Scratch for the mean within limits, of N unknowns, of which n are angles."""
@@ -54,7 +49,8 @@ def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float
     flipped = a > 0.0  # mirrored, so that no tail is the difference of two numbers near 1
     if flipped:
         a, b = -b, -a
-    a, b = min(max(a, -_FAR), _FAR), min(max(b, -_FAR), _FAR)
+    far = 30.0  # standard deviations, beyond which the normal distribution underflows
+    a, b = min(max(a, -far), far), min(max(b, -far), far)
     at_a, at_b = exp(-0.5 * a * a), exp(-0.5 * b * b)
     norm = max(_below(b) - _below(a), 1e-300) * sqrt(2.0 * pi)
     shift = (at_a - at_b) / norm
@@ -79,13 +75,16 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
     n, N = x.shape[0], cut.pull.shape[0]
     for i in range(N):
         cut.pull[i] = 0.0
+    fixed_rad, fixed_weight = 1e-6, 1e10  # limits that leave no room, and how that is weighed
     for i in range(n):
         below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
-        fixed = above - below < _FIXED_RAD
-        cut.weight[i], cut.push[i] = _FIXED_WEIGHT if fixed else 0.0, 0.0
-        if below > -_ON_LIMIT_RAD or above < _ON_LIMIT_RAD:
+        fixed = above - below < fixed_rad
+        cut.weight[i], cut.push[i] = fixed_weight if fixed else 0.0, 0.0
+        on_limit_rad = 1e-9
+        if below > -on_limit_rad or above < on_limit_rad:
             cut.pull[6 + i] = -gradient[6 + i]
-    for sweep in range(_SWEEPS + 1):
+    sweeps, damping = 6, 0.8
+    for sweep in range(sweeps + 1):
         for i in range(N):
             for j in range(i + 1):
                 cut.total[i, j] = normal[i, j]
@@ -101,11 +100,11 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
             for j in range(N):
                 pushed = cut.push[j - 6] if 6 <= j < 6 + n else 0.0
                 mean[i] += cut.cov[i, j] * (cut.pull[j] + pushed)
-        if sweep == _SWEEPS:
+        if sweep == sweeps:
             break
         for i in range(n):
             below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
-            if above - below < _FIXED_RAD:
+            if above - below < fixed_rad:
                 continue
             variance = cut.cov[6 + i, 6 + i]
             # the distribution of the angle without the factor of its own limits
@@ -113,8 +112,8 @@ def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, c
             middle = cavity_variance * (mean[6 + i] / variance - cut.push[i])
             at, narrow = _cut(middle, cavity_variance, below, above)
             better = max(1.0 / narrow - 1.0 / cavity_variance, 0.0)
-            cut.weight[i] += _DAMPING * (better - cut.weight[i])
-            cut.push[i] += _DAMPING * (at / narrow - middle / cavity_variance - cut.push[i])
+            cut.weight[i] += damping * (better - cut.weight[i])
+            cut.push[i] += damping * (at / narrow - middle / cavity_variance - cut.push[i])
     for i in range(n):
         below = -inf if hand.at_low_limit[i] else hand.low[i] - x[i]
         mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

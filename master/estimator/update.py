@@ -27,7 +27,6 @@ from master.estimator.wrist_device import EXTRAS
 from master.estimator.wrist_rows import contrary, sensed_palm
 from master.estimator.wrist_update import extras_only, start_scanned, take_scanned
 
-_LONG_S = 10.0
 _SOLVED, _MEASURED, _HELD, _WRIST = (
     int(source) for source in (Source.SOLVED, Source.MEASURED, Source.HELD, Source.WRIST)
 )
@@ -379,7 +378,8 @@ def take_over_epoch(
     if palm_shown:
         state.measured_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)
-    since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
+    long_s = 10.0
+    since_s = dt_s if goes_on else long_s  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.epoch_prior, found.z, found.cov, found.scale[0], space.extras)
     # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
     state.measured_rotation_known[0] = space.epoch_prior.oriented[0] > 0.0

@@ -23,10 +23,6 @@ from master.rig.wrist import WristSetup
 TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
 _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
-_BLUR_PX = 0.5
-_CURVED = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
-_WHOLE = 0.85  # of the line that is expected: a shorter one is hidden in part
-_AWAY_M = 0.1  # a fingertip of which no laser point measures the distance
 
 
 class Device:
@@ -222,14 +218,16 @@ def loosen_short(
     """
     seen_px = lines_of_sight.laser_px[f]
     x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
-    if seen_px == 0.0 or seen_px > _WHOLE * length_px or not on_plane(device, x, y, point, A):
+    whole = 0.85  # of the line that is expected: a shorter one is hidden in part
+    if seen_px == 0.0 or seen_px > whole * length_px or not on_plane(device, x, y, point, A):
         return False
     W = lines_of_sight.laser_W[f]
     det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
     off = 0.5 * (length_px - seen_px) / device.focal[0]
     for axis in range(2):
-        scale = off * (1.0 if axis == 0 else _CURVED) / hypot(A[0, axis], A[1, axis])
+        curved = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
+        scale = off * (1.0 if axis == 0 else curved) / hypot(A[0, axis], A[1, axis])
         u, v = scale * A[0, axis], scale * A[1, axis]
         a, b, c = a + u * u, b + u * v, c + v * v
     inverse_2(a, b, c, W)
@@ -291,7 +289,8 @@ def observe_wrist(
                 out.laser_W[f, i, j] = out.tip_W[f, i, j] = 1.0 if i == j else 0.0
         x, y = laser[f, 0], laser[f, 1]
         if np.isfinite(x + y + laser_sigma_px[f]) and on_plane(device, x, y, point, A):
-            sensed = (laser_sigma_px[f] ** 2 + _BLUR_PX**2) / device.focal[0] ** 2
+            blur_px = 0.5
+            sensed = (laser_sigma_px[f] ** 2 + blur_px**2) / device.focal[0] ** 2
             across = 0.25 * device.surface2[f] + _PALM_M**2
             along = device.surface2[f] + _PALM_M**2
             a = sensed + A[0, 0] ** 2 * across + A[0, 1] ** 2 * along
@@ -302,7 +301,8 @@ def observe_wrist(
             out.laser_px[f] = laser_px[f] if laser_px[f] > 0.0 else 0.0
         x, y = tip[f, 0], tip[f, 1]
         if np.isfinite(x + y + tip_sigma_px[f]):
-            near = point[2] if out.lit[f] > 0.0 else _AWAY_M
+            away_m = 0.1  # a fingertip of which no laser point measures the distance
+            near = point[2] if out.lit[f] > 0.0 else away_m
             variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / near**2
             inverse_2(variance, 0.0, variance, out.tip_W[f])
             out.tip[f, 0], out.tip[f, 1], out.shown[f], out.rows[0] = x, y, 1.0, 1.0

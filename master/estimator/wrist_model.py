@@ -15,11 +15,9 @@ from master.estimator.wrist_device import Device
 from master.rig.wrist import WristSetup
 
 _DIP_PER_PIP = 0.5 * (2.0 / 3.0 + 0.84)  # between the ratios of both papers
-_IP_PER_MCP = 1.1  # of thumbs: between those of grasps and the ratio of the limits
 _ASIDE_RAD = radians(25.0)
 _BEYOND_RAD = radians(8.0)  # of limits: those of a hand file are a prior's, not a wall's
 _DIP_SPREAD_RAD = radians(7.0)
-_INSIDE_PX = 20.0  # from the edge of the image: a fingertip there is clearly in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +58,8 @@ class WristModel:
         per_pip = synergy.per_pip.copy()
         if setup.model.profile.couplings is None and setup.solver_mode != "fk":
             per_pip[1:, DIP] = _DIP_PER_PIP
-        per_pip[0, DIP] = _IP_PER_MCP
+        ip_per_mcp = 1.1  # of thumbs: between those of grasps and the ratio of the limits
+        per_pip[0, DIP] = ip_per_mcp
         base_rad = synergy.base_rad.copy()
         base_rad[0, DIP] = 0.0
         if not lit(setup, synergy):
@@ -71,7 +70,8 @@ class WristModel:
         size = np.array([optics.width_px, optics.height_px])
         centre = np.array([optics.matrix[0, 2], optics.matrix[1, 2]])
         focal = np.array([optics.matrix[0, 0], optics.matrix[1, 1]])
-        low, high = (_INSIDE_PX - centre) / focal, (size - _INSIDE_PX - centre) / focal
+        inside_px = 20.0  # from the edge of the image: a fingertip there is clearly in it
+        low, high = (inside_px - centre) / focal, (size - inside_px - centre) / focal
         return cls(
             Device.of(setup),
             base_rad,

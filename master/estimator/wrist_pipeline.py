@@ -31,7 +31,6 @@ _PALM = np.setdiff1d(np.arange(26), CHAINS)
 _NO_AXES = np.zeros((3, 3))
 _NO_POINTS = np.empty((0, 3)), np.empty((0, 3, 3))
 _STRAIGHT = np.zeros(2), np.zeros((2, 2))
-_NEVER_NS = -(2**62)
 
 
 class WristPipeline:
@@ -67,7 +66,8 @@ class WristPipeline:
         )
         self._place = np.ascontiguousarray(T[:3, 3])
         self._forearm = None if setup.imu is None else Forearm(setup.imu, self.counts)
-        self._last_ns, self._seen_ns = _NEVER_NS, np.full(5, _NEVER_NS)
+        never_ns = -(2**62)
+        self._last_ns, self._seen_ns = never_ns, np.full(5, never_ns)
         self._forget_ns = round(1e9 * settings.forget_s)
 
     def push(self, message: WristDetections) -> list[SolvedPose]:

@@ -22,8 +22,6 @@ from master.estimator.kinematics import rotation_between
 from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.wrist_device import LED_SCALE, TILT, WRIST_ANGLES, flexed_palm
 
-_SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
-
 
 @inlined
 def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
@@ -34,7 +32,8 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
     squared = rotation[0] * rotation[0] + rotation[1] * rotation[1] + rotation[2] * rotation[2]
-    angle = max(sqrt(squared), _SMALL_RAD)
+    small_rad = 1e-4  # below it a rotation vector counts as so long in the derivative
+    angle = max(sqrt(squared), small_rad)
     factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3

@@ -19,7 +19,6 @@ from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.result_files import ObjectPoses
 
 _NEAR_NS = 100_000_000  # between truths farther apart nothing is interpolated
-_FIRST_NS = 1_000_000_000  # scene time 0 of a recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +73,8 @@ def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
         raise RecordingError(f"{folder / TRUTH}: {key}: {error}") from error
     if t_s.ndim != 1 or poses.shape != (t_s.size, 4, 4):
         raise RecordingError(f"{folder / TRUTH}: {key} has shape {poses.shape}, expected ({t_s.size}, 4, 4)")
-    return ObjectTruth(_FIRST_NS + np.round(1e9 * t_s).astype(np.int64), poses)
+    first_ns = 1_000_000_000  # scene time 0 of a recording
+    return ObjectTruth(first_ns + np.round(1e9 * t_s).astype(np.int64), poses)
 
 
 def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:

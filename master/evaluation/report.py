@@ -32,7 +32,6 @@ from master.outputs.truth import PosesTruth
 from master.replay.solve import fingers_of
 from master.rig.setup import RigSetup
 
-_IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
 
 
@@ -208,6 +207,7 @@ def _images(
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     for camera in scene.rig.cameras:
         renderer = Renderer(scene, camera)
-        for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
+        images_hz = 2.0
+        for t_ns in range(first, last, int(1e9 / images_hz)):
             progress(f"rendering camera {camera}", t_ns - first, last - first)
             yield camera, t_ns, renderer.render((t_ns - epoch_ns) * 1e-9)

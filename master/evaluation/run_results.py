@@ -28,8 +28,6 @@ from master.outputs.result_files import (
 from master.rig.setup import RigSetup
 
 _LATE_S = 0.4  # a gesture that is reported so long after it was made is not that one
-_GAP_NS = 200_000_000  # between two rows of one contact
-_TRUTH_HZ = 60.0
 
 
 class Annotation(Protocol):
@@ -141,7 +139,8 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
     if len(poses) == 0:
         return ObjectTruth(np.empty(0, np.int64), np.empty((0, 4, 4)))
     first, last = max(int(poses.t_ns[0]), epoch_ns), int(poses.t_ns[-1])
-    t_ns = np.arange(first, max(last, first) + 1, round(1e9 / _TRUTH_HZ), dtype=np.int64)
+    truth_hz = 60.0
+    t_ns = np.arange(first, max(last, first) + 1, round(1e9 / truth_hz), dtype=np.int64)
     true = [scene.truth(float(t - epoch_ns) * 1e-9).objects[poses.object] for t in t_ns.tolist()]
     return ObjectTruth(t_ns, np.array(true))
 
@@ -268,4 +267,5 @@ def _seconds_of(one: Gesture, epoch_ns: int) -> float:
 def _seconds(t_ns: Int, holds: Bool) -> float:
     """How long something held [s], a gap in the rows not counted."""
     step = np.diff(t_ns)
-    return float(step[holds[:-1] & (step < _GAP_NS)].sum() * 1e-9) if len(t_ns) > 1 else 0.0
+    gap_ns = 200_000_000  # between two rows of one contact
+    return float(step[holds[:-1] & (step < gap_ns)].sum() * 1e-9) if len(t_ns) > 1 else 0.0

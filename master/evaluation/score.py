@@ -16,9 +16,6 @@ from common.hand.model import FINGER_JOINTS
 from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 
-_MATCH_NS = 1_000_000
-_FOLLOWS_NS = 100_000_000  # longer apart, two poses are no step
-_HAND_OVER_NS = 200_000_000
 _OF_HAND = ("t_ref", "joints", "angles", "paint_centroid", "frac")  # arrays of a truth
 _OF_SWEEP = ("depth", "center", "frac")
 _FINGER_OF_JOINT = np.full(26, -1)
@@ -131,7 +128,8 @@ def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[s
     put(out, "hidden_invalid", (~all_valid)[hidden[:, 1:]].astype(np.float64), np.mean)
     step = 1e3 * np.linalg.norm(np.diff(found, axis=0) - np.diff(exact, axis=0), axis=2)
     t_ns = poses.t_ns[rows]
-    follows = (np.diff(t_ns) <= _FOLLOWS_NS)[:, None] & valid[1:] & valid[:-1]
+    follows_ns = 100_000_000  # longer apart, two poses are no step
+    follows = (np.diff(t_ns) <= follows_ns)[:, None] & valid[1:] & valid[:-1]
     near = _near_change(t_ns, poses.source[rows])
     put(out, "hand_over_step_mm", step[follows & near[1:, None]], np.max)
     return out
@@ -143,8 +141,9 @@ def _near_change(t_ns: Int, source: Code) -> Bool:
     Within 0.2 s of each of the times (N,), of sources (N, 26).
     """
     changed = t_ns[1:][(source[1:] != source[:-1]).any(axis=1)]
-    after = np.searchsorted(changed, t_ns - _HAND_OVER_NS)
-    return np.searchsorted(changed, t_ns + _HAND_OVER_NS, side="right") > after
+    hand_over_ns = 200_000_000
+    after = np.searchsorted(changed, t_ns - hand_over_ns)
+    return np.searchsorted(changed, t_ns + hand_over_ns, side="right") > after
 
 
 def put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:
@@ -175,7 +174,8 @@ def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
         return rows, rows
     nearest = np.clip(np.searchsorted(truth_ns, t_ns), 1, len(truth_ns) - 1)
     nearest = nearest - (np.abs(truth_ns[nearest - 1] - t_ns) <= np.abs(truth_ns[nearest] - t_ns))
-    rows = np.flatnonzero(np.abs(truth_ns[nearest] - t_ns) <= _MATCH_NS)
+    match_ns = 1_000_000
+    rows = np.flatnonzero(np.abs(truth_ns[nearest] - t_ns) <= match_ns)
     return rows, nearest[rows]
 
 

@@ -18,7 +18,6 @@ from common.sim.wrist.scene import WristTruth as WristEpoch
 from master.evaluation.wrist_score import WristTruth, score_laser
 from master.outputs.poses import Poses
 
-_IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
 
 
@@ -95,6 +94,7 @@ def wrist_images(
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     camera = scene.rig.cameras[0]
     renderer = WristRenderer(scene, camera)
-    for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
+    images_hz = 2.0
+    for t_ns in range(first, last, int(1e9 / images_hz)):
         progress(f"rendering camera {camera}", t_ns - first, last - first)
         yield camera, t_ns, lit_view(renderer, (t_ns - epoch_ns) * 1e-9)

@@ -23,15 +23,9 @@ from master.rig.wrist import WristSetup
 
 GROUPS = ("palm", *FINGERS, "thenar")  # rows of the truth's laser line
 _OF_FINGERS = slice(1, 1 + FINGER_COUNT)
-_CLEAR_M = 2e-3  # of line that is lit and seen: less is no more than a few pixels
-_NEAR_PX, _FAR_PX = (
-    6.0,
-    15.0,
-)  # of a tip that is found, and of one that is false: half the width of a fingertip
 _STRAIGHT_RAD = np.radians(
     85.0
 )  # up to here the laser measures the flexion; from about 95 degrees its point stands still
-_MATCH_NS = 5_000_000  # less than half the time from one frame to the next
 _OF_WRIST = "wrist_"
 _ARRAYS = ("t_ns", "laser_pt", "laser_len_vis", "tip_uv", "tip_visible", "joints", "angles")
 _LOG = logging.getLogger(__name__)
@@ -197,8 +191,10 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
     reported = np.isfinite(found).all(axis=2)
     out: dict[str, float] = {}
     put(out, "tip_px", off[reported & truth.tip_visible], np.median)
-    put(out, "tip_within_6px", (reported & (off <= _NEAR_PX))[truth.tip_visible].astype(np.float64), np.mean)
-    right = truth.tip_visible & (off <= _FAR_PX)
+    # of a tip that is found, and of one that is false: half the width of a fingertip
+    near_px, far_px = 6.0, 15.0
+    put(out, "tip_within_6px", (reported & (off <= near_px))[truth.tip_visible].astype(np.float64), np.mean)
+    right = truth.tip_visible & (off <= far_px)
     put(out, "tip_false", (~right)[reported].astype(np.float64), np.mean)
     return out
 
@@ -241,7 +237,8 @@ def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
 
 def clear_line(truth: WristTruth) -> Bool:
     """(N, 5) whether enough of the line is seen on a finger."""
-    return (truth.laser_seen_m >= _CLEAR_M)[:, _OF_FINGERS] & np.isfinite(truth.laser_m[:, _OF_FINGERS, 0])
+    clear_m = 2e-3  # of line that is lit and seen: less is no more than a few pixels
+    return (truth.laser_seen_m >= clear_m)[:, _OF_FINGERS] & np.isfinite(truth.laser_m[:, _OF_FINGERS, 0])
 
 
 def rows_at(truth_ns: Int, t_ns: Int) -> Int:
@@ -254,7 +251,8 @@ def rows_at(truth_ns: Int, t_ns: Int) -> Int:
     after = np.clip(np.searchsorted(t_ns, truth_ns), 0, len(t_ns) - 1)
     before = np.maximum(after - 1, 0)
     row = np.where(np.abs(t_ns[before] - truth_ns) < np.abs(t_ns[after] - truth_ns), before, after)
-    return np.where(np.abs(t_ns[row] - truth_ns) <= _MATCH_NS, row, -1)
+    match_ns = 5_000_000  # less than half the time from one frame to the next
+    return np.where(np.abs(t_ns[row] - truth_ns) <= match_ns, row, -1)
 
 
 def at_rows(values: Float, row: Int) -> Float:

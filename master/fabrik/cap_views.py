@@ -13,8 +13,6 @@ from master.fabrik.intersection import Rays
 
 TILTED = 7  # directions of a cap of a known hand
 ANY = 5  # and while no hand is known
-_LEAST_TILT_RAD2 = 1e-30
-_LEAST_AREA_M2 = 1e-9
 
 
 class Views(NamedTuple):
@@ -111,8 +109,9 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
             xx += R[row, a, 0] * tilt_rad2[row, a, b] * R[row, b, 0]
             xy += R[row, a, 0] * tilt_rad2[row, a, b] * R[row, b, 1]
             yy += R[row, a, 1] * tilt_rad2[row, a, b] * R[row, b, 1]
+    least_tilt_rad2 = 1e-30
     # Its Cholesky factor, which gives a round hexagon its shape.
-    first = sqrt(max(xx, _LEAST_TILT_RAD2))
+    first = sqrt(max(xx, least_tilt_rad2))
     mixed = xy / first
     second = sqrt(max(yy - mixed * mixed, 0.0))
     most = CAPS.most_tilt
@@ -207,10 +206,11 @@ def hidden_part(
         shows, alike = 0.0, np.nan
         for t in range(count):
             best = 0.0
+            least_area_m2 = 1e-9
             for other in range(cameras):
                 size = area_px2[other] * scale_m[other] * scale_m[other]
-                best = max(best, size / max(whole_m2[t, other], _LEAST_AREA_M2)) if size > 0.0 else best
-            share = area_px2[c] * scale_m[c] * scale_m[c] / max(whole_m2[t, c], _LEAST_AREA_M2)
+                best = max(best, size / max(whole_m2[t, other], least_area_m2)) if size > 0.0 else best
+            share = area_px2[c] * scale_m[c] * scale_m[c] / max(whole_m2[t, c], least_area_m2)
             shows = max(shows, share)
             if best > 0.0 and not share / best <= alike:
                 alike = share / best

@@ -16,9 +16,7 @@ from common.arrays import Float, Int
 from common.hand.model import HandModel
 from master.fabrik.estimate import SolvedHand
 
-_RINGS, _SPOKES = 16, 48  # samples of the surface
 _ANGLES = 90  # steps of the tables
-_LEAST_AREA_M2 = 1e-9
 
 
 class CapSettings(NamedTuple):
@@ -139,7 +137,8 @@ def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
     visible_m2 = np.maximum(eye @ normals.T, 0.0) * areas
     shown = visible_m2.sum(axis=1)
-    seen = visible_m2 @ points / np.maximum(shown, _LEAST_AREA_M2)[:, None]
+    least_area_m2 = 1e-9
+    seen = visible_m2 @ points / np.maximum(shown, least_area_m2)[:, None]
     return np.stack([-seen[:, 2], seen[:, 0], shown], axis=1)
 
 
@@ -154,10 +153,11 @@ def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
         Points (N, 3) [m], outward normals (N, 3), areas (N,) [m^2].
     """
     length = max(radius_m - 2.0 * min(ahead_m, 0.5 * radius_m), 0.0)
-    phi = (np.arange(_SPOKES) + 0.5) * 2 * np.pi / _SPOKES
-    circle = np.stack([np.cos(phi), np.sin(phi), np.zeros(_SPOKES)], axis=1)
+    rings, spokes = 16, 48  # samples of the surface
+    phi = (np.arange(spokes) + 0.5) * 2 * np.pi / spokes
+    circle = np.stack([np.cos(phi), np.sin(phi), np.zeros(spokes)], axis=1)
     # Rings of equal height have equal area, on a sphere as on a cylinder (Archimedes).
-    height = (np.arange(_RINGS) + 0.5) / _RINGS
+    height = (np.arange(rings) + 0.5) / rings
     points: list[Float] = []
     normals: list[Float] = []
     areas: list[Float] = []
@@ -165,8 +165,8 @@ def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
         normal = circle * np.sqrt(1 - h * h) - [0.0, 0.0, h]
         points.append(radius_m * normal)
         normals.append(normal)
-        areas.append(np.full(_SPOKES, 2 * np.pi * radius_m**2 / (_RINGS * _SPOKES)))
+        areas.append(np.full(spokes, 2 * np.pi * radius_m**2 / (rings * spokes)))
         points.append(radius_m * circle + [0.0, 0.0, length * h])
         normals.append(circle)
-        areas.append(np.full(_SPOKES, 2 * np.pi * radius_m * length / (_RINGS * _SPOKES)))
+        areas.append(np.full(spokes, 2 * np.pi * radius_m * length / (rings * spokes)))
     return np.concatenate(points), np.concatenate(normals), np.concatenate(areas)

@@ -22,8 +22,6 @@ Pose = tuple[Angles, ...]
 """Angles of every joint [rad]: one of a hinge, abduction and flexion of a rotor."""
 
 _SEARCH_STARTS = (1.0, 0.5, 0.0)
-_FIRST_STEP, _LEAST_STEP = 0.25, 1e-4
-_NO_GAIN_M = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +136,9 @@ def _nearest_from(chain: Chain, share: float) -> float:
     low, high = chain.arrays.spans.T
     first = _count(chain.links[0].joint)
     angles = np.append(np.clip(0.0, low[:first], high[:first]), (low + share * (high - low))[first:])
-    here, step = distance(angles), _FIRST_STEP
-    while step > _LEAST_STEP:
+    first_step, least_step = 0.25, 1e-4
+    here, step = distance(angles), first_step
+    while step > least_step:
         before = here
         for i in range(first, len(angles)):
             start = angles[i]
@@ -149,7 +148,8 @@ def _nearest_from(chain: Chain, share: float) -> float:
                 found = distance(trial)
                 if found < here:
                     angles, here = trial, found
-        if here >= before - _NO_GAIN_M:
+        no_gain_m = 1e-12
+        if here >= before - no_gain_m:
             step *= 0.5
     return here
 

@@ -40,16 +40,12 @@ from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, ro
 
 REACHED_M = 1e-6
 _TOLERANCE_M = 0.05 * REACHED_M
-_SLACK_RAD = 1e-6
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
 _FIRST = constant(0)
 PIP, DIP = constant(1), constant(2)  # links
-_EDGE_M2 = 1e-14
 """Rounding of a squared distance at the end of a branch."""
 _PER_BRANCH = 2.0 * pi
 """How much rather the more bent branch is taken: more than any abduction, by which the poses of one are ranked."""
-_ROOT_STEPS = 60
-_ROUNDING = 1e-15
 _SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
 """PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
 _STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
@@ -91,7 +87,9 @@ def closed_form(
         dip = min(max(ratio * pip, chain.spans[3, 0]), chain.spans[3, 1])
         for side in range(2):
             cut = _swing(chain, pip, dip, local, side, trial)
-            if cut <= _SLACK_RAD and off <= _EDGE_M2:
+            slack_rad = 1e-6
+            edge_m2 = 1e-14
+            if cut <= slack_rad and off <= edge_m2:
                 # bones out of plane cannot point exactly at the pole: legal angles may still miss
                 miss = length(minus(end_of(chain, trial), goal))
                 rank = _rank(trial, warm_start, branches - 1 - b)
@@ -160,7 +158,8 @@ def _invert(
     if off >= 0.0:
         return far if distance2 >= far2 else bent, off
     pip = far + sqrt((far2 - distance2) / (far2 - near2)) * (bent - far)
-    for _ in range(_ROOT_STEPS):
+    root_steps = 60
+    for _ in range(root_steps):
         value, dip_per_pip = distance2_of(chain, ratio, pip)
         if value > distance2:
             far = pip
@@ -169,7 +168,8 @@ def _invert(
         new = pip + (distance2 - value) / dip_per_pip if dip_per_pip != 0.0 else inf
         if not min(far, bent) <= new <= max(far, bent):
             new = 0.5 * (far + bent)
-        if new == pip or abs(value - distance2) <= _ROUNDING * far2:
+        rounding = 1e-15
+        if new == pip or abs(value - distance2) <= rounding * far2:
             break
         pip = new
     return pip, off

@@ -8,15 +8,15 @@ import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 
-_SLOW_S = 1.5  # from the cache it takes half a second
 _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
 def log_if_slow() -> Generator[None]:
     """Log that kernels are compiled, where that takes longer than loading them does."""
+    slow_s = 1.5  # from the cache it takes half a second
     timer = threading.Timer(
-        _SLOW_S, _LOG.warning, ("compiling kernels, once for each version: about two minutes in all ...",)
+        slow_s, _LOG.warning, ("compiling kernels, once for each version: about two minutes in all ...",)
     )
     timer.daemon = True
     timer.start()

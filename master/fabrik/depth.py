@@ -27,7 +27,6 @@ from common.geometry.camera_model import CameraModel
 
 PARALLEL_RAD = np.radians(3.0)
 """Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
-ALIKE = 0.05
 """Most by which their focal lengths may differ, and the slope of their baseline against the image rows."""
 LAW_RESIDUAL = 0.02
 """Most by which a law of depth and the cameras' places may differ where both are used."""
@@ -197,13 +196,14 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
         )
     if x <= 0.0:
         return "the second is not to the right of the first: name the left one first in 'cameras'"
-    if max(abs(y), abs(z)) > ALIKE * x:
+    alike = 0.05
+    if max(abs(y), abs(z)) > alike * x:
         off_mm = 1e3 * max(abs(y), abs(z))
         return (
             f"their baseline of {1e3 * x:.0f} mm is off the image rows by {off_mm:.0f} mm,"
-            f" at most {1e2 * ALIKE:.0f} % are allowed"
+            f" at most {1e2 * alike:.0f} % are allowed"
         )
-    if abs(focal - 1.0) > ALIKE or left.height_px != right.height_px:
+    if abs(focal - 1.0) > alike or left.height_px != right.height_px:
         return f"their focal lengths differ by {1e2 * abs(focal - 1.0):.0f} %, or their heights do"
     return ""
 

@@ -45,10 +45,6 @@ from master.fabrik.rotations import IDENTITY, Matrix, Vector, length, minus, rot
 
 _RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
 """How a restart shares out its bend between the front and the back of the chain."""
-_RESTART_HALVINGS = 14
-_STALL = 0.995
-_STALL_ITERATIONS = 6
-_SHORTEST_M = 1e-9
 
 
 class Reach(Enum):
@@ -151,6 +147,7 @@ class Fabrik:
         )
         positions, orientations = chain.forward_flat(angles)
         rotation = np.array(frame)
+        shortest_m = 1e-9
         return ChainResult(
             positions=positions @ rotation.T + np.array(root),
             orientations=rotation @ orientations,
@@ -159,7 +156,7 @@ class Fabrik:
             iterations=iterations,
             reached=residual <= self.tolerance_m,
             reach=reach,
-            degenerate=min(chain.lengths) < _SHORTEST_M or length(goal) < _SHORTEST_M,
+            degenerate=min(chain.lengths) < shortest_m or length(goal) < shortest_m,
         )
 
     def _reach(self, goal: Vector) -> Reach:
@@ -213,7 +210,8 @@ def solve_chain(
 def _bend_to(chain: ChainArrays, distance: float, front: float, back: float, angles: Float) -> None:
     """Write the bent pose whose end is as far from the root as the target."""
     low, high = 0.0, 1.0
-    for _ in range(_RESTART_HALVINGS):
+    restart_halvings = 14
+    for _ in range(restart_halvings):
         share = 0.5 * (low + high)
         _bend(chain, share, front, back, angles)
         if length(end_of(chain, angles)) > distance:
@@ -258,12 +256,14 @@ def _attempt(
         backward_pass(chain, positions, orientations, now, goal, places)
         forward_pass(chain, places, now, positions, orientations)
         residual = length(minus(vector_at(positions, count, START), goal))
-        slow = slow + 1 if residual > _STALL * last else 0
+        stall = 0.995
+        slow = slow + 1 if residual > stall * last else 0
         last = residual
         if residual < best:
             best = residual
             for i in range(len(angles)):
                 angles[i] = now[i]
-        if best <= tolerance_m or slow >= _STALL_ITERATIONS:
+        stall_iterations = 6
+        if best <= tolerance_m or slow >= stall_iterations:
             return best, iteration
     return best, max_iterations

@@ -22,7 +22,6 @@ THUMB = 0
 Four = tuple[float, float, float, float]
 
 _GRID = 2001
-_THIRDS = 52
 _NO_RESTARTS = constant(0)
 _NAN = float("nan")
 _UNKNOWN = (_NAN,) * 4
@@ -311,7 +310,8 @@ def _branches(chain: Chain, ratio: float) -> Float:
 
 def _extremum(function: Callable[[float], float], low: float, high: float, *, maximum: bool) -> float:
     """By thirds: the curve is smooth and has one extremum inside."""
-    for _ in range(_THIRDS):
+    thirds = 52
+    for _ in range(thirds):
         third = (high - low) / 3.0
         if (function(low + third) < function(high - third)) == maximum:
             low += third

@@ -25,10 +25,6 @@ from common.kernels import inner, kernel
 from master.estimator.cameras import CameraArrays, project, undistort
 from master.estimator.matrices import inverse_3_plus
 
-_STEPS = 8  # of Gauss-Newton; from the linear solution three are the rule
-_SETTLED_M = 1e-7  # then the error is its square, about
-_SINGULAR = 1e14  # condition of a normal matrix; the rounding of parallel rays stays above
-
 
 class RaySettings(NamedTuple):
     """Numbers of triangulation by rays.
@@ -151,7 +147,8 @@ def _solve(rays: Rays) -> bool:
     inverse_3_plus(rays.normal, 0.0, rays.cov)
     trace = rays.normal[0, 0] + rays.normal[1, 1] + rays.normal[2, 2]
     spread = rays.cov[0, 0] + rays.cov[1, 1] + rays.cov[2, 2]
-    return spread > 0.0 and trace * spread < _SINGULAR
+    singular = 1e14  # condition of a normal matrix; the rounding of parallel rays stays above
+    return spread > 0.0 and trace * spread < singular
 
 
 @inner
@@ -213,7 +210,8 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
         Whether the point is in front of the cameras and its depth is determined.
     """
     seen, J, cov, rhs = rays.seen, rays.J, rays.cov, rays.rhs
-    for _ in range(_STEPS):
+    steps = 8  # of Gauss-Newton; from the linear solution three are the rule
+    for _ in range(steps):
         _clear(rays)
         for c in range(rays.weight.shape[0]):
             w = rays.weight[c]
@@ -232,7 +230,8 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
             step = cov[i, 0] * rhs[0] + cov[i, 1] * rhs[1] + cov[i, 2] * rhs[2]
             rays.point[i] += step
             size += step * step
-        if size < _SETTLED_M * _SETTLED_M:
+        settled_m = 1e-7  # then the error is its square, about
+        if size < settled_m * settled_m:
             break
     spread = rays.cov[0, 0] + rays.cov[1, 1] + rays.cov[2, 2]
     for c in range(rays.weight.shape[0]):

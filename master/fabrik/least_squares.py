@@ -27,11 +27,6 @@ from master.fabrik.chain_arrays import (
 from master.fabrik.limits import narrowing
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 
-_FIRST_DAMPING_M2 = 1e-7
-_LEAST_DAMPING_M2, _MOST_DAMPING_M2 = 1e-13, 1.0
-_LEAST_GAIN = 1e-7
-_COUPLED_RAD = 1e-12
-
 
 @kernel
 def least_squares(
@@ -55,21 +50,24 @@ def least_squares(
     columns, trial_columns = np.empty((4, 3)), np.empty((4, 3))
     next_angles = np.empty(4)
     left = _evaluate(chain, goal, unknowns, angles, columns)
-    cost, damping = dot(left, left), _FIRST_DAMPING_M2
+    first_damping_m2 = 1e-7
+    cost, damping = dot(left, left), first_damping_m2
     for _ in range(max_steps):
         if cost <= tolerance_m * tolerance_m or not _step(chain, unknowns, left, columns, damping, trial):
             break
         trial_left = _evaluate(chain, goal, trial, next_angles, trial_columns)
         trial_cost = dot(trial_left, trial_left)
+        least_damping_m2, most_damping_m2 = 1e-13, 1.0
         if trial_cost < cost:
             gain = cost - trial_cost
-            left, cost, damping = trial_left, trial_cost, max(damping * 0.1, _LEAST_DAMPING_M2)
+            left, cost, damping = trial_left, trial_cost, max(damping * 0.1, least_damping_m2)
             for i in range(4):
                 unknowns[i], angles[i] = trial[i], next_angles[i]
                 put_vector(columns, i, vector_at(trial_columns, i, START))
-            if gain < _LEAST_GAIN * (cost + gain):
+            least_gain = 1e-7
+            if gain < least_gain * (cost + gain):
                 break
-        elif damping > _MOST_DAMPING_M2:
+        elif damping > most_damping_m2:
             break
         else:
             damping *= 10.0
@@ -102,7 +100,8 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
     for k in range(3):
         axis = (-orientations[k, 0], -orientations[k, 3], -orientations[k, 6])
         put_vector(columns, k + 1, cross(axis, minus(end, vector_at(positions, k, START))))
-    follows = chain.follower >= 0 and abs(angles[3] - chain.ratio * angles[2]) < _COUPLED_RAD
+    coupled_rad = 1e-12
+    follows = chain.follower >= 0 and abs(angles[3] - chain.ratio * angles[2]) < coupled_rad
     ratio, narrows = chain.ratio if follows else 0.0, unknowns[0] * narrowing_derivative
     for j in range(3):
         if chain.follower >= 0:

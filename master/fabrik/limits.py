@@ -23,7 +23,6 @@ Pair = tuple[float, float]
 
 HINGE, BOX, ELLIPSE = 0, 1, 2
 _TINY = 1e-15
-_ROUNDING_RAD = 1e-12
 
 _spread_left = inner(spread_left)
 
@@ -107,10 +106,11 @@ def _legalised(limits: Limits, pair: Pair, now: Pair) -> tuple[Pair, float, floa
     """A pair clamped, by how much, and how far it is from the present one [rad]."""
     legal = clamp(limits, pair)
     miss = max(abs(legal[0] - pair[0]), abs(legal[1] - pair[1]))
+    rounding_rad = 1e-12
     # below: rounding, not a violation; then continuity decides
     return (
         legal,
-        miss if miss > _ROUNDING_RAD else 0.0,
+        miss if miss > rounding_rad else 0.0,
         abs(legal[0] - now[0]) + abs(legal[1] - now[1]),
     )
 

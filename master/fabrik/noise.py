@@ -12,10 +12,6 @@ import numpy as np
 from common.arrays import Float, Int
 from common.kernels import kernel
 
-_MEMORY_S = 0.4  # a few swings of a trembling hand
-# A solved pose is a prior of the next, so its noise stays in part: of seven tenths, a quarter shows.
-_SHOWN = 0.25
-
 
 class NoiseEstimator:
     """Push machine. Holds the last sample and step, and the variance of each signal."""
@@ -59,11 +55,14 @@ def measure(
     for i in range(values.shape[0]):
         step, variance = values[i] - past[0, i], past[2, i]
         smaller = largest[i] < variance or isnan(variance)
-        known[i] = (largest[i] if smaller else variance) / _SHOWN
+        # A solved pose is a prior of the next, so its noise stays in part: of seven tenths, a quarter shows.
+        # shown
+        known[i] = (largest[i] if smaller else variance) / 0.25
         if count[0] > 1:
             off = step - ratio * past[1, i]
             shown = off * off / (2.0 * (1.0 + ratio + ratio * ratio))
-            past[2, i] += passed_s / (_MEMORY_S + passed_s) * (shown - variance)
+            memory_s = 0.4  # a few swings of a trembling hand
+            past[2, i] += passed_s / (memory_s + passed_s) * (shown - variance)
         past[0, i], past[1, i] = values[i], step
     dt_s[0] = passed_s
     count[0], count[1] = count[0] + 1, t_ns

@@ -49,7 +49,6 @@ from common.kernels import bound, kernel
 # Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
 # rest is light and shape, which stay.
 CARRY_NOTHING = 0.25
-_QUANTILE = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
 UNSEEN_NS = -(2**63)
 
 
@@ -247,9 +246,10 @@ def filter_step(
         speed[i] += r / (r + 1.0) * ((values[i] - x[i]) / dt - speed[i])
         fastest[group[i], 0] = max(fastest[group[i], 0], abs(speed[i]))
         if variance[i] > jitter_2:
-            moved_2 = speed[i] * speed[i] * dt * dt - _QUANTILE * r / (2.0 + r) * variance[i]
+            quantile = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
+            moved_2 = speed[i] * speed[i] * dt * dt - quantile * r / (2.0 + r) * variance[i]
             off = values[i] - x[i]
-            u2 = max(moved_2, off * off - _QUANTILE * variance[i]) / variance[i]
+            u2 = max(moved_2, off * off - quantile * variance[i]) / variance[i]
             fastest[group[i], 1] = max(fastest[group[i], 1], u2)
     for i in range(len(values)):
         if seen_ns[i] == t_ns or not isfinite(values[i]):

@@ -31,21 +31,16 @@ from common.kernels import inner, kernel
 HISTORY = 8
 OBSERVATIONS = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
 NEVER = -(2**63)
-_FAR_NS = 2**62
 # What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
 _SPEED_M_S = (0.01, 1.0, 1.0)
 _ACCELERATION_M_S2 = (0.3, 1.5, 15.0)
-_W2 = 18.0**2  # [1/s^2] jerk by acceleration, and snap by jerk, squared
 _LEAP_M_S, _LEAP_PX = 5.0, 5.0  # what is farther away a frame later is another thing
-_SWAPPED = 3.0  # times nearer to the other track: the slave's names are contradicted
 # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
 # no mean removes it. New in each is at most this part of the variance that the slave states, and this much.
 _INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1
-_EVIDENCE = 0.5  # so they also constrain the motion less than as many independent ones
 # An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much (98-99 %),
 # half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %); this 93-97 %.
 _ALONG = 0.75
-_LEAST_SIGMA_PX = 0.01
 
 
 Reach = tuple[int, int, int, int]
@@ -140,8 +135,9 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
         after -= 1
     before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
     while n < OBSERVATIONS and (before >= oldest or after < end):
-        back_ns = t_ns - history.times_ns[c, before % HISTORY, 0] if before >= oldest else _FAR_NS
-        ahead_ns = history.times_ns[c, after % HISTORY, 0] - t_ns if after < end else _FAR_NS
+        far_ns = 2**62
+        back_ns = t_ns - history.times_ns[c, before % HISTORY, 0] if before >= oldest else far_ns
+        ahead_ns = history.times_ns[c, after % HISTORY, 0] - t_ns if after < end else far_ns
         if min(back_ns, ahead_ns) > reach_ns[n]:
             break
         if back_ns <= ahead_ns:
@@ -188,7 +184,8 @@ def _sort(track: Float, n: int, leap_px_s: float) -> None:
             straight += 0.0 if isnan(there) else there
             crossed += 0.0 if isnan(across) else across
             other |= not isnan(across)
-        if other and _SWAPPED * crossed < straight:
+        swapped = 3.0  # times nearer to the other track: the slave's names are contradicted
+        if other and swapped * crossed < straight:
             for j in range(4):
                 track[k, 0, j], track[k, 1, j] = track[k, 1, j], track[k, 0, j]
         for i in range(2):
@@ -214,7 +211,8 @@ def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> flo
 
 @inner
 def _variance(sigma_px: float) -> float:
-    return max(sigma_px, _LEAST_SIGMA_PX) ** 2
+    least_sigma_px = 0.01
+    return max(sigma_px, least_sigma_px) ** 2
 
 
 @inner
@@ -279,7 +277,8 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
     for i in range(n):
         for j in range(i + 1):
             tt = known[i, 3] * known[j, 3]
-            w2tt = _W2 * tt
+            w2 = 18.0**2  # [1/s^2] jerk by acceleration, and snap by jerk, squared
+            w2tt = w2 * tt
             s = tt * (speed2 + acceleration2 * tt * (1.0 / 4.0 + w2tt * (1.0 / 36.0 + w2tt / 576.0)))
             for k in range(j):
                 s -= L[i, k] * L[j, k]
@@ -310,6 +309,7 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
         for k in range(i + 1, n):
             s -= L[k, i] * fit[6 + k]
         fit[6 + i] = s * L[i, i]
-    return -_EVIDENCE * (
+    evidence = 0.5  # so they also constrain the motion less than as many independent ones
+    return -evidence * (
         log(det * c) + 0.5 * residual2
     )  # two axes: twice the logarithm of the determinant's root

@@ -50,8 +50,6 @@ from master.fabrik.intersection import (
     triangulate,
 )
 
-_FEWEST = 3  # cameras of which one may be an outlier
-
 
 class _Hand(NamedTuple):
     """Directions of the K caps.
@@ -277,7 +275,8 @@ def correct_centres(
             cameras, caps, hand, rays_px, observed, rejected, m, rays, views
         )
         meets = triangulated and chi_square(rays) <= limits[seen]
-        if seen >= _FEWEST and not meets:
+        fewest = 3  # cameras of which one may be an outlier
+        if seen >= fewest and not meets:
             outlying = outlier(cameras, limits[seen - 1], rays)
             if outlying >= 0:
                 rejected[outlying, m] = True

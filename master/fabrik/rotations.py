@@ -15,7 +15,6 @@ Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_TINY = 1e-18
 
 
 @kernel
@@ -96,7 +95,8 @@ def rotation_about(axis: Vector, angle: float) -> Matrix:
 def between(a: Vector, b: Vector) -> Matrix:
     """Shortest rotation from direction a to b; identity where either has none."""
     scale = length(a) * length(b)
-    if not scale > _TINY:
+    tiny = 1e-18
+    if not scale > tiny:
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     x, y, z = cross(a, b)
     x, y, z = x / scale, y / scale, z / scale

@@ -29,9 +29,7 @@ from master.fabrik.triangulate import Triangulate
 
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
-_ON_TARGET_M = 1e-4
 _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
-_HELD_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
 
@@ -80,8 +78,9 @@ class FabrikSolver:
         self._finger_of = places.finger
         self._on_finger = self._finger_of >= 0
         at_tips = {int(self._finger_of[m]): m for m, mount in enumerate(mounts) if mount.joint in TIPS}
+        on_target_m = 1e-4
         self._fingers = {
-            m: (f, Finger.of(model, f, mounts[m].offset_m, _ON_TARGET_M)) for f, m in at_tips.items()
+            m: (f, Finger.of(model, f, mounts[m].offset_m, on_target_m)) for f, m in at_tips.items()
         }
         self._last: SolvedHand | None = None
         self._last_ns = -(2**62)
@@ -215,4 +214,5 @@ class FabrikSolver:
 
 def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:
     """A hand that was solved a time ago, as much less sure as it may have moved."""
-    return replace(hand, cov_m2=hand.cov_m2 + (_HELD_M_S * age_s) ** 2 * np.eye(3))
+    held_m_s = 0.3  # of a hand that is held
+    return replace(hand, cov_m2=hand.cov_m2 + (held_m_s * age_s) ** 2 * np.eye(3))

@@ -28,8 +28,6 @@ from common.messages import MarkerDetections
 from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
 
 SILENT_FRAMES = 12
-_SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files state, between so many of its own
-_REACH_M = 0.5  # where hands are, for what a camera makes of their motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,14 +94,16 @@ class FrameSync:
         near_ns = self._deadline_ns if continuous else self._deadline_ns // 2
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
         self._patience = SILENT_FRAMES * count
-        self._slow_frames = [_SLOW * sum(rates) / rate for rate in rates]
+        slow = 2.2  # times as many frames of others as the files state, between so many of its own
+        self._slow_frames = [slow * sum(rates) / rate for rate in rates]
+        reach_m = 0.5  # where hands are, for what a camera makes of their motion
         self._history = TrackHistory(
             np.zeros(count, np.int64),
             np.full((count, HISTORY, 3), NEVER),
             np.zeros((count, HISTORY)),
             np.full((count, HISTORY, 6, markers), np.nan),
             np.array([model.row_time_ns for model in models], np.float64),
-            np.array([model.matrix[0, 0] / _REACH_M for model in models]),
+            np.array([model.matrix[0, 0] / reach_m for model in models]),
         )
         self._newest_of = [NEVER] * count  # centre rows
         self._behind = [False] * count
@@ -191,7 +191,8 @@ class FrameSync:
         By what others deliver and the rates of the files.
         """
         at = self._came[c]
-        return len(at) >= _SLOW_FRAMES and at[-1] - at[0] > self._slow_frames[c] * (len(at) - 1)
+        slow_frames = 4  # times as many frames of others as the files state, between so many of its own
+        return len(at) >= slow_frames and at[-1] - at[0] > self._slow_frames[c] * (len(at) - 1)
 
     def _emit(self, *, flush: bool) -> list[FrameSet]:
         out: list[FrameSet] = []

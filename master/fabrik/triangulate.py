@@ -31,14 +31,8 @@ from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 
-GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
-_LAW_ROUNDS = 3  # each leaves a thousandth of the correction off the axis
-_ANYHOW_RAD = (
-    1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
-)
 _ONE = constant(1)  # direction
-_ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing measures where the finger points
 
 
 class DisparityTables(NamedTuple):
@@ -86,8 +80,9 @@ def disparity_tables(
     Arguments as of `DisparityTables`.
     """
     left, right = cameras[:2]
-    u = np.linspace(0.0, left.width_px, GRID + 1)
-    v = np.linspace(0.0, left.height_px, GRID + 1)
+    grid = 48  # cells of the table along each side of the image
+    u = np.linspace(0.0, left.width_px, grid + 1)
+    v = np.linspace(0.0, left.height_px, grid + 1)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = left.undistort(uv)
     design = np.stack([np.ones_like(_DEPTHS_M), 1.0 / _DEPTHS_M], axis=1)
@@ -108,8 +103,8 @@ def disparity_tables(
         law_error,
         row_sigma_px,
         row_limit,
-        np.array([left.width_px / GRID, left.height_px / GRID]),
-        table.reshape(GRID + 1, GRID + 1, 6),
+        np.array([left.width_px / grid, left.height_px / grid]),
+        table.reshape(grid + 1, grid + 1, 6),
         np.ascontiguousarray(left.T_rig_camera[:3, :3]),
         np.ascontiguousarray(left.centre),
         np.array([camera.T_rig_camera[:3, :3].T for camera in cameras[:2]]),
@@ -165,7 +160,8 @@ def place_centroids(
         cell[c] = (1.0 - p) * upper + p * lower
     disparity = u - right_u
     z = depth(tables, disparity)
-    for _ in range(_LAW_ROUNDS):
+    law_rounds = 3  # each leaves a thousandth of the correction off the axis
+    for _ in range(law_rounds):
         z = depth(tables, disparity - cell[0] - cell[1] / z)
     if not np.isfinite(z):
         return np.nan, np.nan
@@ -323,7 +319,8 @@ def triangulate(
                     for b in range(3):
                         cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
         else:
-            spread2 = _ANYHOW_M2 if row >= 0 else CAPS.relief_m**2
+            anyhow_m2 = (4e-3) ** 2  # of a cap's seen centroid while nothing measures where the finger points
+            spread2 = anyhow_m2 if row >= 0 else CAPS.relief_m**2
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):
@@ -408,7 +405,9 @@ class DepthTriangulator:
         if hand is not None:
             ahead, tilt = self._caps.pointing(hand, age_s)
         elif not as_seen:
-            ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], _ANYHOW_RAD**2 * np.eye(3)
+            # standard deviation of the direction of a finger that shows its end, from that to the cameras
+            anyhow_rad = 1.0
+            ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], anyhow_rad**2 * np.eye(3)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         triangulate(

@@ -20,8 +20,6 @@ from master.gestures.templates import Example, PoseTemplate, learn
 from master.outputs.files import load_poses
 from master.run.master_bus import join_bus
 
-_DEPTH = 256  # poses that may wait while a line is printed
-_FIRST_S = 10.0  # until the first pose of a running master must have come
 _TOOL = "gestures teach"
 
 
@@ -148,15 +146,17 @@ def _live(options: Namespace) -> list[Example]:
     """Examples that are shown before a running master."""
     link = join_bus(options.bus)
     try:
+        depth = 256  # poses that may wait while a line is printed
         queue = (
-            link.subscribe("hand", depth=_DEPTH)
+            link.subscribe("hand", depth=depth)
             if options.hand_name is None
-            else link.subscribe("hand", options.hand_name, _DEPTH)
+            else link.subscribe("hand", options.hand_name, depth)
         )
-        first = queue.get(_FIRST_S)
+        first_s = 10.0  # until the first pose of a running master must have come
+        first = queue.get(first_s)
         if not isinstance(first, HandPose):
             raise FitError(
-                f"no hand came within {_FIRST_S:g} s; is `phalanx run` running, on --bus {options.bus}"
+                f"no hand came within {first_s:g} s; is `phalanx run` running, on --bus {options.bus}"
             )
 
         def receive(timeout_s: float) -> HandPose | None:

@@ -32,7 +32,6 @@ from master.gestures.held_gesture import HeldGesture
 
 _AXIS_RAD = radians(15.0)  # how well the circle of the tips constrains the axis of the knob
 _SWAY_RAD = radians(4.0)  # about other axes, by which a hand sways while it turns a knob
-_MOST = 0.6  # of the epochs of a hold have the shape of a grip
 
 
 @dataclass(slots=True, eq=False)
@@ -139,7 +138,8 @@ class DialMonitor:
             self._maybe.popleft()
         if (t_ns - self._maybe[0][0]) * 1e-9 < hold_s:
             return None
-        if sum(shape for _, _, shape in self._maybe) < _MOST * len(self._maybe):
+        most = 0.6  # of the epochs of a hold have the shape of a grip
+        if sum(shape for _, _, shape in self._maybe) < most * len(self._maybe):
             return None
         return tips.axis()
 

@@ -29,7 +29,6 @@ PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad 
 _CURLED_RAD = np.radians([90.0, 230.0, 230.0, 230.0, 230.0])
 # Of fingers that nothing is known of [rad]: a thumb at rest, fingers half bent.
 _LIKELY_RAD = np.radians([[8.0, 15.0, 15.0, 15.0], *([[0.0, 55.0, 75.0, 50.0]] * 4)])
-_OWN_M = 0.012  # a marker farther from where the hand has the cap is not this finger's
 
 
 class HandFeatures(NamedTuple):
@@ -318,7 +317,8 @@ def _take_seen(markers: Float, caps: Float) -> None:
             if apart < least:
                 own[f], least = m, apart
         for g in range(5):
-            if least > _OWN_M or _apart(markers, own[f], caps, g) < least:
+            own_m = 0.012  # a marker farther from where the hand has the cap is not this finger's
+            if least > own_m or _apart(markers, own[f], caps, g) < least:
                 own[f] = -1
                 break
     for f in range(5):

@@ -17,8 +17,6 @@ from master.estimator.matrices import diagonalise
 from master.fabrik.rotations import dot
 from master.gestures.features import HandFeatures
 
-_INWARDS = -0.3  # cosine between the pad's side and the way to the middle, at least
-_FLAT_M2 = 1e-20  # places that lie in one line, or in one point, by their scatter
 _EYE = np.eye(3)
 
 
@@ -130,7 +128,8 @@ def _about(
             continue
         pad = pads[f, 0], pads[f, 1], pads[f, 2]
         apart = acos(min(max(dot(out, thumb), -1.0), 1.0))
-        inwards = -dot(out, pad) / sqrt(dot(pad, pad)) >= _INWARDS
+        # cosine between the pad's side and the way to the middle, at least
+        inwards = -dot(out, pad) / sqrt(dot(pad, pad)) >= (-0.3)
         good += 1 if fits and inwards and apart >= opposed else 0
     return good >= least
 
@@ -175,7 +174,8 @@ def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float
         for k in range(3):
             shift[k] += 0.5 * square * _along(place, f, centre, ways, k)
     for k in range(3):
-        shift[k] = shift[k] / scatter[k, k] if k != least and scatter[k, k] > _FLAT_M2 else 0.0
+        flat_m2 = 1e-20  # places that lie in one line, or in one point, by their scatter
+        shift[k] = shift[k] / scatter[k, k] if k != least and scatter[k, k] > flat_m2 else 0.0
         squares += shift[k] * shift[k]
     for i in range(3):
         axis[i] = ways[i, least] if side > 0.0 else -ways[i, least]

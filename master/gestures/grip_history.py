@@ -12,11 +12,6 @@ from collections import deque
 from math import exp
 from statistics import median
 
-_LATE_S = 0.1  # what counts as of late
-_FIRM = 0.3  # of what is quick: from there on the last epochs before it may be of it
-_FADE_S = 0.06  # in which a turn that nobody sees fades
-_HOLD_S = 0.15  # a grip that is wider for so long is just wider
-
 
 class GripHistory:
     """Recent history of a grip.
@@ -49,7 +44,8 @@ class GripHistory:
             good = abs(wide_m) <= most_m
         else:
             typical = median(wide for _, wide, _ in self._late)
-            lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _HOLD_S
+            hold_s = 0.15  # a grip that is wider for so long is just wider
+            lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > hold_s
             good = abs(wide_m) <= most_m and (lasts or abs(wide_m - typical) <= self._quick_m)
             if good and lasts:
                 self._late.clear()
@@ -62,7 +58,8 @@ class GripHistory:
     def push(self, t_ns: int, wide_m: float, angle_rad: float) -> None:
         """Take width and angle of a sound epoch."""
         self._late.append((t_ns, wide_m, angle_rad))
-        while len(self._late) > 2 and (t_ns - self._late[0][0]) * 1e-9 > _LATE_S:
+        late_s = 0.1  # what counts as of late
+        while len(self._late) > 2 and (t_ns - self._late[0][0]) * 1e-9 > late_s:
             self._late.popleft()
 
     def ahead_rad(self, t_ns: int) -> float | None:
@@ -74,7 +71,8 @@ class GripHistory:
             return None
         typical = median(wide for _, wide, _ in self._late)
         firm = len(self._late)
-        while firm > 1 and abs(self._late[firm - 1][1] - typical) > _FIRM * self._quick_m:
+        # of what is quick: from there on the last epochs before it may be of it
+        while firm > 1 and abs(self._late[firm - 1][1] - typical) > 0.3 * self._quick_m:
             firm -= 1
         kept = list(self._late)[:firm]
         times = [(t - kept[-1][0]) * 1e-9 for t, _, _ in kept]
@@ -83,4 +81,5 @@ class GripHistory:
         rate = sum(t * angle for t, (_, _, angle) in zip(off, kept, strict=True))
         rate = rate / max(sum(t * t for t in off), 1e-12) if len(times) > 2 else 0.0
         gone = (t_ns - kept[-1][0]) * 1e-9
-        return kept[-1][2] + rate * _FADE_S * (1.0 - exp(-gone / _FADE_S))
+        fade_s = 0.06  # in which a turn that nobody sees fades
+        return kept[-1][2] + rate * fade_s * (1.0 - exp(-gone / fade_s))

@@ -29,7 +29,6 @@ from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.held_gesture import HeldGesture
 
-_HELD = 1.5  # the standard deviation of a ray that is reported already may be larger by this
 _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
@@ -59,7 +58,8 @@ class PointMonitor:
         """
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
-        most_rad = own.ray_sigma_rad * (1.0 if point is None else _HELD)
+        held = 1.5  # the standard deviation of a ray that is reported already may be larger by this
+        most_rad = own.ray_sigma_rad * (1.0 if point is None else held)
         self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= most_rad
         if point is None:
             if not (shape and may_begin):

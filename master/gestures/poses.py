@@ -32,12 +32,6 @@ from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.quantities import QUANTITIES, Quantities, known_bends
 
-_RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
-_VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
-_ANYTHING = 1e9  # standard deviation of a quantity that is not known: it is as good as anything
-_ENOUGH = 3  # fingers of index ... little: what is recognised from fewer must last longer
-_MEMORY_S = 0.15  # older frames do not measure how fast a finger is now
-
 
 class Fit(NamedTuple):
     """How well each pose fits one hand, in the order of `PoseTable.names`.
@@ -146,12 +140,14 @@ def _fit(
             if not table.asked[p, q]:
                 continue
             there = isfinite(value[q] + sigma[q])
-            sigma_of = sigma[q] if there else _ANYTHING
+            anything = 1e9  # standard deviation of a quantity that is not known: it is as good as anything
+            sigma_of = sigma[q] if there else anything
             own = value[q] if isfinite(value[q]) else 0.0
             outside = max(table.low[p, q] - own, own - table.high[p, q], 0.0)
             residuals[p, q] = outside / hypot(table.soft[p, q], sigma_of)
             squares += residuals[p, q] * residuals[p, q]
-            vague = sigma_of / (_VAGUE * table.soft[p, q])
+            # borders: a quantity that is as doubtful as that is half known
+            vague = sigma_of / (4.0 * table.soft[p, q])
             share += 1.0 / (1.0 + vague * vague)
             asked += 1
         score[p] = confidence[p] = exp(-0.5 * squares)
@@ -185,11 +181,14 @@ class FingerSpeed:
             bend_deg: (4,) bends of index ... little, MCP and PIP together.
             known: (4,) which of them are.
         """
-        while self._past and t_ns - self._past[0][0] > 1e9 * _MEMORY_S:
+        memory_s = 0.15  # older frames do not measure how fast a finger is now
+        while self._past and t_ns - self._past[0][0] > 1e9 * memory_s:
             self._past.popleft()
         self._past.append((t_ns, bend_deg, known))
         for then_ns, before, known_then in reversed(self._past):
-            if t_ns - then_ns >= 1e9 * _RATE_S:
+            # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
+            rate_s = 0.030
+            if t_ns - then_ns >= 1e9 * rate_s:
                 moved = [now - then for now, then in zip(bend_deg, before, strict=True)]
                 both = [
                     one for one, *sure in zip(moved, known_then, known, strict=True) if all(sure)
@@ -251,7 +250,8 @@ class PoseRecogniser:
         if best != self._coming:
             self._coming, self._coming_ns = best, t_ns
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
-        enough = known >= _ENOUGH
+        # fingers of index ... little: what is recognised from fewer must last longer
+        enough = known >= 3
         at_rest = (
             lasted_s >= (self._hold.begin_s if enough else self._hold.uncertain_s)
             and speed <= self._hold.still_deg_s

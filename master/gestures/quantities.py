@@ -25,8 +25,7 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 _HIDDEN_DEG, _HIDDEN_SIGMA_DEG = (55.0, 75.0), 45.0
 _COUNT = len(QUANTITIES)
 _FROM, _TO = constant(WRIST), constant(MIDDLE_PROXIMAL)  # the length of the hand
-# Where they begin: index ... little, each MCP, PIP, both; and so on.
-_THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _ALL, _SPREADS = 12, 13, 16, 20, 21, 22
+_ALL = 21
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,13 +80,15 @@ def _write(
         lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
         sigma_deg[f] = degrees(tip_sigma_m[f] / lever)
     size = _length(joints, _FROM, _TO)
-    value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), sigma_deg[0]
+    # Where they begin: index ... little, each MCP, PIP, both; and so on.
+    thumb_bend, thumb_place, gaps, ahead, spreads = 12, 13, 16, 20, 22
+    value[thumb_bend], sigma[thumb_bend] = degrees(bend[0, 1] + bend[0, 2]), sigma_deg[0]
     for i in range(3):
         place = 0.0
         for k in range(3):
             place += (tips[0, k] - T[k, 3]) * T[k, i]
-        value[_THUMB_PLACE + i] = place * (side if i == 0 else -1.0 if i == 1 else 1.0) / size
-        sigma[_THUMB_PLACE + i] = tip_sigma_m[0] / size
+        value[thumb_place + i] = place * (side if i == 0 else -1.0 if i == 1 else 1.0) / size
+        sigma[thumb_place + i] = tip_sigma_m[0] / size
     others, others_2, every, sigma_sum = 0.0, 0.0, 0.0, 0.0
     for f in range(1, 5):
         weight, sigma_deg[f] = _hidden(sigma_deg[f], seen[f])
@@ -102,21 +103,21 @@ def _write(
         off = sqrt(
             (tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2
         )
-        value[_GAPS + f - 1] = 1e3 * (off - radius[f] - radius[0])
-        sigma[_GAPS + f - 1] = 1e3 * hypot(tip_sigma_m[f], tip_sigma_m[0])
+        value[gaps + f - 1] = 1e3 * (off - radius[f] - radius[0])
+        sigma[gaps + f - 1] = 1e3 * hypot(tip_sigma_m[f], tip_sigma_m[0])
         every += both / 4.0
         sigma_sum += sigma_deg[f] / 4.0  # neighbours are wrong alike
         if f > 1:
             others += both / 3.0
             others_2 += sigma_deg[f] * sigma_deg[f]
-    value[_AHEAD], sigma[_AHEAD] = value[2] - others, hypot(sigma_deg[1], sqrt(others_2) / 3.0)
+    value[ahead], sigma[ahead] = value[2] - others, hypot(sigma_deg[1], sqrt(others_2) / 3.0)
     value[_ALL], sigma[_ALL] = every, sigma_sum
     before = 0.0
     for f in range(1, 5):
         heading = _heading(f, joints, T, side)
         if f > 1:
-            value[_SPREADS + f - 2] = before - heading
-            sigma[_SPREADS + f - 2] = hypot(sigma_deg[f - 1], sigma_deg[f])
+            value[spreads + f - 2] = before - heading
+            sigma[spreads + f - 2] = hypot(sigma_deg[f - 1], sigma_deg[f])
         before = heading
 
 

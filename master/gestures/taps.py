@@ -31,8 +31,6 @@ from master.gestures.touch import ThumbTouch
 KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
 """Name of the key on each segment, from the knuckle on, of index ... little."""
 
-_PALMAR = -0.3  # cosine: a thumb that lies on the back of a segment touches no key
-_DOWN_M = 0.001  # a thumb whose gap is larger than the least by less is down
 _NEVER_NS = -(2**61)
 
 
@@ -104,7 +102,8 @@ class ThumbTapMonitor:
             return []
         if gap >= own.leave_gap_m:
             self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
-        palmar = bool(touch.key_palmar[finger, segment] > _PALMAR)
+        # cosine: a thumb that lies on the back of a segment touches no key
+        palmar = bool(touch.key_palmar[finger, segment] > (-0.3))
         if gap <= own.touch_gap_m and may_begin and palmar and self._begins(seen):
             self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
         return []
@@ -143,7 +142,8 @@ class ThumbTapMonitor:
         It is nothing where two fingers may have been touched.
         """
         least = [min(one.gap_m) for one in gone.epochs]
-        down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
+        down_m = 0.001  # a thumb whose gap is larger than the least by less is down
+        down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + down_m)
         flight, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
         weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in flight])
         weight = weight / weight.sum()

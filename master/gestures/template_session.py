@@ -14,14 +14,6 @@ from master.gestures.poses import FingerSpeed
 from master.gestures.quantities import known_bends
 from master.gestures.templates import SHORTEST, Example
 
-COUNT_DOWN_S = 3
-HOLD_S = 1.0
-STILL_DEG_S = 45.0  # half of the frames of a hold are slower; noise of a resting hand is a third of that
-_TRIES = 3
-_REST_S = 1.0
-_WAIT_S = 0.05
-_STARTED_S = 0.2  # until a hand that obeys has stopped
-
 Receive = Callable[[float], HandPose | None]
 
 
@@ -48,14 +40,18 @@ def template_session(
     """
     out: list[Example] = []
     for number in range(count):
-        for _ in range(_TRIES):
+        tries = 3
+        for _ in range(tries):
             notify(f"{number + 1} of {count}: show {name!r}, as you will later")
-            for left in range(COUNT_DOWN_S, 0, -1):
+            count_down_s = 3
+            for left in range(count_down_s, 0, -1):
                 notify(f"{left} ...")
                 during(receive, clock, 1.0)
-            notify(f"hold still ({HOLD_S:g} s)")
-            during(receive, clock, _STARTED_S)
-            frames = held(during(receive, clock, HOLD_S), model)
+            hold_s = 1.0
+            notify(f"hold still ({hold_s:g} s)")
+            started_s = 0.2  # until a hand that obeys has stopped
+            during(receive, clock, started_s)
+            frames = held(during(receive, clock, hold_s), model)
             lacking = what_lacks(frames)
             if not lacking:
                 out.append(Example.of(frames))
@@ -63,11 +59,12 @@ def template_session(
             notify(f"{lacking}; once more")
         else:
             raise FitError(
-                f"example {number + 1}: not seen at rest in {_TRIES} tries; the poses that were there stay"
+                f"example {number + 1}: not seen at rest in {tries} tries; the poses that were there stay"
             )
         if number + 1 < count:
             notify("good; open the hand, move it, turn it a little")
-            during(receive, clock, _REST_S)
+            rest_s = 1.0
+            during(receive, clock, rest_s)
     return out
 
 
@@ -91,7 +88,8 @@ def what_lacks(frames: list[HandFeatures]) -> str:
     speed = FingerSpeed()
     speeds = sorted(speed.push(one.t_ns, *known_bends(one)) for one in frames)
     middle = speeds[len(speeds) // 2]
-    if middle > STILL_DEG_S:
+    still_deg_s = 45.0  # half of the frames of a hold are slower; noise of a resting hand is a third of that
+    if middle > still_deg_s:
         return f"the fingers moved, by {middle:.0f} degrees a second"
     return ""
 
@@ -101,7 +99,8 @@ def during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
     until = clock.now_ns() + round(1e9 * seconds)
     poses: list[HandPose] = []
     while clock.now_ns() < until:
-        pose = receive(_WAIT_S)
+        wait_s = 0.05
+        pose = receive(wait_s)
         if pose is not None:
             poses.append(pose)
     return poses

@@ -27,7 +27,7 @@ from master.gestures.features import HandFeatures
 from master.gestures.poses import PoseTable
 from master.gestures.quantities import QUANTITIES, Quantities, known_of
 
-FEWEST, MOST = 3, 10  # examples
+FEWEST = 3  # examples
 SHORTEST = 5  # frames of one
 _FLOOR: Mapping[str, float] = {"deg": 7.0, "mm": 7.0, "": 0.09}  # by unit: what a hold varies from day to day
 _WIDEST: Mapping[str, float] = {
@@ -41,10 +41,6 @@ _ASKED: tuple[Quantity, ...] = (
     *("thumb_bend_deg", "thumb_across", "thumb_below", "thumb_ahead", "thumb_index_gap_mm"),
     *("index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg"),
 )
-_KNOWN_SHARE = 0.6  # of an example's frames
-_LIKE = 0.25  # an example that another pose fits so well would be called by its name
-_SPECIAL = 4.0  # weight of a special case
-_APART = 3  # quantities that are named where two poses differ
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,14 +66,15 @@ class Example:
             raise FitError(f"an example of {len(frames)} frames: hold it longer, for {SHORTEST} at least")
         each = [Quantities.of(frame) for frame in frames]
         measured = np.array([known_of(one) for one in each])
-        enough = measured.mean(axis=0) >= _KNOWN_SHARE
+        known_share = 0.6  # of an example's frames
+        enough = measured.mean(axis=0) >= known_share
         value = np.array(
             [np.where(known, one.value, np.nan) for known, one in zip(measured, each, strict=True)]
         )
         sigma = np.array(
             [np.where(known, one.sigma, np.nan) for known, one in zip(measured, each, strict=True)]
         )
-        known = np.mean([frame.known for frame in frames], axis=0) >= _KNOWN_SHARE
+        known = np.mean([frame.known for frame in frames], axis=0) >= known_share
         medians = [np.full(len(QUANTITIES), fill) for fill in (0.0, np.inf)]
         for median, of in zip(medians, (value, sigma), strict=True):
             median[enough] = np.nanmedian(of[:, enough], axis=0)
@@ -114,12 +111,14 @@ def learn(
         FitError: Too few or too different examples, too little is known of the hand, or it is too like another pose.
             The text states which and why.
     """
-    if not FEWEST <= len(examples) <= MOST:
-        raise FitError(f"{name}: {len(examples)} examples, {FEWEST} to {MOST} are needed")
+    most = 10  # examples
+    if not FEWEST <= len(examples) <= most:
+        raise FitError(f"{name}: {len(examples)} examples, {FEWEST} to {most} are needed")
     others = {other: shape for other, shape in settings.poses.items() if other != name}
     if within is not None and within not in others:
         raise FitError(f"{name}: there is no pose {within!r} that it could be a special case of")
-    shape = _shape(name, examples, 1.0 if within is None else _SPECIAL)
+    special = 4.0  # weight of a special case
+    shape = _shape(name, examples, 1.0 if within is None else special)
     _refuse_alike(name, shape, examples, others, within)
     agree = _agreement(name, examples)
     asked = [f"{span.low:.4g} to {span.high:.4g} {quantity}" for quantity, span in shape.ranges.items()]
@@ -184,7 +183,8 @@ def _refuse_alike(
         fits = max(_scores(of, examples))
         middle = _middle(of)
         back = _scores(shape, [middle])[0] if middle is not None else 0.0
-        if max(fits, back) >= _LIKE:
+        like = 0.25  # an example that another pose fits so well would be called by its name
+        if max(fits, back) >= like:
             hint = (
                 ""
                 if middle is not None
@@ -228,7 +228,8 @@ def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> st
     residuals = np.median([_residuals(shape, example) for example in examples], axis=0)
     value = np.median([example.quantities.value for example in examples], axis=0)
     parts: list[str] = []
-    columns: list[int] = np.argsort(-residuals)[:_APART].tolist()
+    apart = 3  # quantities that are named where two poses differ
+    columns: list[int] = np.argsort(-residuals)[:apart].tolist()
     for column in columns:
         if residuals[column] < 0.5:
             break

@@ -21,10 +21,6 @@ from master.mocap.track import Track, known
 
 _ITERATIONS = 30
 _PARTS = 8
-_LEAST_ROWS = 30
-_LEAST_SPREAD_M = 0.005  # across the line that points lie along: less does not determine a rotation
-_MIRROR = 0.5  # of the residual
-_FLOOR_M = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +63,8 @@ def align(ours: Track, theirs: Track) -> Alignment:
     rows = _rows(ours)
     target = ours.position_m[rows]
     start = [_registered(theirs.at(ours.t_ns[rows] - offset_ns), target, mirror) for mirror in (False, True)]
-    mirrored = start[1][1] < _MIRROR * start[0][1]
+    # of the residual
+    mirrored = start[1][1] < 0.5 * start[0][1]
     flip = np.diag([1.0, 1.0, -1.0]) if mirrored else np.eye(3)
     T = start[1][0] if mirrored else start[0][0]
     fit = _Fit.of(ours, Track(theirs.t_ns, theirs.position_m @ flip), rows, T @ _four(flip), float(offset_ns))
@@ -102,9 +99,10 @@ def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, floa
         source = source * [1.0, 1.0, -1.0]
     both = known(source) & known(target)
     p, q = source[both], target[both]
-    if both.any(axis=1).sum() < _LEAST_ROWS:
+    least_rows = 30
+    if both.any(axis=1).sum() < least_rows:
         raise FitError(
-            f"poses and motion capture share {int(both.any(axis=1).sum())} times, at least {_LEAST_ROWS} are needed"
+            f"poses and motion capture share {int(both.any(axis=1).sum())} times, at least {least_rows} are needed"
         )
     _check_spread(p)
     weight, off = np.ones(len(p)), np.zeros(len(p))
@@ -124,7 +122,8 @@ def _check_spread(points: Float) -> None:
         FitError: They do.
     """
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
-    if spread < _LEAST_SPREAD_M * np.sqrt(len(points)):
+    least_spread_m = 0.005  # across the line that points lie along: less does not determine a rotation
+    if spread < least_spread_m * np.sqrt(len(points)):
         raise FitError(
             "the points that poses and motion capture share lie on a line: they determine no rotation"
         )
@@ -132,7 +131,8 @@ def _check_spread(points: Float) -> None:
 
 def _weights(off: Float) -> Float:
     """Of Geman & McClure, with three times the median distance as scale."""
-    scale = max(3.0 * float(np.median(off)), _FLOOR_M)
+    floor_m = 1e-5
+    scale = max(3.0 * float(np.median(off)), floor_m)
     return 1.0 / (1.0 + (off / scale) ** 2) ** 2
 
 

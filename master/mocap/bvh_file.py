@@ -19,8 +19,6 @@ from common.errors import RecordingError
 from master.mocap.joint_motion import MAX_BYTES, PointTable
 
 _CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
-_MOST_JOINTS = 2000
-_NO_BONE = 1e-6
 
 
 @dataclass(slots=True)
@@ -53,7 +51,8 @@ def read_bvh(path: Path) -> PointTable:
     except (ValueError, IndexError, OverflowError) as error:
         raise RecordingError(f"{path}: broken BVH: {error}") from error
     position = _positions(joints, values)
-    shown = [k for k, joint in enumerate(joints) if not joint.end or max(map(abs, joint.offset)) > _NO_BONE]
+    no_bone = 1e-6
+    shown = [k for k, joint in enumerate(joints) if not joint.end or max(map(abs, joint.offset)) > no_bone]
     names = tuple(joints[k].name for k in shown)
     ends = frozenset(joint.name for joint in joints if joint.end)
     return PointTable(
@@ -77,8 +76,9 @@ def _hierarchy(words: list[str]) -> list[_Joint]:
             if word == "End":
                 name = f"{joints[parent].name}_end"
             joints.append(_Joint(name, parent, end=word == "End"))
-            if len(joints) > _MOST_JOINTS:
-                raise ValueError(f"more than {_MOST_JOINTS} joints")
+            most_joints = 2000
+            if len(joints) > most_joints:
+                raise ValueError(f"more than {most_joints} joints")
             coming, at = True, end
         elif word == "{":
             if not coming:

@@ -19,10 +19,7 @@ from master.mocap.joint_motion import JointMotion
 from master.mocap.track import Track, known
 from master.outputs.poses import Poses
 
-FALSE_MM, FALSE_DEG = 15.0, 20.0
-CHI2_95, CHI2_50 = 7.814727903, 2.365973884
 """Quantiles of a chi-square of 3 degrees of freedom."""
-_FLOOR_M2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
 CLASSES = ("wrist", "palm", "metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
 _ANGLES = ("mcp", "pip", "dip")
 _OF_FINGER = np.zeros((26, 5), np.bool_)
@@ -64,8 +61,9 @@ class Compared:
     @property
     def false(self) -> Bool:
         """(T, 26) TRACKED joints that are off."""
-        bent = np.nan_to_num(self.angle_deg[:, :, 1]) > FALSE_DEG
-        wrong = (np.nan_to_num(self.mm) > FALSE_MM) | (bent[:, None, :] & _OF_FINGER).any(axis=2)
+        false_mm, false_deg = 15.0, 20.0
+        bent = np.nan_to_num(self.angle_deg[:, :, 1]) > false_deg
+        wrong = (np.nan_to_num(self.mm) > false_mm) | (bent[:, None, :] & _OF_FINGER).any(axis=2)
         return self.tracked & wrong
 
 
@@ -118,7 +116,8 @@ def _chi2(off_m: Float, cov_m2: Float) -> Float:
     It is infinite where there is an error and no covariance.
     """
     stated = np.asarray(known(cov_m2).all(axis=2), np.bool_)
-    cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + _FLOOR_M2 * np.eye(3)
+    floor_m2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
+    cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + floor_m2 * np.eye(3)
     value = (off_m * np.linalg.solve(cov, off_m[..., None])[..., 0]).sum(axis=2)
     return np.where(stated | np.isnan(value), value, np.inf)
 
@@ -200,6 +199,7 @@ def _figures(compared: Compared, joints: Bool) -> dict[str, float | None]:
     chi2 = np.where(scored, chi2, np.nan)
     of_tracked = np.where(tracked, chi2, np.nan)
     constant = compared.own_frame_m[:, joints]
+    chi2_95, chi2_50 = 7.814727903, 2.365973884
     return {
         "joint_mm": _mean(mm),
         "joint_mm_p95": _percentile(mm, 95.0),
@@ -207,9 +207,9 @@ def _figures(compared: Compared, joints: Bool) -> dict[str, float | None]:
         "valid_percent": _percent(scored[exact]),
         "tracked_percent": _percent(tracked[exact]),
         "false_tracked_percent": _percent(compared.false[:, joints][tracked]),
-        "coverage_95_percent": _percent((chi2 <= CHI2_95)[scored]),
-        "coverage_50_percent": _percent((chi2 <= CHI2_50)[scored]),
-        "tracked_coverage_95_percent": _percent((of_tracked <= CHI2_95)[tracked]),
+        "coverage_95_percent": _percent((chi2 <= chi2_95)[scored]),
+        "coverage_50_percent": _percent((chi2 <= chi2_50)[scored]),
+        "tracked_coverage_95_percent": _percent((of_tracked <= chi2_95)[tracked]),
         "tracked_mm": _mean(mm[tracked]),
     }
 

@@ -21,7 +21,6 @@ METRES: dict[Unit, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in":
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back", "back2", "back3")
 POINTS = (*JOINTS, *MARKERS)
 MAX_BYTES = 1 << 30
-_MAX_S = 9e9  # beyond it no integer of nanoseconds has room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +83,9 @@ def checked_times(t_s: Float, where: str) -> Int:
     """
     if not len(t_s):
         raise RecordingError(f"{where}: has no frame")
-    if not np.isfinite(t_s).all() or np.abs(t_s).max() > _MAX_S:
-        row = int(np.argmax(~np.isfinite(t_s) | (np.abs(t_s) > _MAX_S)))
+    max_s = 9e9  # beyond it no integer of nanoseconds has room
+    if not np.isfinite(t_s).all() or np.abs(t_s).max() > max_s:
+        row = int(np.argmax(~np.isfinite(t_s) | (np.abs(t_s) > max_s)))
         raise RecordingError(f"{where}: time of frame {row + 1} is {t_s[row]}: no seconds")
     t_ns = np.round(t_s * 1e9).astype(np.int64)
     steps = np.diff(t_ns)

@@ -30,7 +30,6 @@ _PARTS = {
     **dict.fromkeys(("tip", "end", "nub"), _TIP),
 }
 _MARKER_NAMES = ("thumb", "index", "middle", "ring", "little")
-_COUNTED = 3  # joints of a finger: fewer numbers do not determine which
 _SHOWN = 80  # names of an error message
 
 Key = tuple[Side | None, str]
@@ -145,7 +144,8 @@ def _prefer_wrist(points: dict[str, list[str]]) -> None:
 def _parts(one: _Finger, thumb: bool, ends: frozenset[str]) -> dict[int, list[str]]:
     """Joint of a finger -> the names that mean it."""
     out = {part: list(names) for part, names in one.worded.items()}
-    numbers = sorted(one.numbered) if len(one.numbered) >= _COUNTED else []
+    counted = 3  # joints of a finger: fewer numbers do not determine which
+    numbers = sorted(one.numbered) if len(one.numbered) >= counted else []
     if joints := [name for name in out.get(_TIP, []) if name not in ends]:
         out[_TIP] = joints  # a tip of its own goes before what lies beyond it
     tips = out.get(_TIP, [])

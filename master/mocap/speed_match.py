@@ -16,10 +16,6 @@ from master.mocap.track import Track
 HALF_NS = 20_000_000
 """Half of the time over which a speed is a difference."""
 _STEP_NS = 10_000_000
-_LEAST_S = 2.0  # that both must show together
-_CORRELATED = 0.5
-_ALTERNATIVE, _APART_NS = 0.9, 500_000_000  # a second peak that counts
-_MOST_STEPS = 400_000  # 67 minutes
 
 
 def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
@@ -33,10 +29,12 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
     a, first_a = _speeds(ours)
     b, first_b = _speeds(theirs)
     half = 0.5 * min(np.isfinite(a).sum(), np.isfinite(b).sum())
-    together = min(len(a), len(b), max(_LEAST_S * 1e9 / _STEP_NS, half))
+    least_s = 2.0  # that both must show together
+    together = min(len(a), len(b), max(least_s * 1e9 / _STEP_NS, half))
     score = _masked_correlation(a, b, together)
     best = int(np.argmax(score))
-    if not score[best] > _CORRELATED:
+    correlated = 0.5
+    if not score[best] > correlated:
         raise FitError(
             f"the speeds of poses and motion capture agree nowhere (correlation {max(score[best], 0.0):.2f} at best, of"
             f" {together * _STEP_NS * 1e-9:.1f} s or more together): the same hand at the same time? Where both have"
@@ -48,10 +46,11 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
         curvature = inner[0] - 2.0 * inner[1] + inner[2]
         shift = 0.5 * (inner[0] - inner[2]) / curvature if curvature < 0.0 else 0.0
     lags = np.arange(len(score)) - best
-    far = np.where(np.abs(lags) * _STEP_NS > _APART_NS, score, -1.0)
+    alternative, apart_ns = 0.9, 500_000_000  # a second peak that counts
+    far = np.where(np.abs(lags) * _STEP_NS > apart_ns, score, -1.0)
     second = int(np.argmax(far))
     alternative_s = (
-        (second - best) * _STEP_NS * 1e-9 if far[second] > _ALTERNATIVE * score[best] else float("nan")
+        (second - best) * _STEP_NS * 1e-9 if far[second] > alternative * score[best] else float("nan")
     )
     lag = best + shift - (len(b) - 1)
     return round(first_a - first_b + lag * _STEP_NS), float(score[best]), alternative_s
@@ -63,7 +62,8 @@ def _speeds(track: Track) -> tuple[Float, int]:
     Steps are 10 ms; NaN: not known.
     """
     count = int((track.t_ns[-1] - track.t_ns[0]) // _STEP_NS) + 1 if len(track.t_ns) else 0
-    if count > _MOST_STEPS:
+    most_steps = 400_000  # 67 minutes
+    if count > most_steps:
         raise FitError(
             f"{count * _STEP_NS * 6e-11:.0f} minutes are too long to align: take a part, --from and --until"
         )

@@ -9,7 +9,6 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 
-_GAP_NS, _MOST_GAP_NS, _GAP_FRAMES = 25_000_000, 100_000_000, 1.5
 """Between two frames that are farther apart nothing is known: 25 ms, or 1.5 frames of a slow file, at most 100 ms."""
 
 
@@ -34,7 +33,9 @@ class Track:
     def gap_ns(self) -> int:
         """Frames that are farther apart have nothing between them."""
         typical = float(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0.0
-        return int(min(max(_GAP_NS, _GAP_FRAMES * typical), _MOST_GAP_NS))
+        # gap ns
+        most_gap_ns, gap_frames = 100_000_000, 1.5
+        return int(min(max(25_000_000, gap_frames * typical), most_gap_ns))
 
     def at(self, t_ns: Int) -> Float:
         """Interpolate positions (N, J, 3) [m] at times (N,).

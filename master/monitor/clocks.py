@@ -14,12 +14,6 @@ from master.monitor.timing import ResidualTiming
 from master.monitor.timing_fit import TimeOffset
 from master.rig.setup import RigSetup
 
-WARN_NS = 1e6
-WARN_SIGMAS = 3.0
-_LOOKS = 5  # in a row: one wild second is no lie
-_AGAIN = 60  # looks until the same camera is named again
-_NAME = 64  # characters of a name in `Health`
-
 
 class _Machines:
     """What is measured of the marker cameras of one hand with one state of its files."""
@@ -85,9 +79,13 @@ class ClockMonitor:
         lines = [line for now in self._now for line in now.phases.look()]
         for name in measured:
             offset = self._found.get(name)
-            wrong = offset is not None and abs(offset.offset_ns) > max(WARN_NS, WARN_SIGMAS * offset.sigma_ns)
+            warn_ns = 1e6
+            warn_sigmas = 3.0
+            wrong = offset is not None and abs(offset.offset_ns) > max(warn_ns, warn_sigmas * offset.sigma_ns)
             self._suspect[name] = self._suspect.get(name, 0) + 1 if wrong else 0
-            if offset is not None and self._suspect[name] % _AGAIN == _LOOKS:
+            looks = 5  # in a row: one wild second is no lie
+            again = 60  # looks until the same camera is named again
+            if offset is not None and self._suspect[name] % again == looks:
                 lines.append(warning(name, offset))
         return lines
 
@@ -149,7 +147,8 @@ def _named(sender: str, **quantities: float) -> dict[str, float]:
 
     A name too long is cut to the length limit by shortening the sender's part.
     """
+    name = 64  # characters of a name in `Health`
     return {
-        f"{sender[: _NAME - 1 - len(quantity)]}.{quantity}": round(value, 3)
+        f"{sender[: name - 1 - len(quantity)]}.{quantity}": round(value, 3)
         for quantity, value in quantities.items()
     }

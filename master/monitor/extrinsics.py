@@ -5,9 +5,6 @@ It reports a camera whose rays miss those of the others: the camera was knocked,
 
 from collections.abc import Mapping
 
-_LOOKS = 5  # in a row, once a second: somebody who reaches before a camera is no knock
-_NAME = 64  # characters of a name in `Health`
-
 
 class ExtrinsicsMonitor:
     """Monitor of cameras whose rays are rejected.
@@ -33,11 +30,13 @@ class ExtrinsicsMonitor:
         poses = counts.get("poses", 0) - self._poses
         self._poses += poses
         for name, before in self._rejected.items():
-            now = counts.get(f"mostly_rejected.{name}"[:_NAME], 0)
+            # characters of a name in `Health`
+            now = counts.get(f"mostly_rejected.{name}"[:64], 0)
             mostly = poses > 0 and now - before > 0.5 * poses
             self._rejected[name] = now
             self._looks[name] = self._looks[name] + 1 if mostly else 0
-            if self._looks[name] == _LOOKS:
+            looks = 5  # in a row, once a second: somebody who reaches before a camera is no knock
+            if self._looks[name] == looks:
                 lines.append(
                     f"camera {name}: its rays miss those of the others and are left out: it was knocked, or it is not"
                     " the camera of its file: calibrate it anew, `phalanx calibrate cameras stereo --help`"

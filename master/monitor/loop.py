@@ -12,8 +12,6 @@ from typing import Generic
 from common.service_manager import ServiceManager
 from master.run.app import AuxiliaryMessage, SeenT, Source
 
-_NOTIFIES = 4  # in a period of the watchdog
-
 
 class MonitoredLoop(Generic[SeenT]):
     """A source of messages that shows the manager each time it is asked.
@@ -35,7 +33,8 @@ class MonitoredLoop(Generic[SeenT]):
             now_ns: The time [ns].
         """
         self._source, self._manager, self._now_ns = source, manager, now_ns
-        self._every_ns = manager.watchdog_us * 1000 // _NOTIFIES
+        notifies = 4  # in a period of the watchdog
+        self._every_ns = manager.watchdog_us * 1000 // notifies
         self._due_ns = now_ns() + self._every_ns
         manager.send("READY=1\nSTATUS=tracks", wait=True)
 

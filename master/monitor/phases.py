@@ -14,11 +14,7 @@ import numpy as np
 
 from common.messages import MarkerDetections
 
-IN_STEP_US = 500.0
 """A third of the 1.5 ms that cost 2 % of depth at 1 m/s; libcamera's own synchronisation stays within some 10 us."""
-_FRAMES = 64
-_AT_LEAST = 16
-_LOOKS = 10  # in a row: cameras whose rates differ by 50 ppm are out of the band after that
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +45,9 @@ class CameraPhases:
         self._leader = next(iter(frame_rate_hz))
         self._period_ns = 1e9 / frame_rate_hz[self._leader]
         self._lead_ns: int | None = None
+        frames = 64
         self._fractions = {
-            name: deque[float](maxlen=_FRAMES) for name in frame_rate_hz if name != self._leader
+            name: deque[float](maxlen=frames) for name in frame_rate_hz if name != self._leader
         }
         self._near = dict.fromkeys(self._fractions, 0)
         self._in_step: dict[str, bool | None] = dict.fromkeys(self._fractions)
@@ -70,7 +67,8 @@ class CameraPhases:
         found: dict[str, Phase] = {}
         for name, fractions in self._fractions.items():
             kept = np.array(fractions.copy())
-            if len(kept) < _AT_LEAST:
+            at_least = 16
+            if len(kept) < at_least:
                 continue
             mean = np.exp(2j * np.pi * kept).mean()
             to_us = 1e-3 * self._period_ns / (2.0 * np.pi)
@@ -82,10 +80,12 @@ class CameraPhases:
         """Called once a second: a line for each camera that fell in step, or out of it."""
         lines: list[str] = []
         for name, phase in self.phases().items():
-            near = abs(phase.phase_us) <= IN_STEP_US and phase.spread_us <= IN_STEP_US
+            in_step_us = 500.0
+            near = abs(phase.phase_us) <= in_step_us and phase.spread_us <= in_step_us
             self._near[name] = self._near[name] + 1 if near else 0
             was = self._in_step[name]
-            now = self._near[name] >= _LOOKS if near else False
+            looks = 10  # in a row: cameras whose rates differ by 50 ppm are out of the band after that
+            now = self._near[name] >= looks if near else False
             if near and not now:
                 continue  # not yet reported
             if now != was:

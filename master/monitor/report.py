@@ -22,8 +22,6 @@ from master.run.ingest import Ingest
 from master.run.rejected_peers import MarkerCounts
 from master.run.tuning import LivePipeline, RigTuning
 
-_REPORT_S = 1.0
-
 
 class Reporter:
     """Status reporter of the master.
@@ -100,7 +98,8 @@ class Reporter:
         connected: frozenset[str] | None = None
         started = False
         poses = 0
-        while not self._stop.wait(_REPORT_S):
+        report_s = 1.0
+        while not self._stop.wait(report_s):
             lines = self._looked()
             try:
                 self._bus.publish("health", MASTER, self.health())

@@ -23,12 +23,7 @@ from master.monitor.timing_fit import TENTHS, TimeOffset, fit_offset, unit_sums
 
 BLOCK_NS = 1_000_000_000
 KEPT_BLOCKS = 32
-RATE_HZ = 30.0  # a hand moves below 10 Hz: more frames add no information
-_MARGIN_FRAMES = 4  # the cubic reaches two frames out, and the slowest camera may be one late
-_GAP_PERIODS = 2.5
-_USELESS_S = 5e-3  # a block that could at best resolve this much is uninformative
 _DONE = object()
-_SPARE = 2  # times as many frames are kept as a block needs
 
 
 class ResidualTiming:
@@ -43,7 +38,8 @@ class ResidualTiming:
         frame_rate_hz: Mapping[str, float],
         *,
         kept_blocks: int = KEPT_BLOCKS,
-        rate_hz: float = RATE_HZ,
+        # a hand moves below 10 Hz: more frames add no information
+        rate_hz: float = 30.0,
     ) -> None:
         """Take the cameras in the rig's order; the first one is the reference.
 
@@ -57,12 +53,15 @@ class ResidualTiming:
         self._index = {name: c for c, name in enumerate(cameras)}
         self._pairs = tuple(CameraPair.of(self._models[0], model) for model in self._models)
         rates = [frame_rate_hz[name] for name in cameras]
-        self._gap_s = tuple(_GAP_PERIODS / min(rate, rates[0]) for rate in rates)
+        gap_periods = 2.5
+        self._gap_s = tuple(gap_periods / min(rate, rates[0]) for rate in rates)
         self._stride = max(1, round(rates[0] / rate_hz))
-        self._margin_ns = int(_MARGIN_FRAMES * 1e9 / min(rates))
+        margin_frames = 4  # the cubic reaches two frames out, and the slowest camera may be one late
+        self._margin_ns = int(margin_frames * 1e9 / min(rates))
         window_s = (BLOCK_NS + 2 * self._margin_ns) * 1e-9
+        spare = 2  # times as many frames are kept as a block needs
         self._frames = tuple(
-            deque[MarkerDetections](maxlen=int(_SPARE * rate * window_s) + len(rates)) for rate in rates
+            deque[MarkerDetections](maxlen=int(spare * rate * window_s) + len(rates)) for rate in rates
         )
         self._blocks = tuple(deque[Float](maxlen=kept_blocks) for _ in rates)
         self._work: deque[Iterator[None]] = deque(maxlen=len(rates))  # comparisons, one for each camera
@@ -151,7 +150,8 @@ class ResidualTiming:
         yield
         sums = unit_sums(evidence, reference.t_s.shape[1], part[rows].astype(np.int64))
         known = (np.maximum(sums[..., 1].sum(axis=0), 0.0) / sums[0, :, -1]).sum()
-        if known > _USELESS_S**-2:
+        useless_s = 5e-3  # a block that could at best resolve this much is uninformative
+        if known > useless_s**-2:
             self._blocks[c].append(sums)
 
     def _track(self, c: int, begin_ns: int) -> Track:

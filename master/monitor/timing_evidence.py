@@ -29,11 +29,6 @@ from common.arrays import Float, Int
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross, invert
 
-_NEIGHBOURS = 3  # distances of each marker to so many next ones: of six markers these are all 15 pairs
-_STEP_S = 1e-3  # of the numerical derivative of a distance
-_JERK_PX_S3 = 3e6  # ten times what a hand does: the track jumped to another thing
-_NEAREST_M, _FARTHEST_M = 0.05, 5.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
@@ -107,7 +102,8 @@ class CameraPair:
         # A rolling shutter sees each marker at another time, and a distance needs both at one.
         t_s = reference.t_s[rows].mean(axis=1, keepdims=True)
         xy = reference.xy[rows] + known * (t_s - reference.t_s[rows])[..., None]
-        seen, velocity = carried(other, t_s, gap_s, _JERK_PX_S3 / self.focal_px)
+        jerk_px_s3 = 3e6  # ten times what a hand does: the track jumped to another thing
+        seen, velocity = carried(other, t_s, gap_s, jerk_px_s3 / self.focal_px)
         middle = 0.5 * (
             reference.xy[later] + reference.xy[sooner]
         )  # of other frames again: its noise is not `xy`'s
@@ -139,12 +135,13 @@ class CameraPair:
         distance = _distances(ray, depth)
         value = np.concatenate([self.focal_px * residual, distance], axis=-1)
         changes: list[Float] = []
-        for v in (velocity, expected, along / (self.focal_px * _STEP_S)):  # the last: a pixel
-            before = self._depth(a, along, place - _STEP_S * (along * v).sum(-1))
-            change = (distance - _distances(ray, before)) / _STEP_S
+        step_s = 1e-3  # of the numerical derivative of a distance
+        for v in (velocity, expected, along / (self.focal_px * step_s)):  # the last: a pixel
+            before = self._depth(a, along, place - step_s * (along * v).sum(-1))
+            change = (distance - _distances(ray, before)) / step_s
             changes.append(np.concatenate([self.focal_px * (normal * v).sum(-1), change], axis=-1))
         rate, instrument, pixel_effect = changes
-        return value, rate, instrument, _STEP_S * pixel_effect
+        return value, rate, instrument, step_s * pixel_effect
 
     def _depth(self, a: Float, along: Float, place: Float) -> Float:
         """Return depths (K, M) [m] along the reference rays.
@@ -154,7 +151,8 @@ class CameraPair:
         a_along, t_along = (along * a[..., :2]).sum(-1), along @ self.translation[:2]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
-        return np.where((depth > _NEAREST_M) & (depth < _FARTHEST_M), depth, np.nan)
+        nearest_m, farthest_m = 0.05, 5.0
+        return np.where((depth > nearest_m) & (depth < farthest_m), depth, np.nan)
 
 
 def carried(track: Track, t_s: Float, gap_s: float, jerk_s3: float) -> tuple[Float, Float]:
@@ -199,10 +197,11 @@ def _distances(ray: Float, depth: Float) -> Float:
 @cache
 def _pairs(markers: int) -> tuple[Int, Int]:
     """Each marker with the next ones, every pair once."""
+    neighbours = 3  # distances of each marker to so many next ones: of six markers these are all 15 pairs
     pairs = {
         (min(m, n), max(m, n))
         for m in range(markers)
-        for n in ((m + step) % markers for step in range(1, _NEIGHBOURS + 1))
+        for n in ((m + step) % markers for step in range(1, neighbours + 1))
         if m != n
     }
     one, other = np.array(sorted(pairs), np.int64).reshape(-1, 2).T

@@ -30,17 +30,8 @@ from master.fabrik.intersection import RAYS
 from master.monitor.timing_evidence import Evidence
 
 TENTHS = 10  # of a block, the shortest batches
-RESIDUAL_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3
 """Residual below which a unit is not taken to be better: centroids of a tenth of a pixel, at half a metre."""
-_FITTED = 4  # constant, plane, offset
-_AT_LEAST = 8  # equations of a unit
-_FAR = 6.0  # medians of a normal distribution: 4 sigma
-_STILL = 1e-3  # [1, normalised image]: half a pixel
-_BATCHES_AT_LEAST = 3.0
-_LONG_BATCHES_AT_LEAST = 5.0  # fewer add little that shorter ones do not
 _LENGTHS = (1, 2, 5, 10, 20)  # of batches [tenths of a block]
-_TIMES = 8
-_LEVERAGE_AT_MOST = 0.95
 _THREE_SIGMA = float(ndtr(3.0))
 
 
@@ -73,10 +64,12 @@ def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
         markers: How many of the items are residuals.
         tenth: In which tenth of the block each frame lies (K,).
     """
-    floor = np.full(evidence.value.shape[1], DISTANCE_FLOOR_M**2)
-    floor[:markers] = RESIDUAL_FLOOR_PX**2
+    residual_floor_px, distance_floor_m = 0.2, 1e-3
+    floor = np.full(evidence.value.shape[1], distance_floor_m**2)
+    floor[:markers] = residual_floor_px**2
     good = _plausible(evidence, floor)
-    good &= good.sum(axis=0) >= _AT_LEAST
+    at_least = 8  # equations of a unit
+    good &= good.sum(axis=0) >= at_least
     n = good.sum(axis=0)
     x, y = np.moveaxis(evidence.place, -1, 0)
     parts = (x, y, evidence.instrument, evidence.value, evidence.rate, evidence.pixel_effect)
@@ -104,7 +97,8 @@ def _plausible(evidence: Evidence, floor: Float) -> Bool:
     smoothed = _median(np.stack([padded[i : i + len(value)] for i in range(5)]))
     jump = np.abs(value - smoothed)
     unlike = np.abs(np.where(good, evidence.rate - evidence.instrument, np.nan))
-    return (jump <= _FAR * _median(jump) + np.sqrt(floor)) & (unlike <= _FAR * _median(unlike))
+    far = 6.0  # medians of a normal distribution: 4 sigma
+    return (jump <= far * _median(jump) + np.sqrt(floor)) & (unlike <= far * _median(unlike))
 
 
 def _median(x: Float) -> Float:
@@ -128,7 +122,8 @@ def _without(x: Float, column: Float) -> Float:
     Nothing is removed where that is only noise.
     """
     length = (column * column).sum(axis=0)
-    return x - column * ((column * x).sum(axis=0) / (length + _STILL**2 * len(x)))
+    still = 1e-3  # [1, normalised image]: half a pixel
+    return x - column * ((column * x).sum(axis=0) / (length + still**2 * len(x)))
 
 
 def fit_offset(blocks: Float) -> TimeOffset | None:
@@ -144,14 +139,16 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
 
     def variance(offset: float | Float) -> Float:
         """Residual variance (B, I) of each unit, never below its floor."""
+        fitted = 4  # constant, plane, offset
         return floor + np.maximum(ee - 2.0 * offset * ge + offset * offset * gg, 0.0) / np.maximum(
-            n - _FITTED, 1
+            n - fitted, 1
         )
 
     slope = np.where(moved, ze / np.where(moved, zg, 1.0), 0.0)
     offset = _weighted_median(slope[moved], (zg / variance(slope))[moved])
     weight, total = np.zeros_like(zg), 0.0
-    for _ in range(_TIMES):
+    times = 8
+    for _ in range(times):
         weight = 1.0 / variance(offset)
         total = float((weight * zg).sum())
         if total <= 0.0:
@@ -161,9 +158,11 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         (weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3)
     )
     scatter = [_scatter(information, lagged - offset * information, length) for length in _LENGTHS]
-    if scatter[0][1] < _BATCHES_AT_LEAST:
+    batches_at_least = 3.0
+    if scatter[0][1] < batches_at_least:
         return None
-    sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])
+    long_batches_at_least = 5.0  # fewer add little that shorter ones do not
+    sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= long_batches_at_least)])
     sigma *= float(stdtrit(count - 1.0, _THREE_SIGMA)) / 3.0
     sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(weight_of_rays.sum()) / total)
     return TimeOffset(offset * 1e9, sigma * 1e9, count)
@@ -177,7 +176,8 @@ def _scatter(information: Float, residual: Float, length: int) -> tuple[float, f
     starts = np.arange(0, len(information), length)
     information, residual = np.add.reduceat(information, starts), np.add.reduceat(residual, starts)
     total = information.sum()
-    share = np.clip(information / total, 0.0, _LEVERAGE_AT_MOST)
+    leverage_at_most = 0.95
+    share = np.clip(information / total, 0.0, leverage_at_most)
     residual = residual / (1.0 - share)
     return float(np.sqrt((residual * residual).sum()) / total), 1.0 / max(float((share * share).sum()), 1e-12)
 

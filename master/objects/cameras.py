@@ -12,8 +12,6 @@ import numpy as np
 from common.arrays import Float, Int
 from common.geometry.camera_model import CameraModel
 
-_BEFORE_M = 1e-3  # a point nearer to the plane of a camera than this is not before it
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
@@ -44,7 +42,8 @@ class Views:
             Pixels (n, 2); their derivatives (n, 2, 3) [px/m] by the points, rig frame; depth (n,) [m]. NaN: behind.
         """
         own = (self.R @ points[..., None])[..., 0] + self.t
-        z = np.where(own[:, 2] > _BEFORE_M, own[:, 2], np.nan)
+        before_m = 1e-3  # a point nearer to the plane of a camera than this is not before it
+        z = np.where(own[:, 2] > before_m, own[:, 2], np.nan)
         z = z - self.radius_2 / z
         xy = own[:, :2] / z[:, None]
         k1, k2, p1, p2, k3 = self.lens

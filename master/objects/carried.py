@@ -19,12 +19,6 @@ from common.arrays import Float
 from common.geometry.transforms import invert, transform
 
 SPAN_S = 0.35  # over which motions are compared
-WAY_M = 0.015  # of the palm, at least: by that much it would move with the object
-_ALIKE = 0.5  # by which share of that way the palm may miss
-NEAR_M = 0.05  # between palm and object, at most
-LEFT_M = 0.03  # by which the palm moves about the object before it has left it
-_SLOW = 0.02  # share by which what is remembered of the palm's place follows it, in each pose
-_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,20 +56,24 @@ class Carried:
         """
         if np.isnan(palm_m).any() or np.isnan(distance_m):
             return self._at_m is not None and not away
-        if self._moments and t_ns - self._moments[-1].t_ns > _GAP_S * 1e9:
+        gap_s = 0.1
+        if self._moments and t_ns - self._moments[-1].t_ns > gap_s * 1e9:
             self._moments.clear()
         self._moments.append(_Moment(t_ns, T_rig_object, palm_m))
         while t_ns - self._moments[0].t_ns > SPAN_S * 1e9:
             self._moments.popleft()
         at_m = transform(invert(T_rig_object), palm_m)
-        if away or distance_m > NEAR_M:
+        near_m = 0.05  # between palm and object, at most
+        if away or distance_m > near_m:
             self._at_m = None
             self._moments.clear()
         elif self._goes_along():
             self._at_m = at_m
         elif self._at_m is not None:
             off = at_m - self._at_m
-            self._at_m = None if float(off @ off) > LEFT_M**2 else self._at_m + _SLOW * off
+            left_m = 0.03  # by which the palm moves about the object before it has left it
+            slow = 0.02  # share by which what is remembered of the palm's place follows it, in each pose
+            self._at_m = None if float(off @ off) > left_m**2 else self._at_m + slow * off
         return self._at_m is not None
 
     def forget(self) -> None:
@@ -89,4 +87,6 @@ class Carried:
             return False
         to = transform(last.T @ invert(first.T), first.palm_m)
         way = float(np.linalg.norm(to - first.palm_m))
-        return way > WAY_M and float(np.linalg.norm(last.palm_m - to)) < _ALIKE * way
+        way_m = 0.015  # of the palm, at least: by that much it would move with the object
+        alike = 0.5  # by which share of that way the palm may miss
+        return way > way_m and float(np.linalg.norm(last.palm_m - to)) < alike * way

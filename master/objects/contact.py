@@ -38,13 +38,7 @@ from common.messages import Contact, HandPose, ObjectPose
 from master.objects.carried import Carried
 from master.objects.surface import Nearest, Surface
 
-NEAR_M, FAR_M = 2.5e-3, 5.0e-3
-SURFACE_SIGMA_M = 1.0e-3  # standard deviation of the skin about the profile's radii
-LED_S = 0.1  # by which an object's pose is led on, at most
-_POSES = 6
-_SURE_M = 0.02  # a distance less sure than this is no evidence of touch
-_SIGMA_SHARE = 0.5  # of a standard deviation by which touching may begin early
-_LED_M_S2, _LED_RAD_S2 = 5.0, 50.0  # what a hand does to what it holds while nobody sees it
+FAR_M = 5.0e-3
 _BONES: Int = np.concatenate(
     [
         np.stack([CHAINS[:, :-1], CHAINS[:, 1:]], axis=-1).reshape(-1, 2),
@@ -53,7 +47,6 @@ _BONES: Int = np.concatenate(
 )
 _SEGMENTS = 15
 _PALM = 0
-_FREE = 2.5  # standard deviations of a distance beyond which a finger surely does not touch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +70,8 @@ class ContactMonitor:
         """Take the hand and the objects near it; those without a shape have no contact."""
         self._hand = model.profile.name
         self._surfaces = {profile.name: Surface(profile.shape) for profile in objects if profile.shape}
-        self._poses: dict[str, deque[ObjectPose]] = {name: deque(maxlen=_POSES) for name in self._surfaces}
+        poses = 6
+        self._poses: dict[str, deque[ObjectPose]] = {name: deque(maxlen=poses) for name in self._surfaces}
         self._touching: dict[str, Bool] = {name: np.zeros(6, np.bool_) for name in self._surfaces}
         self._carried = {name: Carried() for name in self._surfaces}
 
@@ -137,7 +131,8 @@ def _away(distance: Float, sigma: Float) -> bool:
 
     All are away but the thumb, which alone holds nothing. NaN: open.
     """
-    return bool((np.nan_to_num(distance - _FREE * sigma, nan=-np.inf)[1:] > FAR_M).all())
+    free = 2.5  # standard deviations of a distance beyond which a finger surely does not touch
+    return bool((np.nan_to_num(distance - free * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
@@ -145,9 +140,12 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
 
     Given are distances and standard deviations (N,) [m] and what touched before; NaN: not known.
     """
-    sure = sigma < _SURE_M
-    begins = distance < NEAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M)
-    stay_near = before & (distance < FAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M))
+    sure_m = 0.02  # a distance less sure than this is no evidence of touch
+    sure = sigma < sure_m
+    near_m = 2.5e-3
+    sigma_share = 0.5  # of a standard deviation by which touching may begin early
+    begins = distance < near_m + sigma_share * np.minimum(sigma, FAR_M)
+    stay_near = before & (distance < FAR_M + sigma_share * np.minimum(sigma, FAR_M))
     return sure & (begins | stay_near)
 
 
@@ -173,7 +171,8 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
     hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
     pull = np.concatenate([normal, cross(lever, normal)], axis=1)
     own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
-    sigma = np.sqrt(hand + own + SURFACE_SIGMA_M**2)
+    surface_sigma_m = 1.0e-3  # standard deviation of the skin about the profile's radii
+    sigma = np.sqrt(hand + own + surface_sigma_m**2)
     nan = np.where(usable, 0.0, np.nan)
     return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
 
@@ -183,7 +182,8 @@ def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
 
     None: it is not known.
     """
-    if not poses or t_ns - poses[-1].t_ns > LED_S * 1e9 or poses[0].t_ns - t_ns > LED_S * 1e9:
+    led_s = 0.1  # by which an object's pose is led on, at most
+    if not poses or t_ns - poses[-1].t_ns > led_s * 1e9 or poses[0].t_ns - t_ns > led_s * 1e9:
         return None
     if len(poses) == 1:
         one = poses[0]
@@ -204,7 +204,8 @@ def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
 def _led(dt_s: float) -> Float:
     """Covariance (6, 6) of what an object may do beyond its motion in so long a time."""
     way = 0.5 * dt_s * dt_s
-    return np.diag([(_LED_M_S2 * way) ** 2] * 3 + [(_LED_RAD_S2 * way) ** 2] * 3)
+    led_m_s2, led_rad_s2 = 5.0, 50.0  # what a hand does to what it holds while nobody sees it
+    return np.diag([(led_m_s2 * way) ** 2] * 3 + [(led_rad_s2 * way) ** 2] * 3)
 
 
 def _pose_of(pose: ObjectPose) -> Float:

@@ -18,12 +18,9 @@ from common.geometry.tag_family import GRIDS
 from common.geometry.transforms import cross, transform
 from master.objects.surface import Surface
 
-_MARGIN_PX = 6.0  # from the image's border
 # Of a tag that is found nearly always, by what the finder of the slaves finds of rendered ones: how it is turned to the
 # camera, and how short its shortest edge may be by cells.
 _TAG_COSINE, _CELL_PX = 0.65, 3.4
-_BEAD_PX = 2.5  # radius of a bead that is found nearly always
-_BEAD_SEEN = 0.75  # share of a bead that must not be behind the object
 _DISC: Float = np.array(
     [[0.0, 0.0]]
     + [[r * np.cos(a), r * np.sin(a)] for r in (0.45, 0.85) for a in np.arange(6) * np.pi / 3 + r]
@@ -120,8 +117,9 @@ class Features:
         """
         eye = (camera.centre - T_rig_object[:3, 3]) @ T_rig_object[:3, :3]
         uv = camera.project(transform(T_rig_object, self.points))
-        last = np.array([camera.width_px, camera.height_px]) - 1.0 - ease * _MARGIN_PX
-        inside = ((uv >= ease * _MARGIN_PX) & (uv <= last)).all(axis=1)
+        margin_px = 6.0  # from the image's border
+        last = np.array([camera.width_px, camera.height_px]) - 1.0 - ease * margin_px
+        inside = ((uv >= ease * margin_px) & (uv <= last)).all(axis=1)
         shows = np.concatenate(
             [self._beads_show(eye, float(camera.matrix[0, 0]), ease), self._tags_show(eye, uv, ease)]
         )
@@ -171,4 +169,6 @@ class Features:
         off = _DISC[:, :1] * across[:, None] + _DISC[:, 1:] * cross(ahead, across)[:, None]
         off += _BULGE * ahead[:, None]
         hidden = self.surface.hides(eye, points[:, None] + radius[:, None, None] * off)
-        return (radius * focal_px >= ease * _BEAD_PX * away) & ((~hidden).mean(axis=1) >= ease * _BEAD_SEEN)
+        bead_px = 2.5  # radius of a bead that is found nearly always
+        bead_seen = 0.75  # share of a bead that must not be behind the object
+        return (radius * focal_px >= ease * bead_px * away) & ((~hidden).mean(axis=1) >= ease * bead_seen)

@@ -32,12 +32,8 @@ _N = 6 * ORDERS
 # At rest on a table, held, waved: speeds and accelerations per axis, and of turns.
 _SPEED: Float = np.array([[0.005, 0.05], [1.0, 6.0], [1.0, 8.0]])  # [m/s, rad/s]
 _ACCELERATION: Float = np.array([[0.1, 1.0], [1.5, 15.0], [15.0, 120.0]])  # [m/s^2, rad/s^2]
-_W_PER_S = 18.0  # jerk by acceleration, and snap by jerk: as hands do
-_EVIDENCE = 0.5
 _ROUNDS = 4
-_SETTLED = 2e-4  # [m, rad]: the next step, which is taken in any case, is some thousandths of that
 _LEAST: Float = np.array([1.0] * 3 + [0.1] * 3)  # information on place and turn: no matrix is singular
-_GONE = 0.05  # weight below which a feature counts as wrong
 _EYE = np.eye(3)
 _REPORTED = np.eye(_N)[:, :12]  # place, turn and their speeds
 
@@ -67,7 +63,8 @@ class Fitted:
     @property
     def used(self) -> Bool:
         """(n,) which observations the pose rests on."""
-        return self.weight > _GONE
+        gone = 0.05  # weight below which a feature counts as wrong
+        return self.weight > gone
 
     def poorer(self, most_m: float, most_rad: float) -> bool:
         """Whether place or turn is less sure than this in some direction."""
@@ -126,7 +123,8 @@ class PoseFit:
             if not np.isfinite(step).all() or most > 1.0:
                 return None
             motion = motion.retracted(step)
-            if most < _SETTLED:
+            settled = 2e-4  # [m, rad]: the next step, which is taken in any case, is some thousandths of that
+            if most < settled:
                 break
         problem = task.linear(motion)
         return None if problem is None else self._mixed(problem, motion)
@@ -145,7 +143,8 @@ class PoseFit:
         sign, size = np.linalg.slogdet(normal)
         if not (sign > 0).all() or not np.isfinite(x).all():
             return None
-        evidence = _EVIDENCE * (x @ pull - size + self._log_prior)  # twice the logarithm
+        # evidence
+        evidence = 0.5 * (x @ pull - size + self._log_prior)  # twice the logarithm
         share = np.exp(0.5 * (evidence - evidence.max()))
         share /= share.sum()
         mean = share @ x
@@ -244,7 +243,8 @@ class _Task:
 def _precision(level: int) -> Float:
     """Diagonal prior (30, 30) of the derivatives at one degree of vigour."""
     acceleration = _ACCELERATION[level]
+    w_per_s = 18.0  # jerk by acceleration, and snap by jerk: as hands do
     sizes = np.stack(
-        [_SPEED[level], acceleration, acceleration * _W_PER_S, acceleration * _W_PER_S**2]
+        [_SPEED[level], acceleration, acceleration * w_per_s, acceleration * w_per_s**2]
     )  # (4, 2): of place and turn
     return np.diag(np.concatenate([_LEAST, (1.0 / sizes**2).repeat(3, axis=1).ravel()]))

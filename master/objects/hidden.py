@@ -16,10 +16,6 @@ from common.geometry.camera_model import CameraModel
 from master.objects.features import Features
 from master.objects.window import ImageObservation, Window
 
-_PART = 0.63  # of what a bead shows when it is whole
-_NEARLY = 0.93  # of that, a bead may show and be whole
-_LEARN, _FORGET = 0.06, 0.004  # towards more, towards less, from frame to frame
-
 
 @dataclass(frozen=True, slots=True)
 class Seen:
@@ -75,7 +71,8 @@ class Hidden:
         Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.
         """
         share, radius_px = self._share(c, T_rig_object, area_px2)
-        missing = 1.0 - share / (_NEARLY * self._whole[c])
+        nearly = 0.93  # of that, a bead may show and be whole
+        missing = 1.0 - share / (nearly * self._whole[c])
         return np.where(missing > 0.0, np.minimum(missing, 1.0) * radius_px, 0.0)  # NaN: not known, 0
 
     def _share(self, c: int, T: Float, area_px2: Float) -> tuple[Float, Float]:
@@ -97,9 +94,11 @@ class Hidden:
         """Whether a bead that is seen shows too little; learns what they show."""
         share = np.where(seen, self._share(c, T, markers.area_px2)[0], np.nan)
         whole = self._whole[c]
-        partly = bool((share < _PART * whole).any())
+        part = 0.63  # of what a bead shows when it is whole
+        partly = bool((share < part * whole).any())
         known = np.isfinite(share)
-        pull = np.where(share > whole, _LEARN, _FORGET)
+        learn, forget = 0.06, 0.004  # towards more, towards less, from frame to frame
+        pull = np.where(share > whole, learn, forget)
         self._whole[c] = np.where(
             known, np.where(np.isnan(whole), share, whole + pull * (share - whole)), whole
         )

@@ -41,16 +41,10 @@ from master.objects.window import Window, Windows
 
 # What light does to a ball's centroid beyond what a slave reports, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
-_POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
-_INCOMPLETE_M, _INCOMPLETE_RAD = (
-    0.02,
-    np.radians(12.0),
-)  # less sure than this it does not determine all of the pose
-_LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
-_MOST = 0.5  # share of what is seen that must be in its place
-_START_CHI2 = 25.0  # chi square per number of what a pose from nothing rests on
-_TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
-_MAX_AGE_PERIODS = 2.25  # an observation older than this is not now
+_POOR_RAD = np.radians(4.0)  # less sure than this: the past counts
+_INCOMPLETE_RAD = np.radians(12.0)  # less sure than this it does not determine all of the pose
+_LOST_RAD = np.radians(30.0)  # less sure than this is no pose
+_TRACKED_RAD = np.radians(10.0)  # less sure than this is led on rather than measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +117,10 @@ class ObjectLine:
     def _solve(self, window: Window) -> ObjectPose:
         predicted = self._trajectory.predicted(window.t_ns)
         seen = self._associated(window, None if predicted is None else predicted.T)
+        max_age_periods = 2.25  # an observation older than this is not now
         now = (
             seen is not None
-            and float(np.abs(seen.seen.tau_s).min()) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9
+            and float(np.abs(seen.seen.tau_s).min()) <= max_age_periods * window.period_ns * 1e-9
         )
         fitted = None
         if seen is not None and now:
@@ -134,12 +129,13 @@ class ObjectLine:
             return self._held(window, predicted)
         if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
-        tracked = fitted.measured_only or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
+        tracked_m = 15e-3  # less sure than this is led on rather than measured
+        tracked = fitted.measured_only or not fitted.poorer(tracked_m, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
         T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
         features = self._features.feature[seen.seen.point[fitted.used]]
-        near = fitted.used & (np.abs(seen.seen.tau_s) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9)
+        near = fitted.used & (np.abs(seen.seen.tau_s) <= max_age_periods * window.period_ns * 1e-9)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -197,7 +193,8 @@ class ObjectLine:
         How it may have moved since is then in it.
         """
         measured = self._fit(seen.seen, start, feature=seen.feature)
-        if measured is not None and not measured.poorer(_POOR_M, _POOR_RAD):
+        poor_m = 6e-3  # less sure than this: the past counts
+        if measured is not None and not measured.poorer(poor_m, _POOR_RAD):
             return measured
         both = None
         if led:
@@ -206,21 +203,25 @@ class ObjectLine:
             both = self._fit(seen.seen, start, past, feature=seen.feature)
         if measured is None:
             return None if both is None else replace(both, measured_only=False)
-        if both is None or not measured.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
+        incomplete_m = 0.02  # less sure than this it does not determine all of the pose
+        if both is None or not measured.poorer(incomplete_m, _INCOMPLETE_RAD):
             return measured if both is None else both
-        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), _POOR_M)
+        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), poor_m)
 
     def _holds(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
-        if fitted.poorer(_LOST_M, _LOST_RAD):
+        lost_m = 0.05  # less sure than this is no pose
+        if fitted.poorer(lost_m, _LOST_RAD):
             return False
-        return float(fitted.weight.mean()) >= _MOST and len(np.unique(seen.feature[fitted.used])) >= 1
+        most = 0.5  # share of what is seen that must be in its place
+        return float(fitted.weight.mean()) >= most and len(np.unique(seen.feature[fitted.used])) >= 1
 
     def _begins(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose may begin with no past: three beads, or a tag, that fit."""
         features = np.unique(seen.feature[fitted.used])
         enough = len(features) >= 3 or bool((features >= self._features.beads).any())
-        return enough and float(fitted.chi2[fitted.used].mean()) < _START_CHI2
+        start_chi2 = 25.0  # chi square per number of what a pose from nothing rests on
+        return enough and float(fitted.chi2[fitted.used].mean()) < start_chi2
 
     def _starts(self, window: Window) -> list[Float]:
         """Poses (4, 4) that the nearest frames suggest."""

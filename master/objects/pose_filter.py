@@ -15,10 +15,6 @@ from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotatio
 from master.fabrik.noise import NoiseEstimator
 from master.fabrik.one_euro import OneEuro, OneEuroParameters
 
-_ARM_M = 0.1
-_RESET_S = 0.5
-_INDEPENDENT_SHARE = 0.15  # of the variance of a pose, new in each frame: most of its error stays
-
 
 class PoseFilter:
     """1 € filter of an object's pose.
@@ -40,14 +36,17 @@ class PoseFilter:
 
     def push(self, t_ns: int, T: Float, cov: Float) -> Float:
         """The pose (4, 4) to show, of one that was measured with a covariance (6, 6)."""
-        if self._filter is None or (t_ns - self._t_ns) * 1e-9 > _RESET_S:
+        reset_s = 0.5
+        if self._filter is None or (t_ns - self._t_ns) * 1e-9 > reset_s:
             self._filter, self._noise = OneEuro(self._parameters, (3, 3)), NoiseEstimator()
             self._R, self._values = T[:3, :3], np.zeros(6)
-        rotation = _ARM_M * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
+        arm_m = 0.1
+        rotation = arm_m * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
         signals = np.concatenate([T[:3, :3] @ self._middle + T[:3, 3], self._values[3:] + rotation])
-        noise = _INDEPENDENT_SHARE * np.concatenate([np.diagonal(cov)[:3], _ARM_M**2 * np.diagonal(cov)[3:]])
+        independent_share = 0.15  # of the variance of a pose, new in each frame: most of its error stays
+        noise = independent_share * np.concatenate([np.diagonal(cov)[:3], arm_m**2 * np.diagonal(cov)[3:]])
         values = self._filter.push(t_ns, signals, self._noise.push(t_ns, signals, noise))
-        self._R = rotation_vector_to_matrix((values - self._values)[3:] / _ARM_M) @ self._R
+        self._R = rotation_vector_to_matrix((values - self._values)[3:] / arm_m) @ self._R
         self._values, self._t_ns = values, t_ns
         return rigid(self._R, values[:3] - self._R @ self._middle)
 

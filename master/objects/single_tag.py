@@ -26,14 +26,6 @@ from master.objects.start import two_poses
 from master.objects.window import Window
 
 _FLIP_RAD = np.radians(8.0)  # poses of a tag nearer than this are one
-_BETTER = 12.0  # chi square, summed over frames, by which the other pose of a tag must be better
-_FORGET = 0.8  # of that sum, from frame to frame
-_CLEAR = (
-    -30.0
-)  # chi square of the other pose's being better at which it is out of the question: exp(-30) is nothing
-_UNLOOKED = (
-    5  # frames for which that holds: less than a tenth of a second, before a sum of it would be forgotten
-)
 
 
 @dataclass(slots=True)
@@ -79,8 +71,9 @@ class SingleTag:
             begins: There is no pose before it: the better one is taken at once.
         """
         features = np.unique(seen.feature[fitted.used])
+        forget = 0.8  # of that sum, from frame to frame
         if len(features) != 1 or features[0] < self._features.beads:
-            self._log_odds *= _FORGET
+            self._log_odds *= forget
             self._clear = None
             return fitted
         feature = int(features[0])
@@ -88,22 +81,26 @@ class SingleTag:
         clear = self._clear
         if clear is not None and clear.seen_by == who and clear.frames > 0 and not begins:
             clear.frames -= 1
-            self._log_odds = _FORGET * (self._log_odds + clear.better)
+            self._log_odds = forget * (self._log_odds + clear.better)
             return fitted
         self._clear = None
         other = self._other(window, seen, fitted, feature)
         if other is None:
-            self._log_odds *= _FORGET
+            self._log_odds *= forget
             return fitted
         better = 0.5 * (fitted.cost - other.cost)
-        self._log_odds = _FORGET * self._log_odds + 2.0 * better * (1.0 - _FORGET) * 2.0
+        self._log_odds = forget * self._log_odds + 2.0 * better * (1.0 - forget) * 2.0
+        # chi square, summed over frames, by which the other pose of a tag must be better
+        # chi square of the other pose's being better at which it is out of the question: exp(-30) is nothing
         if begins:
             if better > 0.0:
                 fitted, other, better = other, fitted, -better
-        elif self._log_odds > _BETTER:
+        elif self._log_odds > 12.0:
             fitted, other, better, self._log_odds = other, fitted, -better, 0.0
-        elif better < _CLEAR:
-            self._clear = _Clear(who, better, _UNLOOKED)
+        elif better < (-30.0):
+            # frames for which that holds: less than a tenth of a second, before a sum of it would be forgotten
+            unlooked = 5
+            self._clear = _Clear(who, better, unlooked)
         return _reaching(fitted, other, better)
 
     def _other(self, window: Window, seen: Association, fitted: Fitted, feature: int) -> Fitted | None:

@@ -22,11 +22,7 @@ from master.estimator.cameras import CameraArrays
 from master.fabrik.intersection import triangulate
 from master.objects.features import Features
 
-_NEAR_S = 0.012  # frames of several cameras that are taken for one moment without bringing them there
-_DISTANCE_M, _DISTANCE_SHARE = 8e-3, 0.08  # by which distances between beads may be wrong
-_MISS_PX = 6.0  # by which rays of a bead may miss each other
-_POSES, _TRIPLES, _COMBINATIONS = 6, 40, 16
-_SIGMA_PX = 0.3
+_COMBINATIONS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +155,8 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
     places = [_points(sighted, bead, cameras) for bead in range(features.beads)]
     seen = [bead for bead, found in enumerate(places) if len(found)]
     poses: list[tuple[float, Float]] = []
-    for triple in list(combinations(seen, 3))[:_TRIPLES]:
+    triples = 40
+    for triple in list(combinations(seen, 3))[:triples]:
         own = features.points[list(triple)]
         if np.linalg.norm(np.cross(own[1] - own[0], own[2] - own[0])) < 1e-4:  # [m^2]: nearly in one line
             continue
@@ -167,10 +164,12 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
         for associated in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
             points = np.array([places[bead][k] for bead, k in zip(triple, associated, strict=True)])
             off = np.abs(_sides(points) - wanted)
-            if (off < _DISTANCE_M + _DISTANCE_SHARE * wanted).all():
+            distance_m, distance_share = 8e-3, 0.08  # by which distances between beads may be wrong
+            if (off < distance_m + distance_share * wanted).all():
                 poses.append((float(off.sum()), fit_rigid(points, own)))
     poses.sort(key=lambda pose: pose[0])
-    return [T for _, T in poses[:_POSES]]
+    # poses
+    return [T for _, T in poses[:6]]
 
 
 def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Float:
@@ -185,8 +184,10 @@ def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Flo
     uv = np.full((len(cameras.scale), len(choices), 2), np.nan)
     for seen, associated in zip(views, np.array(choices, np.int64).T, strict=True):
         uv[seen.camera] = seen.uv[associated, 0]
-    found = triangulate(cameras, uv, _SIGMA_PX)
-    return found.points_m[found.residual_px < _MISS_PX]
+    sigma_px = 0.3
+    found = triangulate(cameras, uv, sigma_px)
+    miss_px = 6.0  # by which rays of a bead may miss each other
+    return found.points_m[found.residual_px < miss_px]
 
 
 def _sides(points: Float) -> Float:
@@ -200,6 +201,7 @@ def reach(taus: Float) -> Int:
     `taus` (n,) are times from an epoch [s]; the nearest is first. Returns one index where only one is usable.
     """
     order: Int = np.argsort(np.abs(taus))
-    if len(order) < 2 or abs(float(taus[order[1]])) > 4 * _NEAR_S:
+    near_s = 0.012  # frames of several cameras that are taken for one moment without bringing them there
+    if len(order) < 2 or abs(float(taus[order[1]])) > 4 * near_s:
         return order[:1]
     return order[:2]

@@ -17,9 +17,6 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.fabrik.intersection import RAYS
 
-_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1  # as in `master.fabrik.propagate`
-_SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
@@ -69,7 +66,8 @@ class Sums:
             points: How many points the object has.
         """
         variance = seen.sigma_px**2
-        independent = np.minimum(_INDEPENDENT_SHARE * variance, _INDEPENDENT_PX**2)
+        independent_share, independent_px = 0.7, 0.1  # as in `master.fabrik.propagate`
+        independent = np.minimum(independent_share * variance, independent_px**2)
         correlated = variance - independent + floor_2
         _, first, group = np.unique(seen.camera * points + seen.point, return_index=True, return_inverse=True)
         # What the surest observation keeps is kept by all; others have more that is new.
@@ -102,8 +100,9 @@ class Sums:
         squared = 0.5 * np.vecdot(miss, miss)
         mean = np.bincount(self._whole, squared / total) / self._whole_size
         forgiven = np.bincount(self._whole, squared / (total + RAYS.rig_px**2)) / self._whole_size
-        weight = (1.0 + forgiven / _SOFT_2) ** -2.0
-        cost = float((self._numbers * mean / (1.0 + mean / _SOFT_2)).sum())
+        soft_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
+        weight = (1.0 + forgiven / soft_2) ** -2.0
+        cost = float((self._numbers * mean / (1.0 + mean / soft_2)).sum())
         return mean[self._whole], weight[self._whole], cost
 
     def normal(self, rows: Float, weight: Float, lag_2: Float) -> tuple[Float, Float]:

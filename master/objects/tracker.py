@@ -28,13 +28,7 @@ from common.messages import ObjectPose, ObjectSource, TrackerPose
 from master.objects.line import SolvedObject
 from master.objects.trajectory import HELD_S
 
-LEAP_M, LEAP_M_S, LEAP_S = 0.08, 8.0, 0.15  # a leap: farther and faster than that; and how long it is doubted
-_UNKNOWN_M, _UNKNOWN_RAD = (
-    5e-3,
-    np.radians(1.5),
-)  # of a registration without figures, such as one made by hand
-_WANDERS_M_S, _WANDERS_RAD_S = 0.3, 2.0  # what a held pose may have become wrong by
-_UNIT_WITHIN = 1e-2
+_UNKNOWN_RAD = np.radians(1.5)  # of a registration without figures, such as one made by hand
 _NOWHERE = (np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan))
 
 
@@ -113,7 +107,8 @@ class TrackerLine:
         if np.isnan(place).any() or np.isnan(quaternion).any():
             self.counts["lost"] += 1
             return None
-        if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT_WITHIN:
+        unit_within = 1e-2
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > unit_within:
             self.counts["broken"] += 1
             return None
         T = np.eye(4)
@@ -147,15 +142,17 @@ class TrackerLine:
             return False
         way = _distance(place_m, self._last.position_m)
         since_s = max(1e-9 * (t_ns - self._last.t_ns), 1e-3)
+        # a leap: farther and faster than that; and how long it is doubted
+        leap_m, leap_m_s, leap_s = 0.08, 8.0, 0.15
         if self._leapt is not None:
             leapt_ns, where = self._leapt
-            recent = 0 <= t_ns - leapt_ns < round(1e9 * LEAP_S)
-            if recent and way > LEAP_M and _distance(place_m, where) < way:
+            recent = 0 <= t_ns - leapt_ns < round(1e9 * leap_s)
+            if recent and way > leap_m and _distance(place_m, where) < way:
                 return True
             self._leapt = None
             if not recent:
                 return False
-        if way > LEAP_M and way > LEAP_M_S * since_s:
+        if way > leap_m and way > leap_m_s * since_s:
             self._leapt = t_ns, place_m
             return True
         return False
@@ -170,7 +167,8 @@ class TrackerLine:
             return ObjectPose(
                 self.name, t_ns, place, quaternion, cov, float("nan"), source, False, 0, 1, True
             )
-        spread = np.repeat([_WANDERS_M_S * since_s, _WANDERS_RAD_S * since_s], 3) ** 2
+        wanders_m_s, wanders_rad_s = 0.3, 2.0  # what a held pose may have become wrong by
+        spread = np.repeat([wanders_m_s * since_s, wanders_rad_s * since_s], 3) ** 2
         return replace(
             last,
             t_ns=t_ns,
@@ -197,7 +195,8 @@ def covariance_of(profile: ObjectProfile) -> Float:
     rotation_rad = np.radians(
         np.hypot(residual.get("rotation_deg", 0.0), residual.get("rotation_sigma_deg", 0.0))
     )
+    unknown_m = 5e-3  # of a registration without figures, such as one made by hand
     # The figures are of the whole offset: a third of its square belongs to each axis.
-    place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else _UNKNOWN_M
+    place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else unknown_m
     rotation_rad = rotation_rad / np.sqrt(3.0) if rotation_rad > 0.0 else _UNKNOWN_RAD
     return np.diag(np.repeat([place_m, rotation_rad], 3) ** 2)

@@ -15,9 +15,8 @@ from master.objects.motion import Motion, Past
 HELD_S = 0.5
 _DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
 _PUSHED: Float = np.repeat([5.0, 40.0], 3)  # [m/s^2, rad/s^2] what may happen to its speed meanwhile
-_UNSEEN_M_S2, _ARM_M = 1.5, 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
+_ARM_M = 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
 _SCALE: Float = np.array([1.0] * 3 + [_ARM_M] * 3)
-_POSES = 16
 _SIX, _TWELVE = np.arange(6), np.arange(12)
 
 
@@ -36,7 +35,8 @@ class Trajectory:
     """
 
     def __init__(self) -> None:
-        self._known: deque[_Known] = deque(maxlen=_POSES)
+        poses = 16
+        self._known: deque[_Known] = deque(maxlen=poses)
         self._sure_ns = -(2**63)
 
     def __bool__(self) -> bool:
@@ -121,5 +121,6 @@ def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) ->
     size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
     unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
     cov = fitted.cov.copy()
-    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
+    unseen_m_s2 = 1.5  # how it moves unseen, a turn counting by what it does a decimetre away
+    cov[:6, :6] += (0.5 * unseen_m_s2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
     return replace(fitted, cov=cov, measured_only=False)

@@ -25,7 +25,7 @@ from master.fabrik.sync import SILENT_FRAMES
 from master.objects.features import Features
 
 _PERIOD_NS = 16_666_667  # until it is measured from frames
-_DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
+_DEADLINE = 1.25  # periods
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +228,8 @@ class Windows:
         while self._pending:
             t_ns = self._pending[0]
             period_ns = max(self._period_ns)
-            due = self._newest_ns - t_ns > (_TAG_DEADLINE if tagged else _DEADLINE) * period_ns
+            tag_deadline = 2.25  # periods
+            due = self._newest_ns - t_ns > (tag_deadline if tagged else _DEADLINE) * period_ns
             if not (flush or due or all(self._complete(c, t_ns, tagged) for c in range(len(self._names)))):
                 break
             self._pending.popleft()

@@ -17,11 +17,9 @@ from common.hand.model import WRIST, HandModel
 from common.hand.wrist_joint import forearm_palm
 from master.outputs.poses import Poses
 
-_CORNERS = 24
 _ELBOW = np.array(
     [0.0, 0.0, -1.0]
 )  # along the forearm, in its own axes: the fingers of a straight hand go along z
-_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,8 +72,10 @@ class DevicePlace:
 
         Where these ends are at 2 sigma of the wrist's flexion; NaN: not known.
         """
-        angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+        corners = 24
+        angle = np.linspace(0.0, 2.0 * np.pi, corners)
         around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        wrist_angles = self.wrist_angles_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
+        sigmas = 2.0
+        wrist_angles = self.wrist_angles_rad[:, None] + sigmas * self.sigma_rad[:, None] * around
         forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(wrist_angles), 2, 3)
         return self.wrist_m[:, None] + length_m * (forearm @ _ELBOW)

@@ -16,11 +16,8 @@ from common.hand.model import FINGER_JOINTS, WRIST
 
 Pixels = npt.NDArray[np.float32]
 
-_STEP = 0.12  # of a radius, between swept spheres: ripples stay far below a pixel
 _LIGHT = np.array([-0.45, -0.6, -0.66], np.float32)
-_WRIST_SHARE = 0.75  # a wrist is flat: half its width would make a ball of it
 _WEBS = ((1, 2), (2, 3), (3, 4))  # neighbouring fingers whose metacarpals the palm spans
-_WEB_STEPS = 28
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,15 +71,17 @@ def render_hand(view: View, position_m: Float, radius_m: Float) -> tuple[Pixels,
 def _spheres(position_m: Float, radius_m: Float) -> Float:
     """Centres and radii (N, 4) [m] that fill the hand."""
     joints = np.column_stack([position_m, radius_m])
-    joints[WRIST, 3] *= _WRIST_SHARE
+    wrist_share = 0.75  # a wrist is flat: half its width would make a ball of it
+    joints[WRIST, 3] *= wrist_share
     segments = [(joints[a], joints[b]) for chain in FINGER_JOINTS for a, b in pairwise(chain)]
+    web_steps = 28
     for left, right in _WEBS:
         a, b = joints[list(FINGER_JOINTS[left][:2])], joints[list(FINGER_JOINTS[right][:2])]
-        segments += [tuple((1 - t) * a + t * b) for t in np.linspace(0.0, 1.0, _WEB_STEPS)[1:-1]]
+        segments += [tuple((1 - t) * a + t * b) for t in np.linspace(0.0, 1.0, web_steps)[1:-1]]
     # The ball of the thumb spans from the lower part of the thumb's metacarpal to that of the index finger's.
     thumb, index = joints[list(FINGER_JOINTS[0][:2])], joints[list(FINGER_JOINTS[1][:2])]
     thumb, root = (np.stack([bone[0], 0.45 * bone[0] + 0.55 * bone[1]]) for bone in (thumb, index))
-    segments += [tuple((1 - t) * thumb + t * root) for t in np.linspace(0.0, 1.0, _WEB_STEPS)[1:-1]]
+    segments += [tuple((1 - t) * thumb + t * root) for t in np.linspace(0.0, 1.0, web_steps)[1:-1]]
     segments += [(joints[WRIST], joints[chain[0]]) for chain in FINGER_JOINTS]
     swept = [_sweep(a, b) for a, b in segments if np.isfinite(a + b).all()]
     return np.concatenate(swept) if swept else np.empty((0, 4))
@@ -91,7 +90,8 @@ def _spheres(position_m: Float, radius_m: Float) -> Float:
 def _sweep(a: Float, b: Float) -> Float:
     """Spheres (N, 4) from `a` to `b`, radius changing evenly."""
     length = float(np.linalg.norm(b[:3] - a[:3]))
-    count = 2 + int(length / (_STEP * max(min(a[3], b[3]), 1e-3)))
+    step = 0.12  # of a radius, between swept spheres: ripples stay far below a pixel
+    count = 2 + int(length / (step * max(min(a[3], b[3]), 1e-3)))
     t = np.linspace(0.0, 1.0, count)[:, None]
     return (1 - t) * a + t * b
 

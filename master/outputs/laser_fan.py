@@ -12,7 +12,6 @@ from master.rig.wrist import WristSetup
 
 LASER_RGB: Rgb = (235, 64, 52)
 _FAN_RAD = np.radians(105.0)  # of the laser line of Digits, where the rig does not specify it
-_RAYS = 22  # about every 5 degrees
 _REACH_M = (0.06, 0.12, 0.18)  # arcs; the fingers of a large hand end within the last
 
 
@@ -29,7 +28,8 @@ def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
     ahead /= np.linalg.norm(ahead)
     across = np.cross(setup.normal, ahead)
     half = (_FAN_RAD if laser is None or laser.fan_rad is None else laser.fan_rad) / 2.0
-    angles = np.linspace(-half, half, _RAYS)[:, None]
+    rays = 22  # about every 5 degrees
+    angles = np.linspace(-half, half, rays)[:, None]
     return np.cos(angles) * ahead + np.sin(angles) * across
 
 

@@ -38,16 +38,9 @@ WIDTH_PX, HEIGHT_PX = 1600, 900
 _DPI = 100
 _HAND_BOX = (0.19, 0.0, 0.43, 0.87)  # left, bottom, width, height of the figure
 _HAND_BOX_ABOVE = (0.19, 0.205, 0.43, 0.665)  # a strip of gestures
-_FILL = 0.90  # share of the box that the hand may take
 _SKIN = np.array([1.0, 0.79, 0.67])
 _YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
 _WRIST_YAW, _WRIST_PITCH = np.deg2rad(30.0), np.deg2rad(58.0)
-_LINE, _HALF_LINE = (
-    52,
-    36,
-)  # letters of what was tracked that fit in one line beside eight figures, and beside more
-_MOST_FIGURES = 10
-_FIGURE_STEP, _FIGURE_STEP_NARROW = 0.0845, 0.0735  # of the width, between eight figures and between more
 # Key figures of the summary, in the order of importance: key, label, format.
 _FIGURES = (
     ("poses_per_s", "poses / s", "{:.1f}"),
@@ -137,8 +130,9 @@ def _header(
     summary: Mapping[str, float],
 ) -> None:
     figure.text(0.018, 0.948, "Phalanx", color=INK, size=25, weight="bold", va="center")
+    most_figures = 10
     shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary][
-        :_MOST_FIGURES
+        :most_figures
     ]
     many = len(shown) > 8
     wrist_rigs = [wrist.rig] if wrist is not None and wrist.in_rig else []
@@ -149,12 +143,16 @@ def _header(
     )
     hand = f"hand {model.profile.name} ({model.profile.side})"
     watched = f"{rigs} · {cameras}"
-    if len(watched) > _HALF_LINE:
+    # letters of what was tracked that fit in one line beside eight figures, and beside more
+    line, half_line = 52, 36
+    if len(watched) > half_line:
         watched = f"{rigs}\n{cameras}"
-    what = watched + (" · " if len(watched + hand) <= _LINE and not many else "\n") + hand
+    what = watched + (" · " if len(watched + hand) <= line and not many else "\n") + hand
     figure.text(0.019, 0.925, what, color=INK, alpha=0.75, size=12, va="top")
     for i, (label, value) in enumerate(reversed(shown)):
-        x = 0.945 - i * (_FIGURE_STEP_NARROW if many else _FIGURE_STEP)
+        # of the width, between eight figures and between more
+        figure_step, figure_step_narrow = 0.0845, 0.0735
+        x = 0.945 - i * (figure_step_narrow if many else figure_step)
         figure.text(x, 0.949, value, color=INK, size=21, weight="bold", ha="center", va="center")
         figure.text(x, 0.905, label, color=INK, alpha=0.75, size=9 if many else 10, ha="center", va="center")
 
@@ -225,7 +223,8 @@ def fit_view(at: Float, rotation: Float, box: tuple[float, float, float, float] 
     low, high = np.nanmin(rotated, axis=0), np.nanmax(rotated, axis=0)
     margin_m = 0.027  # of flesh around the joints
     span = high - low + 2 * margin_m
-    scale = _FILL * min(width / span[0], height / span[1])
+    fill = 0.90  # share of the box that the hand may take
+    scale = fill * min(width / span[0], height / span[1])
     return View(rotation, (low + high) / 2 @ rotation, float(scale), width, height)
 
 

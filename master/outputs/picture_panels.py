@@ -18,10 +18,7 @@ Colour = tuple[float, float, float]
 PAPER: Colour = (0.075, 0.09, 0.115)
 INK: Colour = (0.90, 0.92, 0.94)
 _PANEL: Colour = (0.105, 0.125, 0.155)
-_LEFT, _WIDTH, _HEIGHT = 0.655, 0.33, 0.205
 _BOTTOMS = (0.63, 0.345, 0.06)
-_PIP = 2
-_LABEL_WIDTH = 0.22  # of a panel
 
 
 def unit(rgb: Rgb) -> Colour:
@@ -45,7 +42,8 @@ def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth:
 
     A thin line marks the row that is shown as a hand.
     """
-    boxes = [figure.add_axes((_LEFT, bottom, _WIDTH, _HEIGHT)) for bottom in _BOTTOMS]
+    left, width, height = 0.655, 0.33, 0.205
+    boxes = [figure.add_axes((left, bottom, width, height)) for bottom in _BOTTOMS]
     seconds = (poses.t_ns - poses.t_ns[0]).astype(np.float64) * 1e-9
     _angles(boxes[0], poses, seconds, model)
     if truth is not None:
@@ -65,10 +63,11 @@ def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth:
 
 def _angles(axes: Axes, poses: Poses, seconds: Float, model: HandModel) -> None:
     style(axes, "PIP angle [deg]")
-    degrees = np.rad2deg(poses.angles_rad[:, :, _PIP])
+    pip = 2
+    degrees = np.rad2deg(poses.angles_rad[:, :, pip])
     for finger, name in enumerate(FINGERS):
         axes.plot(seconds, degrees[:, finger], color=unit(series_rgb(finger)), lw=1.5, label=name)
-    top = float(np.rad2deg(model.limits_rad[1, _PIP, 1]))
+    top = float(np.rad2deg(model.limits_rad[1, pip, 1]))
     axes.set_ylim(-15.0, top + 22.0)
     axes.axhline(top, color=INK, lw=0.9, ls=":", alpha=0.7)
     axes.text(0.995, top + 1.5, "limit", color=INK, size=9, ha="right", va="bottom", alpha=0.8,
@@ -117,8 +116,9 @@ def _histogram(axes: Axes, values: Float, title: str, what: str) -> None:
     heights = axes.hist(shown, bins=bins, range=(0.0, top), color=unit(series_rgb(1)), alpha=0.85)[0]
     axes.set_ylim(0.0, 1.2 * float(np.max(heights)))
     axes.set_xlim(0.0, top)
+    label_width = 0.22  # of a panel
     # Near the axis there is no room on the left; on the right the two would meet, so one stands lower.
-    side, height = ("right", 0.97) if middle > _LABEL_WIDTH * top else ("left", 0.86)
+    side, height = ("right", 0.97) if middle > label_width * top else ("left", 0.86)
     for value, name, ha, y in ((middle, "p50", side, height), (tail, "p99", "left", 0.97)):
         axes.axvline(float(value), color=unit(series_rgb(0)), lw=1.4)
         gap = 4 if ha == "left" else -4

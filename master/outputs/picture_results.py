@@ -25,11 +25,6 @@ from master.outputs.result_files import Contacts, ObjectPoses
 STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the figure
 _NEAR_NS = 60_000_000  # an object is shown where it was this close to the time shown
 _LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
-_TAP_S = 0.15
-_LETTER_SHARE = 0.0135  # of the strip's length that a letter takes
-_EDGED_SHARE = 0.01  # of it: what is shorter would be all edge
-_LANES_OF_TWO_LINES = 3  # at most, else names have one line
-_LETTERS_LEAST = 3  # of a name that is cut off
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
 
@@ -120,21 +115,25 @@ class ResultPicture:
         for lane, kind in enumerate(reversed(lanes)):
             for name, start_ns, stop_ns in spans(self.gestures, kind, int(t_ns[-1])):
                 start, length = (start_ns - first) * 1e-9, (stop_ns - start_ns) * 1e-9
-                colour, edged = unit(GESTURE_RGB[kind]), length > _EDGED_SHARE * span
+                edged_share = 0.01  # of it: what is shorter would be all edge
+                colour, edged = unit(GESTURE_RGB[kind]), length > edged_share * span
+                tap_s = 0.15
                 axes.broken_barh(
-                    [(start, max(length, _TAP_S))],
+                    [(start, max(length, tap_s))],
                     (lane - 0.38, 0.76),
                     fc=colour,
                     ec=PAPER if edged else colour,
                     lw=0.8,
                 )
-                letters = len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span))
-                words = _words(name if len(lanes) > _LANES_OF_TWO_LINES else name.replace("_", "\n"), letters)
+                letter_share = 0.0135  # of the strip's length that a letter takes
+                letters = len(name) if kind == "tap" else int(length / (letter_share * span))
+                lanes_of_two_lines = 3  # at most, else names have one line
+                words = _words(name if len(lanes) > lanes_of_two_lines else name.replace("_", "\n"), letters)
                 key = kind == "tap"
-                thin = key and _TAP_S < _LETTER_SHARE * span
+                thin = key and tap_s < letter_share * span
                 axes.text(
                     start
-                    + (_TAP_S if thin else 0.5 * _TAP_S if key else 0.0)
+                    + (tap_s if thin else 0.5 * tap_s if key else 0.0)
                     + (0.0 if key and not thin else 0.004 * span),
                     lane,
                     words,
@@ -196,7 +195,8 @@ def _words(name: str, letters: int) -> str:
     Empty where the shortened name would be meaningless.
     """
     lines = name.split("\n")
-    if letters < min(max(map(len, lines)), _LETTERS_LEAST):
+    letters_least = 3  # of a name that is cut off
+    if letters < min(max(map(len, lines)), letters_least):
         return ""
     return "\n".join(line[:letters] for line in lines)
 

@@ -30,7 +30,6 @@ from master.rig.wrist import WristSetup
 
 _BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
 _FOREARM_M = 0.055  # of it
-_BRIGHT = 200.0  # level of the brightest skin as shown: such frames are dark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +131,8 @@ class WristPicture:
         axes.set_ylim(self.camera.height_px - 0.5, -0.5)
         if self.frame is not None:
             top = max(float(np.percentile(self.frame, 99.5)), 1.0)
-            bright = np.clip(self.frame * (_BRIGHT / 255.0 / top), 0.0, 1.0)
+            # level of the brightest skin as shown: such frames are dark
+            bright = np.clip(self.frame * (200.0 / 255.0 / top), 0.0, 1.0)
             axes.imshow(bright, cmap="gray", vmin=0.0, vmax=1.0, interpolation="bilinear")
         at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
         seen = self.camera.project(at)

@@ -9,7 +9,6 @@ from common.clock import now_ns
 from common.errors import BusError
 from common.messages import Command
 
-PERIOD_S = 2.0  # a camera shows itself for 3 s after each request
 TIMEOUT_S = 0.9
 
 _log = logging.getLogger(__name__)
@@ -26,7 +25,8 @@ class PictureAsker:
         bus: Bus,
         cameras: Iterable[str],
         verb: str = "preview",
-        period_s: float = PERIOD_S,
+        # a camera shows itself for 3 s after each request
+        period_s: float = 2.0,
         notify: Callable[[str], None] = _log.info,
     ) -> None:
         """Begin to ask.

@@ -38,13 +38,6 @@ from master.rig.setup import RigSetup
 Mode = Literal["spawn", "web", "save"]
 
 _APPLICATION = "phalanx"
-_BATCH_S = 0.033  # poses shown together: one redraw of a 30 Hz screen
-_IDLE_S = 0.1
-_FLUSH_PERIOD_NS = 1_000_000_000
-_FLUSH_TIMEOUT_S = 5.0
-_DEPTH = 256
-_PREVIEW_DEPTH = 16
-_ROWS_A_CHUNK = 512
 
 _log = logging.getLogger(__name__)
 _Kind = TypeVar("_Kind", bound=Message)
@@ -61,11 +54,13 @@ class _Subscribers:
 
     @classmethod
     def of(cls, bus: Bus) -> "_Subscribers":
+        depth = 256
+        preview_depth = 16
         return cls(
-            bus.subscribe("hand", depth=_DEPTH),
-            tuple(bus.subscribe(stream, depth=_DEPTH) for stream in ("object", "contact", "gesture")),
-            bus.subscribe("health", depth=_DEPTH),
-            bus.subscribe("preview", depth=_PREVIEW_DEPTH),
+            bus.subscribe("hand", depth=depth),
+            tuple(bus.subscribe(stream, depth=depth) for stream in ("object", "contact", "gesture")),
+            bus.subscribe("health", depth=depth),
+            bus.subscribe("preview", depth=preview_depth),
         )
 
     def close(self) -> None:
@@ -145,8 +140,9 @@ def write_rrd(
         recording.send_blueprint(blueprint([setup], live=False, with_truth=truth is not None))
         scene = RerunScene(recording, [setup])
         rest = sorted(results, key=lambda one: one.t_ns)
-        for start in range(0, len(poses), _ROWS_A_CHUNK):
-            stop = min(start + _ROWS_A_CHUNK, len(poses))
+        rows_a_chunk = 512
+        for start in range(0, len(poses), rows_a_chunk):
+            stop = min(start + rows_a_chunk, len(poses))
             scene.log_poses(poses.rows(start, stop), truth.rows(start, stop) if truth is not None else None)
             count = bisect_right(rest, int(poses.t_ns[stop - 1]), key=lambda one: one.t_ns)
             scene.log_results(rest[:count])
@@ -191,7 +187,8 @@ def _pump(
                 scene.log_health(health, at_ns)
             for picture in pictures:
                 scene.log_image(picture.camera, picture.jpeg, picture.t_ns, at_ns)
-        if now_ns() - flush_ns > _FLUSH_PERIOD_NS:
+        flush_period_ns = 1_000_000_000
+        if now_ns() - flush_ns > flush_period_ns:
             # The SDK queues without bound towards a viewer that hangs; one second's data is the bound here.
             _flush(recording)
             flush_ns = now_ns()
@@ -210,14 +207,16 @@ def _waiting(subscriber: Subscription, kind: type[_Kind]) -> list[_Kind]:
 def _drain(hands: Subscription) -> list[HandPose]:
     """Wait for a pose, then take what arrives until the next redraw."""
     batch: list[HandPose] = []
-    end_ns = now_ns() + round(_IDLE_S * 1e9)
+    idle_s = 0.1
+    end_ns = now_ns() + round(idle_s * 1e9)
     while (left_ns := end_ns - now_ns()) > 0:
         message = hands.get(left_ns * 1e-9)
         if message is None:
             break
         if isinstance(message, HandPose):
             if not batch:
-                end_ns = now_ns() + round(_BATCH_S * 1e9)
+                batch_s = 0.033  # poses shown together: one redraw of a 30 Hz screen
+                end_ns = now_ns() + round(batch_s * 1e9)
             batch.append(message)
     return batch
 
@@ -292,7 +291,8 @@ def _flush(recording: rr.RecordingStream) -> None:
         PhalanxError: It is not taken: disk full, or a viewer that hangs.
     """
     try:
-        recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+        flush_timeout_s = 5.0
+        recording.flush(timeout_sec=flush_timeout_s)
     except (RuntimeError, TimeoutError) as error:
         raise PhalanxError(
             f"Rerun does not take the data (disk full, or the viewer hangs): {error}"

@@ -35,11 +35,8 @@ _TABS = 4  # the last so many share one place
 _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
 _EYE_M, _TARGET_M = (0.21, -0.12, 0.0), (0.012, 0.018, 0.36)
-_AROUND_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
 # Of a wrist device: from above the palm and behind the camera, beside the forearm, towards the fingers.
 _WRIST_EYE_M, _WRIST_TARGET_M = (0.17, -0.17, -0.10), (0.0, 0.035, 0.12)
-_CAMERAS_A_ROW = 4
-_PLOT_SPAN_S = 10.0
 
 
 def camera_path(camera: str) -> str:
@@ -62,9 +59,10 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     with_markers = any(setup.has_markers for setup in setups)
     with_wrist = any(setup.has_markers and setup.wrist is not None for setup in setups)
     hidden = [f"- {WORLD}/hand/{setup.hand.profile.name}/uncertainty" for setup in setups]
+    plot_span_s = 10.0
     span = rrb.VisibleTimeRange(
         TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SPAN_S),
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-plot_span_s),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     position, target = (_eye_of(setups), _TARGET_M) if with_markers else (_WRIST_EYE_M, _WRIST_TARGET_M)
@@ -111,10 +109,11 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     lanes = rrb.StateTimelineView(
         origin=STATES, name="Gestures and held objects", time_ranges=span if live else None
     )
+    cameras_a_row = 4
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                scene, rrb.Grid(*views, grid_columns=min(len(views), _CAMERAS_A_ROW)), row_shares=[3, 2]
+                scene, rrb.Grid(*views, grid_columns=min(len(views), cameras_a_row)), row_shares=[3, 2]
             ),
             rrb.Vertical(tabs, *plots[:-_TABS], lanes, row_shares=[1.5] + [1] * (len(plots) - _TABS) + [1.4]),
             column_shares=[3, 2],
@@ -133,7 +132,9 @@ def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
     models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
     reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
-    if reach > _AROUND_M:
+    # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
+    around_m = 0.45
+    if reach > around_m:
         eye = target + 1.5 * reach * (eye - target) / np.linalg.norm(eye - target)
     x, y, z = (float(value) for value in eye)
     return x, y, z

@@ -24,9 +24,8 @@ from master.outputs.palette import GESTURE_RGB, Rgb
 from master.outputs.rerun_blueprint import EVENTS, WORLD
 from master.outputs.rerun_states import States
 
-_DIAL_M, _RAY_M, _LINE_M = 0.045, 0.35, 0.0012
+_LINE_M = 0.0012
 _ARC_STEP_RAD = np.deg2rad(4.0)
-_TAP_NS = 500_000_000
 _LABEL_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
 
 
@@ -51,7 +50,8 @@ class GesturesLayer:
             root = rr.new_entity_path([WORLD, "gestures", one.hand])
             at = joints_m.get((one.hand, one.t_ns), np.full((6, 3), np.nan))
             self._states.at(one.t_ns)
-            if one.t_ns - self._tapped.get(one.hand, one.t_ns) > _TAP_NS:
+            tap_ns = 500_000_000
+            if one.t_ns - self._tapped.get(one.hand, one.t_ns) > tap_ns:
                 del self._tapped[one.hand]
                 self._rec.log(f"{root}/tap", rr.Clear(recursive=True))
             if one.kind == "tap":
@@ -85,8 +85,9 @@ class GesturesLayer:
         elif one.kind == "dial" and np.isfinite(one.direction).all() and np.isfinite(one.origin_m).all():
             self._dial(path, one, colour)
         elif one.kind == "point" and np.isfinite(one.direction).all() and np.isfinite(one.origin_m).all():
+            ray_m = 0.35
             arrow = rr.Arrows3D(
-                origins=[one.origin_m], vectors=[_RAY_M * one.direction], radii=_LINE_M, colors=[colour]
+                origins=[one.origin_m], vectors=[ray_m * one.direction], radii=_LINE_M, colors=[colour]
             )
             self._rec.log(path, arrow)
 
@@ -109,12 +110,13 @@ class GesturesLayer:
         self._rec.log(path, line)
 
     def _dial(self, path: str, one: Gesture, colour: Rgb) -> None:
-        circle = _DIAL_M * arc(one.direction, 2.0 * np.pi) + one.origin_m
+        dial_m = 0.045
+        circle = dial_m * arc(one.direction, 2.0 * np.pi) + one.origin_m
         thin = rr.LineStrips3D([circle], radii=0.4 * _LINE_M, colors=[colour])
         self._rec.log(path, thin)
         if not isfinite(one.angle_rad):
             return
-        rotated = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
+        rotated = dial_m * arc(one.direction, one.angle_rad) + one.origin_m
         strip = np.concatenate([one.origin_m[None], rotated, one.origin_m[None]])
         thick = rr.LineStrips3D(
             [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[label_of(one)], show_labels=True

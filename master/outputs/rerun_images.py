@@ -15,9 +15,6 @@ from common.geometry.camera_model import CameraModel
 from common.recording.picture_size import Size, jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, camera_path
 
-IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
-_JPEG_QUALITY = 80
-
 
 class CameraImages:
     """Logger of images to `recording`, which belongs to the caller.
@@ -48,7 +45,8 @@ class CameraImages:
             Whether it was logged.
         """
         last = self._last_ns.get(camera)
-        if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
+        image_period_ns = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
+        if last is not None and 0 <= t_ns - last < image_period_ns:
             return False
         model = self._models.get(camera)
         size = _size(image)
@@ -58,7 +56,8 @@ class CameraImages:
         if isinstance(image, bytes):
             jpeg = image
         else:
-            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+            jpeg_quality = 80
+            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()
         path = f"{camera_path(camera)}/image"
         if self._size.get(camera) != size:
             # The pinhole and all centroids are in pixels of the camera; a preview has fewer.

@@ -30,11 +30,7 @@ from master.outputs.rerun_blueprint import WORLD
 from master.outputs.rerun_columns import Columns, seen
 from master.outputs.rerun_states import States
 
-_NEAR_M = 0.03  # of a finger that is shown beside an object
-_LINE_M, _SPOT_M, _TOUCH_M = 0.0006, 0.002, 0.0045
-_TAG_CELL_PX = 8  # of a tag's texture, so that its edges stay sharp
 _UNKNOWN = np.full((5, 3), np.nan)
-_LIFT_M = 3e-4  # a tag lies on its face, not in it
 
 
 @dataclass(slots=True)
@@ -98,9 +94,11 @@ class ObjectsLayer:
                 np.array([one.point_m for one in own]),
             )
             touching = np.array([one.touching for one in own])
-            near = seen(point) & (distance < _NEAR_M)
+            near_m = 0.03  # of a finger that is shown beside an object
+            near = seen(point) & (distance < near_m)
             colours = pack([TOUCH_RGB[False], TOUCH_RGB[True]])[touching.astype(np.int64)]
-            radii = np.where(touching, _TOUCH_M, _SPOT_M)[near]
+            spot_m, touch_m = 0.002, 0.0045
+            radii = np.where(touching, touch_m, spot_m)[near]
             self._rows.points(f"{root}/points", t, point, near, colours, radii)
             tips = np.array([tips_m.get((hand, one.t_ns), _UNKNOWN)[:5] for one in own])
             self._gaps(
@@ -124,8 +122,9 @@ class ObjectsLayer:
         """Lines (T, 5, 2, 3) that are `shown` (T, 5), each with its distance beside it."""
         strips = list(lines[shown])
         labels = [f"{value:.0f} mm" for value in (distance_m[shown] * 1e3).tolist()]
+        line_m = 0.0006
         columns = rr.LineStrips3D.columns(
-            strips=strips, radii=np.full(len(strips), _LINE_M), colors=colours[shown], labels=labels
+            strips=strips, radii=np.full(len(strips), line_m), colors=colours[shown], labels=labels
         )
         self._rows.send(path, t_ns, columns, shown.sum(axis=1))
 
@@ -202,10 +201,12 @@ def _tag_mesh(profile: ObjectProfile, number: int) -> rr.Mesh3D:
     assert profile.tags is not None
     tag = next(one for one in profile.tags.tags if one.id == number)
     pose = np.array(tag.T_object_tag)
-    image = np.kron(tag_image(profile.tags.family, tag.id), np.ones((_TAG_CELL_PX, _TAG_CELL_PX), np.uint8))
+    tag_cell_px = 8  # of a tag's texture, so that its edges stay sharp
+    image = np.kron(tag_image(profile.tags.family, tag.id), np.ones((tag_cell_px, tag_cell_px), np.uint8))
     half = 0.5 * tag.edge_m
+    lift_m = 3e-4  # a tag lies on its face, not in it
     corners = np.array(
-        [[-half, half, _LIFT_M], [half, half, _LIFT_M], [half, -half, _LIFT_M], [-half, -half, _LIFT_M]]
+        [[-half, half, lift_m], [half, half, lift_m], [half, -half, lift_m], [-half, -half, lift_m]]
     )
     return rr.Mesh3D(
         vertex_positions=corners @ pose[:3, :3].T + pose[:3, 3],

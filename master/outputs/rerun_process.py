@@ -24,8 +24,6 @@ from common.errors import PhalanxError
 LOOPBACK = "127.0.0.1"
 VIEWER_MEMORY = "1GB"  # the viewer drops its oldest data beyond it
 SERVER_MEMORY = "256MB"
-_START_TIMEOUT_NS = 15_000_000_000
-_END_TIMEOUT_S = 5.0
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _FIX = "without a display use --web or --save FILE.rrd; a busy port needs another one"
 
@@ -105,7 +103,8 @@ class ViewerProcess:
         if self.alive():
             self._child.terminate()
             try:
-                self._child.wait(_END_TIMEOUT_S)
+                end_timeout_s = 5.0
+                self._child.wait(end_timeout_s)
             except subprocess.TimeoutExpired:
                 self._child.kill()
                 self._child.wait()
@@ -132,7 +131,8 @@ class ViewerProcess:
             raise PhalanxError(f"the viewer ended (exit {self._child.returncode}): {last[0]}; {_FIX}")
 
     def _wait_for(self, port: int) -> None:
-        end_ns = now_ns() + _START_TIMEOUT_NS
+        start_timeout_ns = 15_000_000_000
+        end_ns = now_ns() + start_timeout_ns
         while now_ns() < end_ns:
             self.check()
             try:
@@ -141,7 +141,7 @@ class ViewerProcess:
             except OSError:
                 time.sleep(0.05)
         raise PhalanxError(
-            f"the viewer does not listen on {LOOPBACK}:{port} after {_START_TIMEOUT_NS // 10**9} s"
+            f"the viewer does not listen on {LOOPBACK}:{port} after {start_timeout_ns // 10**9} s"
         )
 
 

@@ -18,7 +18,6 @@ from master.outputs.rerun_objects import ObjectsLayer
 from master.outputs.rerun_states import States
 
 _NAMED = [*TIPS.tolist(), PALM]
-_REMEMBERED = 1024  # poses
 
 
 class ResultLayer:
@@ -39,7 +38,8 @@ class ResultLayer:
         """Take the poses of a hand, before the results that refer to them."""
         at = np.where(poses.valid[..., None], poses.position_m, np.nan)[:, _NAMED]
         self._joints |= {(poses.hand, t): row for t, row in zip(poses.t_ns.tolist(), at, strict=True)}
-        for old in list(self._joints)[: -max(_REMEMBERED, len(poses))]:
+        remembered = 1024  # poses
+        for old in list(self._joints)[: -max(remembered, len(poses))]:
             del self._joints[old]
 
     def log(self, results: Sequence[ResultMessage]) -> None:

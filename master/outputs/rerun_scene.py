@@ -54,13 +54,8 @@ _STRIP_SOURCE = (*TIPS.tolist(), WRIST)
 _HINGE_OF_ANGLE = np.array(
     [[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS]
 )  # joint that angle (5, 4) turns
-_PIP = 2
-_MARKER_PX, _DETECTED_PX = 3.0, 4.0
-_ELLIPSE_LINE_M = 0.0002
-_LARGEST_M = 0.03  # half axis of the largest ellipsoid shown
-_JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
 _AT_LIMIT_RAD = np.deg2rad(0.5)
-_FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0004, 0.01
+_FRUSTUM_LINE_M = 0.0004
 
 
 class RerunScene:
@@ -154,7 +149,8 @@ class RerunScene:
         uv = np.array([frame.uv for frame in markers])
         colours = np.broadcast_to(_marker_colours(uv.shape[1]), uv.shape[:2])
         t_ns = np.array([frame.t_ns for frame in markers], np.int64)
-        self._rows.pixels(f"{camera_path(markers[0].camera)}/detections", t_ns, uv, colours, _DETECTED_PX)
+        detected_px = 4.0
+        self._rows.pixels(f"{camera_path(markers[0].camera)}/detections", t_ns, uv, colours, detected_px)
 
     def log_image(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
         """Show an image of a camera; see `CameraImages.log`."""
@@ -186,15 +182,16 @@ class RerunScene:
     def _log_lens(self, name: str, model: CameraModel) -> None:
         matrix = model.matrix.copy()
         matrix[:2, 2] += PIXEL_CENTRE
+        frustum_m, axes_m = 0.06, 0.01
         pinhole = rr.Pinhole(
             image_from_camera=matrix,
             resolution=(model.width_px, model.height_px),
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=_FRUSTUM_M,
+            image_plane_distance=frustum_m,
             color=TRUTH_RGB,
             line_width=_FRUSTUM_LINE_M,
         )
-        self._rec.log(camera_path(name), rr.TransformAxes3D(_AXES_M), pinhole, static=True)
+        self._rec.log(camera_path(name), rr.TransformAxes3D(axes_m), pinhole, static=True)
 
     def _group(self, hand: str) -> str:
         """What stands behind a group's path for the entities of a hand."""
@@ -215,7 +212,8 @@ class RerunScene:
             shown.sum(axis=1),
         )
         colours = np.where(poses.tracked, colours, dim(colours))
-        radii = (poses.radius_m * _JOINT_SHOWN)[valid]
+        joint_shown = 0.45  # of its radius, so that the bones stay visible
+        radii = (poses.radius_m * joint_shown)[valid]
         self._rows.points(f"{root}/joints", poses.t_ns, at, valid, colours, radii)
         limit = _at_limit(poses.angles_rad, hand) & valid
         red = np.full(limit.shape, pack([LIMIT_RGB])[0])
@@ -225,8 +223,9 @@ class RerunScene:
     def _log_uncertainty(self, path: str, poses: Poses) -> None:
         cov = poses.cov_m2[:, TIPS]
         known = np.isfinite(cov).all(axis=(-1, -2)) & poses.valid[:, TIPS]
+        largest_m = 0.03  # half axis of the largest ellipsoid shown
         # A cloud larger than the fingers would hide the hand; what is that uncertain is seen by its colour.
-        known[known] &= np.linalg.eigvalsh(cov[known])[:, -1] <= (_LARGEST_M / 2.0) ** 2
+        known[known] &= np.linalg.eigvalsh(cov[known])[:, -1] <= (largest_m / 2.0) ** 2
         variance, axes = np.linalg.eigh(cov[known])
         axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a mirror image is no rotation
         wxyz = matrix_to_quaternion(axes)
@@ -237,7 +236,8 @@ class RerunScene:
             colors=np.full(known.sum(), pack([TRUTH_RGB])[0]),
         )
         if path not in self._styled:
-            style = rr.Ellipsoids3D.from_fields(fill_mode="MajorWireframe", line_radii=_ELLIPSE_LINE_M)
+            ellipse_line_m = 0.0002
+            style = rr.Ellipsoids3D.from_fields(fill_mode="MajorWireframe", line_radii=ellipse_line_m)
             self._rec.log(path, style, static=True)
             self._styled.add(path)
         self._rows.send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
@@ -255,7 +255,8 @@ class RerunScene:
                 f"{path}{group}", poses.t_ns, model.centre, raw, int(pack([RAY_RGB], alpha=110)[0])
             )
             uv = model.project(raw)
-            self._rows.pixels(f"{camera_path(name)}/markers{group}", poses.t_ns, uv, colours, _MARKER_PX)
+            marker_px = 3.0
+            self._rows.pixels(f"{camera_path(name)}/markers{group}", poses.t_ns, uv, colours, marker_px)
 
     def _log_plots(self, poses: Poses, setup: RigSetup) -> None:
         t, group = poses.t_ns, self._group(poses.hand)
@@ -267,7 +268,8 @@ class RerunScene:
             name = setup.markers[m] if m < len(setup.markers) else f"marker-{m}"
             self._rows.scalars(f"plots/jitter_mm{group}{rr.new_entity_path([name])}", t, step[:, m])
         for f, name in enumerate(FINGERS):
-            self._rows.scalars(f"plots/pip_deg{group}/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
+            pip = 2
+            self._rows.scalars(f"plots/pip_deg{group}/{name}", t, np.rad2deg(poses.angles_rad[:, f, pip]))
         self._rows.scalars(
             f"plots/seen{group}/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64)
         )

@@ -35,12 +35,8 @@ from master.outputs.rerun_blueprint import WORLD, camera_path
 from master.outputs.rerun_columns import Columns, seen
 from master.rig.wrist import WristSetup
 
-_FAN_LINE_M, _BONE_M = 0.0003, 0.0025
-_FOREARM_M = 0.16  # of it, as long as a hand
+_FAN_LINE_M = 0.0003
 _WRIST_ANGLES = ("flexion", "deviation")
-_POINT_M = 0.0025
-_UPRIGHT = 0.98  # cosine of 11 degrees off the vertical
-_DETECTED_PX, _POINT_PX = 4.0, 3.0
 _FINGER_RGB = [series_rgb(finger) for finger in range(FINGER_COUNT)]
 
 
@@ -95,13 +91,15 @@ class WristLayer:
         else:
             self._log_held(poses)
         colours = np.broadcast_to(pack(_FINGER_RGB), points.shape[:2])
-        self._rows.points(f"{self._laser}/points", t, points, seen(points), colours, _POINT_M)
+        point_m = 0.0025
+        self._rows.points(f"{self._laser}/points", t, points, seen(points), colours, point_m)
         rays, centre = rr.new_entity_path([WORLD, "rays", self._camera]), self._model.centre
         self._rows.rays(f"{rays}/laser", t, centre, points, int(pack([RAY_RGB], alpha=150)[0]))
         tips = np.where(poses.tracked[:, TIPS, None], tips, np.nan)
         self._rows.rays(f"{rays}/tips", t, centre, tips, int(pack([TRUTH_RGB], alpha=90)[0]))
+        point_px = 3.0
         self._rows.pixels(
-            f"{camera_path(self._camera)}/laser", t, self._model.project(points), colours, _POINT_PX
+            f"{camera_path(self._camera)}/laser", t, self._model.project(points), colours, point_px
         )
         self._rows.scalars(
             f"plots/seen{self._group}/laser_points", t, seen(points).sum(axis=1).astype(np.float64)
@@ -121,9 +119,11 @@ class WristLayer:
                 self._rows.send(path, poses.t_ns[known], columns, None)
         root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
         colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
-        self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
+        bone_m = 0.0025
+        forearm_m = 0.16  # of it, as long as a hand
+        self._rows.lines(f"{root}/forearm", t, place.arm_m(forearm_m), colour, bone_m)
         self._rows.lines(
-            f"{root}/forearm_uncertainty", t, place.uncertainty_m(_FOREARM_M), colour, _FAN_LINE_M
+            f"{root}/forearm_uncertainty", t, place.uncertainty_m(forearm_m), colour, _FAN_LINE_M
         )
         for i, name in enumerate(_WRIST_ANGLES):
             self._rows.scalars(
@@ -159,7 +159,8 @@ class WristLayer:
             ("laser", np.array([frame.laser_uv for frame in frames])),
             ("tips", np.array([frame.tip_uv for frame in frames])),
         ):
-            self._rows.pixels(f"{path}/{name}", t, uv, colours, _DETECTED_PX)
+            detected_px = 4.0
+            self._rows.pixels(f"{path}/{name}", t, uv, colours, detected_px)
 
 
 def _level(world_camera: Float) -> Float:
@@ -168,7 +169,8 @@ def _level(world_camera: Float) -> Float:
     Ahead is where the camera looks, or its image's top where it looks up.
     """
     up = np.array([0.0, 0.0, 1.0])
-    along = world_camera[:, 2] if abs(world_camera[2, 2]) < _UPRIGHT else -world_camera[:, 1]
+    upright = 0.98  # cosine of 11 degrees off the vertical
+    along = world_camera[:, 2] if abs(world_camera[2, 2]) < upright else -world_camera[:, 1]
     ahead = along - (along @ up) * up
     ahead /= np.linalg.norm(ahead)
     return np.stack([np.cross(ahead, up), -up, ahead])

@@ -19,10 +19,6 @@ from common.bus.bus import Bus
 from common.errors import RecordingError
 from master.rig.files import RigFiles
 
-READY_S = 60.0  # Python, numpy and the bus on a busy machine
-_END_S = 20.0
-_STEP_S = 0.05
-
 
 class RecorderProcess:
     """A running recorder.
@@ -61,7 +57,8 @@ class RecorderProcess:
         self._thread = threading.Thread(target=self._listen, name="recorder lines", daemon=True)
         self._thread.start()
 
-    def wait_ready(self, bus: Bus, timeout_s: float = READY_S) -> None:
+    # Python, numpy and the bus on a busy machine
+    def wait_ready(self, bus: Bus, timeout_s: float = 60.0) -> None:
         """Wait until the recorder receives all that is published from here on.
 
         Raises:
@@ -77,7 +74,8 @@ class RecorderProcess:
             if time.monotonic() > deadline:
                 self.close()
                 raise RecordingError(f"{self._path}: the recorder was not ready within {timeout_s:g} s")
-            time.sleep(_STEP_S)
+            step_s = 0.05
+            time.sleep(step_s)
 
     def close(self) -> None:
         """Let the recorder write pending messages and end its file.
@@ -87,7 +85,8 @@ class RecorderProcess:
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
-            code = self._process.wait(_END_S)
+            end_s = 20.0
+            code = self._process.wait(end_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             code = self._process.wait()

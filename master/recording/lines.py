@@ -13,7 +13,6 @@ from common.recording.messages import MessageRecording
 from master.recording.recorder import Progress
 
 RAW_FOLDERS = msgspec.json.Decoder(dict[str, str])
-PLAIN_EVERY = 5  # calls, where no terminal shows the line in place
 
 
 class ProgressLine:
@@ -30,9 +29,10 @@ class ProgressLine:
     def show(self, text: str) -> None:
         """It goes on; called once a second."""
         self._calls += 1
+        plain_every = 5  # calls, where no terminal shows the line in place
         if self._stream.isatty():
             self._write(f"\r{self._prefix}: {text}\x1b[K")
-        elif self._calls % PLAIN_EVERY == 0:
+        elif self._calls % plain_every == 0:
             self._write(f"{self._prefix}: {text}\n")
 
     def end(self, text: str) -> None:

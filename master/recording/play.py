@@ -30,8 +30,6 @@ from master.recording.files import recorded_setups
 from master.recording.player import Passed, Player
 from master.recording.probe import Probe
 
-_REPORT_S = 1.0
-
 
 @dataclass(frozen=True, slots=True)
 class PlaySettings:
@@ -242,8 +240,9 @@ class _Host:
 
     def _report(self) -> None:
         poses = self._player.poses
-        while not self._closing.wait(_REPORT_S):
-            self._rate, poses = (self._player.poses - poses) / _REPORT_S, self._player.poses
+        report_s = 1.0
+        while not self._closing.wait(report_s):
+            self._rate, poses = (self._player.poses - poses) / report_s, self._player.poses
             if self._bus is not None:
                 self._bus.publish("health", MASTER, self.health())
             self._show(self.position_s, self.length_s)

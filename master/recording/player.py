@@ -29,9 +29,6 @@ from master.run.load_shedding import LoadShedding, Shedding
 from master.run.stages import StageTimes
 from master.run.tuning import LivePipeline
 
-SETTLE_NS = 2_000_000_000
-GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
-_STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
 AUXILIARY = ("health", "checklist", "preview", "still")  # published again as they were
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
@@ -203,7 +200,8 @@ class Player:
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
         streams = (*AUXILIARY, *(SOLVED if self._solved else ("taken",)))
-        for one in self._recording.read(streams, start_ns - SETTLE_NS, self.last_ns):
+        settle_ns = 2_000_000_000
+        for one in self._recording.read(streams, start_ns - settle_ns, self.last_ns):
             silent = one.t_ns < start_ns
             if not silent and not self._due(one.t_ns):
                 return False
@@ -231,12 +229,17 @@ class Player:
                 wait_s = self._clock.wait_s(t_ns, now_ns())
                 if wait_s == 0.0:
                     return True
-                if wait_s is not None and (gap_ns := t_ns - self._clock.position_ns(now_ns())) > GAP_NS:
+                # longer than that nobody waits for the next message
+                if (
+                    wait_s is not None
+                    and (gap_ns := t_ns - self._clock.position_ns(now_ns())) > 600_000_000_000
+                ):
                     at_s = (self.at_ns - self._recording.begin_t_ns) * 1e-9
                     self._print_events([f"at {at_s:.1f} s nothing comes for {gap_ns * 1e-9:.0f} s: skipped"])
                     self._clock.seek(t_ns, now_ns())
                     return True
-                self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
+                step_s = 60.0  # of a wait, whatever the speed; a change ends it
+                self._changed.wait(None if wait_s is None else min(wait_s, step_s))
             return False
 
     def _results_of(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[ResultMessage]:

@@ -22,10 +22,8 @@ from master.outputs.devices import Taking
 from master.run.load_shedding import LoadShedding
 
 LEASE_NS = 3_000_000_000
-CAPACITY = 20_000  # messages, some seconds
 _DRAIN_S = 5.0
 _STEP_S = 0.01
-_TOGETHER_S = 0.2  # to wake a thread and a link for each message would cost several times as much
 
 ReceivedT = TypeVar("ReceivedT", bound=Message)
 
@@ -90,7 +88,8 @@ class Probe:
 
     def _put(self, message: Message) -> None:
         self._shown += 1
-        if len(self._queue) >= CAPACITY:
+        capacity = 20_000  # messages, some seconds
+        if len(self._queue) >= capacity:
             self._dropped += 1
         else:
             self._queue.append(message)  # nobody is woken: the thread looks by itself
@@ -144,7 +143,8 @@ class Probe:
                 if self._closed or not (self._always or self._until_ns or self._queue):
                     self._thread = None
                     return
-            self._load_shedding.wait(_STEP_S if self._load_shedding.is_set() else _TOGETHER_S)
+            together_s = 0.2  # to wake a thread and a link for each message would cost several times as much
+            self._load_shedding.wait(_STEP_S if self._load_shedding.is_set() else together_s)
 
 
 def came_ns(message: Message, now_ns: int) -> int:

@@ -28,10 +28,7 @@ from master.rig.files import RigFiles
 
 NAME = "recorder"
 KEPT = ("taken", "hand", "object", "contact", "gesture", "health", "checklist")
-_STEP_S = 0.1
 _PERIOD_NS = 1_000_000_000
-_DRAIN_S, _OWNED_DRAIN_S = 0.5, 10.0
-_TRIES = 3  # a master that does not answer so often is gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,9 +211,11 @@ class _Run:
 
     def _keep(self, bus: Bus, lease: ProbeLease) -> None:
         missed, due_ns = 0, now_ns()
-        while not self.over and missed < _TRIES:
+        tries = 3  # a master that does not answer so often is gone
+        while not self.over and missed < tries:
             if now_ns() < due_ns:
-                self._stop.wait(_STEP_S)
+                step_s = 0.1
+                self._stop.wait(step_s)
                 continue
             due_ns = max(due_ns + _PERIOD_NS, now_ns())
             try:
@@ -257,8 +256,9 @@ class _Run:
         return self._gone_dropped + sum(now.dropped.values()) + sum(subscriber.values())
 
     def _close_subscriber(self, subscriber: StreamSubscriber) -> None:
+        drain_s, owned_drain_s = 0.5, 10.0
         # One that owns us has stopped, and all that it sent is to be kept; another one goes on without us.
-        subscriber.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
+        subscriber.close(drain_s if self._settings.ready_as is None else owned_drain_s)
         self._gone_lost, self._gone_dropped = (
             self._lost(),
             self._gone_dropped + sum(subscriber.dropped.values()),

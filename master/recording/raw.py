@@ -18,7 +18,6 @@ from common.messages import Command, Health
 from common.messages.raw_wish import RawWish, raw_name, refuse_strange
 
 LEASE_S = 10.0
-_PERIOD_S = 2.0
 _ASK_S = 3.0
 _STOP_S = 30.0  # what waits for a slow disk is written first
 
@@ -48,7 +47,7 @@ class RawAsker:
         cameras: Sequence[str],
         notify: Callable[[str], None],
         keep: Callable[[Health], None],
-        period_s: float = _PERIOD_S,
+        period_s: float = 2.0,
     ) -> None:
         """Nothing is asked yet.
 

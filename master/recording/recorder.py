@@ -22,10 +22,6 @@ from common.errors import RecordingError
 from common.messages import Message, Preview, Still
 from common.recording.messages import MessageWriter
 
-DEPTH = 20_000  # messages that may wait for the disk: some seconds
-PICTURES = 100  # and no picture is taken where so many wait: they would fill the memory
-RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
-_RATE_S = 0.9
 _POLL_S = 0.25  # so often the disk is looked at, and what waits in a chunk given to it
 
 
@@ -62,8 +58,10 @@ class MessageRecorder:
         self,
         writer: MessageWriter,
         folder: Path,
-        reserve_bytes: int = RESERVE_BYTES,
-        depth: int = DEPTH,
+        # a system without any room left cannot even be logged in to
+        reserve_bytes: int = 200_000_000,
+        # messages that may wait for the disk: some seconds
+        depth: int = 20_000,
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
         """Start the thread.
@@ -93,7 +91,8 @@ class MessageRecorder:
 
         Never waits. Any thread may call it.
         """
-        pictures = isinstance(message, Preview | Still) and self._waiting.qsize() >= PICTURES
+        # and no picture is taken where so many wait: they would fill the memory
+        pictures = isinstance(message, Preview | Still) and self._waiting.qsize() >= 100
         if self.failure is None and not self._closing.is_set() and not pictures:
             try:
                 self._waiting.put_nowait((stream, message, t_ns))
@@ -119,7 +118,8 @@ class MessageRecorder:
         with self._lock:
             now, written = time.monotonic(), self._writer.bytes_written
             before, had = self._shown
-            if now - before >= _RATE_S:  # several may ask; nobody shortens the time of another
+            rate_s = 0.9
+            if now - before >= rate_s:  # several may ask; nobody shortens the time of another
                 self._shown, self._bytes_per_s = (now, written), (written - had) / (now - before)
             return Progress(
                 0.0 if self._first_ns is None else (self._last_ns - self._first_ns) * 1e-9,

@@ -14,11 +14,8 @@ from master.recording.probe import came_ns
 from master.recording.recorder import MessageRecorder
 
 DEPTH = {"taken": 20_000, "preview": 32, "still": 32}  # messages that may wait for their thread
-_DEPTH = 5_000
-_QUIET_S = 0.3  # so long nothing has come when all that was sent is there
 _ASK_S = 0.9
 _ANSWERS = 5
-_LONG_NS = 1_000_000_000
 
 
 class MasterClock:
@@ -62,7 +59,8 @@ class StreamSubscriber:
         self._recorder, self._clock = recorder, clock
         self._closing = threading.Event()
         self._end_ns = self._last_ns = 0
-        self._inboxes = {stream: bus.subscribe(stream, depth=DEPTH.get(stream, _DEPTH)) for stream in streams}
+        depth = 5_000
+        self._inboxes = {stream: bus.subscribe(stream, depth=DEPTH.get(stream, depth)) for stream in streams}
         self.received = dict.fromkeys(streams, 0)
         self._threads = [
             threading.Thread(target=self._work, args=(stream, inbox), name=f"record {stream}", daemon=True)
@@ -90,7 +88,8 @@ class StreamSubscriber:
 
     def _work(self, stream: str, inbox: Subscription) -> None:
         while not self._closing.is_set() or now_ns() < self._end_ns:
-            message = inbox.get(_QUIET_S)
+            quiet_s = 0.3  # so long nothing has come when all that was sent is there
+            message = inbox.get(quiet_s)
             if message is not None:
                 self.received[stream] += 1
                 now = self._clock.now_ns()
@@ -108,7 +107,8 @@ class StreamSubscriber:
         None before the one before.
         """
         there = came_ns(message, now_ns)
-        if not 0 <= now_ns - there < _LONG_NS:
+        long_ns = 1_000_000_000
+        if not 0 <= now_ns - there < long_ns:
             there = now_ns  # a master that plays publishes the times of then
         self._last_ns = max(self._last_ns, there)
         return self._last_ns

@@ -16,7 +16,6 @@ from master.run.sequence import CYCLE_FRAMES
 
 # Sigma of detections that state none: of full quality, and added where it is 0.
 _CLEAR_PX, _POOR_PX = 0.1, 0.6
-_LASER_PX, _TIP_PX = 0.5, 3.0  # of a wrist device: some tenths of the line's width, and of a fingertip's
 
 
 def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
@@ -72,11 +71,13 @@ def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
     try:
         t_ns = data["t_ns"].astype(np.int64, casting="same_kind")
         laser, tip = (data[name].astype(np.float64) for name in ("laser_uv", "tip_uv"))
+        # of a wrist device: some tenths of the line's width, and of a fingertip's
+        laser_px, tip_px = 0.5, 3.0
         typical = {
             "seq": CYCLE_FRAMES * np.arange(len(laser)),
-            "laser_sigma_px": _where_seen(laser, _LASER_PX),
+            "laser_sigma_px": _where_seen(laser, laser_px),
             "laser_px": np.full(laser.shape[:2], np.nan),
-            "tip_sigma_px": _where_seen(tip, _TIP_PX),
+            "tip_sigma_px": _where_seen(tip, tip_px),
             "tip_depth": np.full(tip.shape[:2], np.nan),
         }
         rest = {name: data[name] if name in data else typical[name] for name in also}

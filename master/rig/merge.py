@@ -21,7 +21,6 @@ from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matri
 from common.hand.model import HandModel
 
 _ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
-_UNTURNED = 1e-9  # of a rotation matrix that turns nothing
 
 
 def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
@@ -174,7 +173,8 @@ def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | Non
 
 
 def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
-    if volume is None or not np.allclose(T_world_rig[:3, :3], np.eye(3), rtol=0.0, atol=_UNTURNED):
+    unturned = 1e-9  # of a rotation matrix that turns nothing
+    if volume is None or not np.allclose(T_world_rig[:3, :3], np.eye(3), rtol=0.0, atol=unturned):
         return None
     low, high = transform(T_world_rig, np.array([volume.low_m, volume.high_m]))
     return Volume(low_m=_vector(low), high_m=_vector(high))

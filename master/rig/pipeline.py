@@ -36,9 +36,7 @@ from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.rig.setup import RigSetup
 
-_ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
-_BLEND_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
 
 
 class Pipeline(Protocol):
@@ -79,7 +77,8 @@ def _point_filter(setup: RigSetup) -> PointFilter:
 
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
     """The filter of the solved hand, by the same settings."""
-    blend_m_s = None if setup.wrist is None else _BLEND_M_S
+    # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
+    blend_m_s = None if setup.wrist is None else 0.3
     hand = setup.hand if setup.wrist is None else loosened(setup.hand)
     return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), blend_m_s)
 
@@ -153,6 +152,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         row_px = hypot(sqrt(2.0) * RAYS.rig_px, tilt_px)
         tables = disparity_tables(cameras, law, residual.law, row_px, float(limits_of(2)[2]))
         triangulate = DepthTriangulator(tables, CapTables.of(setup.hand, rig.markers))
+    any_curl_rad = 100.0  # a finger that is not seen may be bent anyhow
     line = FabrikSolver(
         setup.models,
         setup.hand,
@@ -163,7 +163,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         one_euro=_point_filter(setup) if continuous else None,
         palm=_estimator(setup, continuous=continuous, natural=True),
         once=_estimator(
-            setup, continuous=False, natural=True, settings=setup.settings._replace(curled_rad=_ANY_CURL_RAD)
+            setup, continuous=False, natural=True, settings=setup.settings._replace(curled_rad=any_curl_rad)
         ),
         stage=stage,
     )

@@ -24,14 +24,6 @@ from master.run.sequence import CYCLE_FRAMES
 
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
-_FASTER = (
-    2.0  # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
-)
-_ANY_HZ = 10_000.0  # where no file states a rate
-_LEAST_HZ = 60.0
-_IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
-_TRACKER_HZ = 500.0
-_BURST_S = 0.5  # of it may come at once: at the rate of the file, what a second's halt of the network held up
 
 Sensed = Detections | TagDetections | ImuSample | TrackerPose
 
@@ -58,8 +50,14 @@ def bucket_of(rate_hz: float | None) -> TokenBucket:
 
     `rate_hz` is that of its files; None: they state none.
     """
-    per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
-    return TokenBucket(per_s, per_s * _BURST_S)
+    # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
+    faster = 2.0
+    any_hz = 10_000.0  # where no file states a rate
+    least_hz = 60.0
+    per_s = any_hz if rate_hz is None else max(faster * rate_hz, least_hz)
+    # of it may come at once: at the rate of the file, what a second's halt of the network held up
+    burst_s = 0.5
+    return TokenBucket(per_s, per_s * burst_s)
 
 
 def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
@@ -91,8 +89,11 @@ def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
             limits[name] = SenderLimits(size, markers, rate_hz)
         for rig in (setup.rig, setup.wrist_rig):
             if rig is not None and rig.imu is not None:
-                limits[rig.imu.name] = SenderLimits(rate_hz=_IMU_FASTER * rig.imu.rate_hz)
-        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=_TRACKER_HZ))
+                # than its file: a sensor has its own rates, and takes the next that is enough
+                imu_faster = 2.0
+                limits[rig.imu.name] = SenderLimits(rate_hz=imu_faster * rig.imu.rate_hz)
+        tracker_hz = 500.0
+        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=tracker_hz))
     return limits
 
 

@@ -28,7 +28,6 @@ from common.messages import (
 from master.monitor.rates import CameraRates
 from master.outputs.sink import Sink
 
-_NAME = 64  # characters of a name in `Health`
 _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour would halt the loop 3 ms every second
 _OBJECT_KEPT = 2_000  # and of objects, some seconds of each
 
@@ -200,7 +199,8 @@ def health(
     Metrics distinguish the rate at which a camera runs (camera_hz.NAME) from the rate of solved poses (poses_per_s).
     """
     metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
-    metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
+    # characters of a name in `Health`
+    metrics |= {f"camera_hz.{camera}"[:64]: hz for camera, hz in figures.rates.camera_hz.items()}
     metrics |= times or {}
     published = {name: number for name, number in figures.published.items() if number}
     events = {"poses": figures.poses} | published | counts

@@ -29,9 +29,6 @@ from master.run.quarantine import Quarantine
 from master.run.rejected_peers import MarkerCounts, RejectedPeer
 from master.run.sequence import CameraCounts
 
-AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
-DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
-
 
 class Ingest:
     """Receiver of all slaves of one rig, on one UDP port.
@@ -238,7 +235,8 @@ class Ingest:
                         messages.append(message)
                 now_ns = self._clock.now_ns()
                 if pending != len(messages) or pending == 0 or now_ns >= due_ns:
-                    outbox, due_ns = self._link.due(), now_ns + DUE_NS
+                    # nor is it looked at more often while nothing but data comes
+                    outbox, due_ns = self._link.due(), now_ns + 1_000_000
             for datagram, address in outbox:
                 self._socket.send(datagram, address)
             if messages:
@@ -252,7 +250,8 @@ class Ingest:
         if first is None:
             return
         yield first
-        for _ in range(AT_ONCE - 1):
+        at_once = 64  # datagrams between two looks at what is due: less than a millisecond
+        for _ in range(at_once - 1):
             if (arrived := self._socket.receive_waiting()) is None:
                 return
             yield arrived

@@ -65,16 +65,8 @@ from master.run.quarantine import Quarantine
 from master.run.rejected_peers import RejectedPeers
 from master.run.sequence import CYCLE_FRAMES, CameraCounts
 
-BEACON_NS = 100_000_000
-ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
-FAST_NS = 2_000_000_000
-ECHO_EARLY_NS = 50_000_000
-ECHO_NS = 200_000_000
-EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
-START_DELAY_NS = 100_000_000  # room for two repetitions of the start before it is due
-START_AGAIN_NS = 50_000_000
 
 
 class MasterLink:
@@ -179,7 +171,8 @@ class MasterLink:
         """Return the datagrams to send now, each with its destination."""
         t_ns = self._clock.now_ns()
         if t_ns >= self._next_beacon_ns:
-            self._next_beacon_ns = max(self._next_beacon_ns + BEACON_NS, t_ns)
+            beacon_ns = 100_000_000
+            self._next_beacon_ns = max(self._next_beacon_ns + beacon_ns, t_ns)
             self._outbox.append((seal(self._sealer, self._beacon()), self._beacon_to))
         for sender in self._senders.values():
             pending = sender.pending
@@ -412,12 +405,17 @@ class MasterLink:
         t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
         if t_ns < session.next_echo_ns:
             return
+        fast_ns = 2_000_000_000
+        echo_ns = 200_000_000
         if t_ns - session.received_ns > SILENT_NS:
-            period = ECHO_NS
-        elif not session.clock.settled or t_ns - session.since_ns < FAST_NS:
-            period = ECHO_FAST_NS
+            period = echo_ns
+        elif not session.clock.settled or t_ns - session.since_ns < fast_ns:
+            echo_fast_ns = 10_000_000  # in the first two seconds, and until the clock is settled
+            period = echo_fast_ns
         else:
-            period = ECHO_EARLY_NS if t_ns - session.since_ns < EARLY_NS else ECHO_NS
+            echo_early_ns = 50_000_000
+            early_ns = 5_000_000_000
+            period = echo_early_ns if t_ns - session.since_ns < early_ns else echo_ns
         # On the grid, so that the rate is kept by a thread that wakes late, too.
         session.next_echo_ns = max(session.next_echo_ns + period, t_ns + period // 2)
         session.asked[t_ns] = None
@@ -430,7 +428,8 @@ class MasterLink:
             return
         ready = all(sender.live is not None and sender.live.clock.ready for sender in self._awaited)
         if ready or t_ns - self._first_ns > self._start_timeout_ns:
-            self._start_ns = t_ns + START_DELAY_NS
+            start_delay_ns = 100_000_000  # room for two repetitions of the start before it is due
+            self._start_ns = t_ns + start_delay_ns
 
     def _send_start(self, sender: Sender, t_ns: int) -> None:
         session = sender.live
@@ -439,6 +438,7 @@ class MasterLink:
         clock = session.clock.estimate()
         if clock is None or not session.clock.ready:
             return
-        session.next_start_ns = t_ns + START_AGAIN_NS
+        start_again_ns = 50_000_000
+        session.next_start_ns = t_ns + start_again_ns
         start = Start(clock.to_remote(self._start_ns))
         self._outbox.append((seal(session.sealer, start), session.address))

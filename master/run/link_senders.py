@@ -19,8 +19,6 @@ from master.run.sequence import Counted, Sequence
 
 OLD_NONCES = 64
 ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
-AHEAD_NS = 50_000_000  # by how much the conversion of a time to this clock may be wrong
-_MAX_SIGMA_NS = 1e10
 
 SensorMessage: TypeAlias = Sensed
 
@@ -120,16 +118,18 @@ def on_master_clock(
         return None
     stamped_ns = clock.to_local(message.t_ns)
     t_ns = min(stamped_ns, now_ns)
-    if not now_ns - OLD_NS <= stamped_ns <= now_ns + AHEAD_NS or (
+    ahead_ns = 50_000_000  # by how much the conversion of a time to this clock may be wrong
+    if not now_ns - OLD_NS <= stamped_ns <= now_ns + ahead_ns or (
         kind.newest_ns is not None and t_ns <= kind.newest_ns
     ):
         return None
     kind.newest_ns = t_ns
     if isinstance(message, (ImuSample, TrackerPose)):
         return restamped(message, t_ns=t_ns)
+    max_sigma_ns = 1e10
     return restamped(
         message,
         t_ns=t_ns,
         ready_t_ns=clock.to_local(message.ready_t_ns),
-        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), stamped_ns - t_ns), _MAX_SIGMA_NS),
+        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), stamped_ns - t_ns), max_sigma_ns),
     )

@@ -43,8 +43,6 @@ from master.run.tuning import LivePipeline, RigTuning, renew
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
 
-_JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
-
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
@@ -179,7 +177,8 @@ def run_live(
         probe.drain()
         stop.set()
         for thread in threads:
-            thread.join(_JOIN_S)
+            join_s = 2.0  # a report that hangs on the bus does not keep the run from ending
+            thread.join(join_s)
         summary: dict[str, object] = {
             **figures.summary(),
             "camera_hz": figures.rates.camera_hz,

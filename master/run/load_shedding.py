@@ -21,9 +21,6 @@ from master.rig.setup import RigSetup
 from master.run.message_queue import QUEUE_PER_CAMERA, Span
 
 MOST = QUEUE_PER_CAMERA  # epochs in a row: as many as can wait; a master that has no time but for messages solves some
-_SILENT_PERIODS = (
-    12  # of the slowest camera: so long nothing waits for one that sends nothing, as in `Pairing`
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +45,9 @@ class Cameras:
             for name, model in models.items()
         }
         slowest_hz = min(setup.cameras[name].frame_rate_hz for name in names)
-        return cls(dict.fromkeys(names, 0) | centre_ns, round(_SILENT_PERIODS * 1e9 / slowest_hz))
+        # of the slowest camera: so long nothing waits for one that sends nothing, as in `Pairing`
+        silent_periods = 12
+        return cls(dict.fromkeys(names, 0) | centre_ns, round(silent_periods * 1e9 / slowest_hz))
 
     def newer_waits(self, waiting: Mapping[str, Span], newest_ns: Mapping[str, int], t_ns: int) -> bool:
         """Check whether the waiting messages complete an epoch.

@@ -12,8 +12,6 @@ from common.bus.keys import access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 
-_TRY_AGAIN_S = 0.3
-
 
 def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
     """Join the bus as the master at `endpoint` sees it.
@@ -61,5 +59,6 @@ def bus_of_master(
             if not notified:
                 waiting(error)
             notified = True
-            stop.wait(_TRY_AGAIN_S)
+            try_again_s = 0.3
+            stop.wait(try_again_s)
     return None

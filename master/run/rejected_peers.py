@@ -13,10 +13,6 @@ from typing import NamedTuple, TypeVar
 from common.link.datagram import HEADER, MAGIC, Header, Kind
 from common.link.session import RigKeys
 
-LATELY_NS = 1_500_000_000  # both send a hello again within a second
-_POLL_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
-
-
 SeenT = TypeVar("SeenT")
 
 
@@ -80,7 +76,8 @@ class RejectedPeers:
         magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
         if magic != MAGIC or kind != Kind.HELLO or rig != self._keys.rig_tag:
             return
-        self._next_ns = t_ns + _POLL_NS
+        poll_ns = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
+        self._next_ns = t_ns + poll_ns
         name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
         if name in self._names:
             self._versions[name] = t_ns, RejectedPeer(host, version)
@@ -109,4 +106,5 @@ class RejectedPeers:
 
 
 def _lately(seen: dict[str, tuple[int, SeenT]], t_ns: int) -> dict[str, SeenT]:
-    return {name: what for name, (seen_ns, what) in seen.items() if t_ns - seen_ns < LATELY_NS}
+    lately_ns = 1_500_000_000  # both send a hello again within a second
+    return {name: what for name, (seen_ns, what) in seen.items() if t_ns - seen_ns < lately_ns}

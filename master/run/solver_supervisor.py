@@ -25,8 +25,6 @@ from master.run.app import Solved
 from master.run.link_senders import SensorMessage
 from master.run.quarantine import Quarantine
 
-RECENT = 64  # messages that are solved again: about ten frames of each camera of a usual rig
-
 
 class Solving(Protocol):
     """What messages are pushed into."""
@@ -69,7 +67,8 @@ class SolverSupervisor:
         """
         self._solver, self._quarantine, self._clock = solver, quarantine, clock
         self._renew, self._fresh = renew, fresh
-        self._recent: deque[SensorMessage] = deque(maxlen=RECENT)
+        recent = 64  # messages that are solved again: about ten frames of each camera of a usual rig
+        self._recent: deque[SensorMessage] = deque(maxlen=recent)
         self._repair: threading.Thread | None = None
 
     def push(self, message: SensorMessage) -> Iterator[Solved]:

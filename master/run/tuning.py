@@ -31,8 +31,6 @@ from master.rig.pipeline import Pipeline, pipeline_of
 from master.rig.setup import RigSetup
 from master.run.dispatcher import Dispatcher
 
-_WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
-_CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
 
 
@@ -90,9 +88,11 @@ class LivePipeline:
         self._setup: RigSetup = setup
         self._now = pipeline_of(setup, stage, dropped_epochs=dropped_epochs)
         per_frame = _messages_per_frame(setup)
-        self._close = _CLOSE_FRAMES * per_frame
+        close_frames = 2  # of each camera: what may be left for the loop to catch up with
+        self._close = close_frames * per_frame
+        warm_frames = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
         self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
-            maxlen=_WARM_FRAMES * per_frame
+            maxlen=warm_frames * per_frame
         )
         self._number = 0
         self._last_ns = -(2**63)

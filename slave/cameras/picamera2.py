@@ -44,7 +44,6 @@ from slave.sources import Frame
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
-GOOD_FRAMES = 3
 _LOG = logging.getLogger(__name__)
 
 
@@ -254,15 +253,16 @@ class Picamera2Camera:
         """
         wanted = wanted_settings(camera, self._library.camera_controls, self._options.pixels)
         good, metadata = 0, dict[str, object]()
+        good_frames = 3
         for metadata in frames:
             good = 0 if differences(wanted, metadata) else good + 1
-            if good == GOOD_FRAMES:
+            if good == good_frames:
                 _LOG.info("%s: settings checked, view %s", self._where, metadata.get("ScalerCrop", "unknown"))
                 return
         fix = "Change the camera file to what the camera can do, and see that no other program controls it."
         demand(self._where, wanted, metadata, fix)
         raise CameraError(
-            f"{self._where}: its settings do not stay: they were right, but not {GOOD_FRAMES} frames long"
+            f"{self._where}: its settings do not stay: they were right, but not {good_frames} frames long"
         )
 
     def _synchronise(self, stop: threading.Event | None) -> None:

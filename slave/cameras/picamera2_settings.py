@@ -24,15 +24,6 @@ Sync = Literal["off", "server", "client"]
 LIVE_CONTROLS = ("ExposureTime", "AnalogueGain", "ColourGains")  # that may change while frames come,
 RATE_CONTROL = "FrameDurationLimits"  # and this one where cameras run free
 
-GLOBAL_SHUTTER_ROW_US = (
-    30.0  # where the camera file states 0: no official sensor needs longer for a row at video rates
-)
-EXPOSURE_SHARE = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
-COLOUR_GAIN = 0.01
-DIOPTRES = 0.05
-# libcamera's default: the server notifies the clients every 30 frames, so each receives it three times
-SYNC_FRAMES = 100
-
 
 @dataclass(frozen=True, slots=True)
 class Picamera2Options:
@@ -121,8 +112,10 @@ def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, objec
             f"--sync {options.sync}: this libcamera cannot synchronise cameras; update the system "
             "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one time"
         )
+    # libcamera's default: the server notifies the clients every 30 frames, so each receives it three times
+    sync_frames = 100
     # The number of frames until "ready" is set by the server (control_ids_rpi.yaml, SyncFrames).
-    return {"SyncMode": mode} | ({"SyncFrames": SYNC_FRAMES} if options.sync == "server" else {})
+    return {"SyncMode": mode} | ({"SyncFrames": sync_frames} if options.sync == "server" else {})
 
 
 def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, Any, Any]]) -> None:
@@ -158,8 +151,11 @@ def wanted_settings(
 
     Tolerances are as in the text above.
     """
-    row_us = camera.row_time_us if camera.row_time_us > 0.0 else GLOBAL_SHUTTER_ROW_US
-    exposure = row_us + EXPOSURE_SHARE * camera.exposure_us
+    # where the camera file states 0: no official sensor needs longer for a row at video rates
+    global_shutter_row_us = 30.0
+    row_us = camera.row_time_us if camera.row_time_us > 0.0 else global_shutter_row_us
+    exposure_share = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
+    exposure = row_us + exposure_share * camera.exposure_us
     gain = max(1.0 / 16.0, camera.analogue_gain**2 / 256.0)
     digital = exposure / camera.exposure_us + gain / camera.analogue_gain
     rate = f"frame_rate_hz {camera.frame_rate_hz:g}"
@@ -170,9 +166,11 @@ def wanted_settings(
         Setting("FrameDuration", (1e6 / camera.frame_rate_hz,), row_us + 1.0, "us", rate),
     ]
     if pixels is Pixels.COLOUR or "ColourGains" in available:
-        wanted.append(Setting("ColourGains", camera.colour_gains, COLOUR_GAIN, "", "colour_gains"))
+        colour_gain = 0.01
+        wanted.append(Setting("ColourGains", camera.colour_gains, colour_gain, "", "colour_gains"))
     if "AfMode" in available and camera.focus_m is not None:
-        wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), DIOPTRES, "dioptres", "focus_m"))
+        dioptres = 0.05
+        wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), dioptres, "dioptres", "focus_m"))
     return tuple(wanted)
 
 

@@ -16,8 +16,6 @@ from common.recording.frame_recording import FrameRow, Manifest, open_recording
 from common.recording.pictures import decode, read_picture
 from slave.sources import Frame
 
-GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
-
 
 class ReplayCamera:
     """A `FrameSource` that reads the pictures of a recording.
@@ -65,7 +63,8 @@ class ReplayCamera:
         if not self._paced:
             return Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=exposure_us)
         now_ns = self._clock.now_ns()
-        if self._shift_ns is None or row.t_ns + self._shift_ns - now_ns > GAP_NS:
+        gap_ns = 600_000_000_000  # longer than that it does not wait for the next frame
+        if self._shift_ns is None or row.t_ns + self._shift_ns - now_ns > gap_ns:
             self._shift_ns = now_ns - row.t_ns
         t_ns = row.t_ns + self._shift_ns
         self._wait_until(t_ns)

@@ -48,7 +48,6 @@ BUFFERS = 4
 RATE_SHARE = (
     0.1  # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
 )
-INTERRUPT_SIGMA_NS, USB_SIGMA_NS, USB_CLOCK_SIGMA_NS = 50e3, 1.2e6, 0.3e6  # see above
 USB_CLOCK = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 _LOG = logging.getLogger(__name__)
 
@@ -104,7 +103,8 @@ class V4l2Camera:
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (v4l2:{options.path})"
         self._foreign: ForeignClock | None = None
-        self._sigma_ns = INTERRUPT_SIGMA_NS
+        interrupt_sigma_ns = 50e3  # see above
+        self._sigma_ns = interrupt_sigma_ns
         self._buffers: list[memoryview] = []
         self._seq = -1
         self._sequence: int | None = None
@@ -258,7 +258,8 @@ class V4l2Camera:
         has = int(found.device_caps if found.capabilities & abi.CAP_DEVICE_CAPS else found.capabilities)
         name = found.card.decode("utf-8", "replace")
         if found.driver == b"uvcvideo":
-            self._sigma_ns = USB_CLOCK_SIGMA_NS if _usb_clock_is_used() else USB_SIGMA_NS
+            usb_sigma_ns, usb_clock_sigma_ns = 1.2e6, 0.3e6  # see above
+            self._sigma_ns = usb_clock_sigma_ns if _usb_clock_is_used() else usb_sigma_ns
         if not (has & abi.CAP_CAPTURE and has & abi.CAP_STREAMING):
             raise CameraError(
                 f"{name} is no single-planar capture device (a USB camera has a second device for metadata; a Pi "

@@ -39,7 +39,6 @@ from slave.cameras.v4l2_abi import (
     fourcc_text,
 )
 
-RATE_SHARE = 0.01  # 59.94 Hz serves 60 Hz
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
     Pixels.GREY: GREY_FORMATS,
@@ -79,7 +78,8 @@ class Offer:
         """
         if not self.rates_hz:
             return True
-        slack = RATE_SHARE * rate_hz
+        rate_share = 0.01  # 59.94 Hz serves 60 Hz
+        slack = rate_share * rate_hz
         if self.continuous:
             return self.rates_hz[0] - slack <= rate_hz <= self.rates_hz[-1] + slack
         return any(abs(offered - rate_hz) <= slack for offered in self.rates_hz)

@@ -11,8 +11,6 @@ from common.command_line import UsageError
 from common.errors import CalibrationError
 from common.terminal import remark
 
-_EVERY = 500  # frames, between two lines that report the progress
-
 
 def detect(options: argparse.Namespace) -> int:
     """Detect markers, or fingers before a wrist device, in every frame.
@@ -26,7 +24,8 @@ def detect(options: argparse.Namespace) -> int:
     camera, recording = _source(options)
 
     def progress(done: int, total: int) -> None:
-        if done % _EVERY == 0 or done == total:
+        every = 500  # frames, between two lines that report the progress
+        if done % every == 0 or done == total:
             remark(f"{camera}: {done} of {total} frames")
 
     if is_grey(load_manifest(recording), camera):

@@ -4,8 +4,6 @@ import argparse
 
 from common.terminal import echo, remark
 
-_EVERY = 500  # frames, between two lines that report the progress
-
 
 def join(options: argparse.Namespace) -> int:
     """Join them.
@@ -16,7 +14,8 @@ def join(options: argparse.Namespace) -> int:
     from slave.join import join_recordings
 
     def progress(done: int, total: int) -> None:
-        if done % _EVERY == 0:
+        every = 500  # frames, between two lines that report the progress
+        if done % every == 0:
             remark(f"{done} of {total} frames")
 
     counts = join_recordings(options.join, options.output, options.by_wall_clock, progress)

@@ -21,9 +21,6 @@ from slave.cameras.v4l2_abi import KernelDevice
 from slave.cameras.v4l2_controls import AUTOMATICS, read_back, read_controls
 from slave.doctor.finding import Finding, fail, ok, unseen
 
-FRAMES = 10
-GIVEN_UP_S = 30.0
-
 
 def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
     """Files and device of a camera.
@@ -68,7 +65,8 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
             camera = devices.open_camera(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
             assert camera is not None  # its driver is a real one
             try:
-                seen = sum(camera.read() is not None for _ in range(FRAMES))
+                frames = 10
+                seen = sum(camera.read() is not None for _ in range(frames))
             finally:
                 camera.close()
         except PhalanxError as error:
@@ -79,10 +77,11 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
     # In a thread of its own: a library that hangs must not hold up the other checks.
     thread = threading.Thread(target=look, name="doctor camera", daemon=True)
     thread.start()
-    thread.join(GIVEN_UP_S)
+    given_up_s = 30.0
+    thread.join(given_up_s)
     if not found:
         fix = "check the cable with the power off; restart the Pi"
-        return fail("camera", f"no answer of its driver in {GIVEN_UP_S:.0f} s", fix)
+        return fail("camera", f"no answer of its driver in {given_up_s:.0f} s", fix)
     return found[0]
 
 

@@ -10,9 +10,6 @@ from collections.abc import Iterator
 from slave.doctor.finding import Finding, fail, ok, unseen, warn
 from slave.doctor.system import System, pairs
 
-REFERENCE, STRATUM, OFFSET_S, RMS_S, LEAP = 1, 2, 4, 6, 13
-FIELDS = 14
-FAR_S = 1e-3  # libcamera brings cameras in step by the system's clock: its error adds to theirs
 INSTALL = (
     "sudo apt install chrony; the installer adds /etc/chrony/conf.d/phalanx.conf with the master's machine"
 )
@@ -25,12 +22,15 @@ def check_clock(system: System, master: str | None) -> Iterator[Finding]:
         yield _without_chrony(system)
         return
     fields = asked.out.strip().split(",")
-    if asked.code != 0 or len(fields) != FIELDS:
+    # fields
+    if asked.code != 0 or len(fields) != 14:
         stated = (asked.error or asked.out).strip().splitlines()[-1:] or ["no answer"]
         yield warn("clock", f"chronyd: {stated[0]}", "sudo systemctl enable --now chrony")
         return
     try:
-        offset_s, rms_s = float(fields[OFFSET_S]), float(fields[RMS_S])
+        # offset s
+        # rms s
+        offset_s, rms_s = float(fields[4]), float(fields[6])
     except ValueError:
         yield warn("clock", f"chronyd reports {asked.out.strip()!r}", "sudo systemctl restart chrony")
         return
@@ -38,14 +38,16 @@ def check_clock(system: System, master: str | None) -> Iterator[Finding]:
 
 
 def _tracking(fields: list[str], offset_s: float, rms_s: float, master: str | None) -> Finding:
-    who = fields[REFERENCE] or "nobody"
-    if fields[LEAP] == "Not synchronised":
+    reference, stratum, leap = 1, 2, 13
+    who = fields[reference] or "nobody"
+    if fields[leap] == "Not synchronised":
         fix = "is the master's machine on, with `local stratum 8` and `allow` in its chrony.conf? `chronyc sources`"
         return warn("clock", "chrony has found no time yet", fix)
     stated = (
-        f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[STRATUM]}), {rms_s * 1e6:.0f} µs in the mean"
+        f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[stratum]}), {rms_s * 1e6:.0f} µs in the mean"
     )
-    if abs(offset_s) > FAR_S:
+    far_s = 1e-3  # libcamera brings cameras in step by the system's clock: its error adds to theirs
+    if abs(offset_s) > far_s:
         return warn(
             "clock", stated, "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`"
         )

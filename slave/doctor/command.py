@@ -22,7 +22,6 @@ from slave.doctor.unit import check_unit
 from slave.drivers import SWITCHED_LIGHTS
 
 ETC = "/etc/phalanx"
-PARSER_EXIT = 2
 
 
 def run(options: argparse.Namespace) -> int:
@@ -123,7 +122,8 @@ def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":
     try:
         return PROGRAM.parse(["run", *words])[1]
     except SystemExit as error:
-        if error.code == PARSER_EXIT:
+        parser_exit = 2
+        if error.code == parser_exit:
             return fail(
                 "options", f"of {name}: see the line above", f"{ETC}/{name}.env: phalanx-slave run --help"
             )

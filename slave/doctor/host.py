@@ -16,7 +16,6 @@ from slave.doctor.system import System
 RELEASES = {"trixie": "13", "bookworm": "12"}  # of Debian, and of the Raspberry Pi OS made from it
 PYTHONS = ((3, 11), (3, 13))
 STATE = "/var/lib/phalanx"
-FEW_MB, NO_MB = 500.0, 100.0
 # Raspberry Pi documentation, "vcgencmd get_throttled": bit -> its meaning; the same 16 bits higher: since the start.
 BITS = {
     0: "under-voltage",
@@ -24,7 +23,6 @@ BITS = {
     2: "throttled",
     3: "soft temperature limit",
 }
-SINCE = 16
 COOL = "better cooling: a heat sink, a fan, air around it"
 SUPPLY = "a stronger power supply, a shorter or thicker cable"
 
@@ -76,10 +74,11 @@ def _metrics(system: System) -> Iterator[Finding]:
     folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
     metrics = Machine(folder, system.environment).metrics()
     free_mb = metrics.get("disk_free_mb")
+    few_mb, no_mb = 500.0, 100.0
     if free_mb is None:
         yield unseen("disk", f"{folder}: not known")
-    elif free_mb < FEW_MB:
-        level = fail if free_mb < NO_MB else warn
+    elif free_mb < few_mb:
+        level = fail if free_mb < no_mb else warn
         yield level(
             "disk", f"{free_mb:.0f} MB free", "delete recordings or old releases in /opt/phalanx/releases"
         )
@@ -116,11 +115,12 @@ def _throttled(system: System) -> Finding:
     if flags is None:
         return unseen("throttling", "no Raspberry Pi firmware that reports it, no vcgencmd")
     now = [text for bit, text in BITS.items() if flags >> bit & 1]
-    before = [text for bit, text in BITS.items() if flags >> (bit + SINCE) & 1 and text not in now]
+    since = 16
+    before = [text for bit, text in BITS.items() if flags >> (bit + since) & 1 and text not in now]
     if not now and not before:
         return ok("throttling", "none since the start")
     stated = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
-    fix = SUPPLY if flags & (1 | 1 << SINCE) else COOL
+    fix = SUPPLY if flags & (1 | 1 << since) else COOL
     return warn("throttling", ", ".join(stated), fix)
 
 

@@ -17,7 +17,6 @@ from slave.doctor.finding import Finding, fail, ok, unseen, warn
 from slave.doctor.system import System
 from slave.link import SlaveLink
 
-LISTEN_S = 1.0  # the beacon comes four times a second and more
 NOT_RECEIVED = (
     "is phalanx-master running, with --beacon of this network? Are both in one network, and does its wireless router "
     "let clients talk to each other? UDP port {} must pass"
@@ -53,7 +52,8 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
         beacons = UdpSocket((bind, port), shared=True, timeout_s=0.1)
     except PhalanxError as error:
         return fail("beacon", str(error), "stop what has the port, or use --beacon-port on both sides")
-    end_s = time.monotonic() + LISTEN_S
+    listen_s = 1.0  # the beacon comes four times a second and more
+    end_s = time.monotonic() + listen_s
     try:
         while time.monotonic() < end_s:
             if (arrived := beacons.receive()) is None:
@@ -73,7 +73,7 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
     if refused:
         stated = ", ".join(f"{reason} {count}" for reason, count in refused.items())
         return fail("beacon", f"received, but not of this rig: {stated}", "compare rig.key of both sides")
-    return fail("beacon", f"none in {LISTEN_S:g} s on UDP port {port}", NOT_RECEIVED.format(port))
+    return fail("beacon", f"none in {listen_s:g} s on UDP port {port}", NOT_RECEIVED.format(port))
 
 
 def _received(address: str, expected: set[str]) -> Finding:

@@ -30,11 +30,6 @@ from slave.imu.lsm6dsox_fifo import Rate, Register
 ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply
 POLL_S = 0.004
 SILENT_POLLS = 250  # without a word: it measures no more
-MOST_WORDS = 90  # of one read: half a kilobyte
-SETTLE_S = 0.1  # a gyroscope starts within 70 ms
-RESET_POLLS = 20
-TEMPERATURE_NS = 1_000_000_000
-CLOCK_ERROR = 0.02  # of its oscillator, once its fine frequency is taken into account: what temperature does
 _NONE = (np.full(3, np.nan), np.full(4, np.nan))
 _SILENT = (EIO, ENXIO, EREMOTEIO, ETIMEDOUT)
 
@@ -141,7 +136,9 @@ class Lsm6dsoxImu:
         self._seq, self._stamp_ns = -1, 0
         self._silent = 0
         self._closed = False
-        self._device_clock = DeviceClock(CLOCK_ERROR)
+        # of its oscillator, once its fine frequency is taken into account: what temperature does
+        clock_error = 0.02
+        self._device_clock = DeviceClock(clock_error)
         with self._errors():
             self._bus = opener(place.bus)
         try:
@@ -183,14 +180,16 @@ class Lsm6dsoxImu:
                 f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {chip.IDENTITY:#04x}"
             )
         self._put(Register.CTRL3_C, chip.SW_RESET)
-        for _ in range(RESET_POLLS):
+        reset_polls = 20
+        for _ in range(reset_polls):
             if not self._get(Register.CTRL3_C)[0] & chip.SW_RESET:
                 break
             self._stop.wait(POLL_S)
         for register, value in chip.settings(rate).items():
             self._set(register, value)
         fine = int.from_bytes(self._get(Register.INTERNAL_FREQ_FINE), signed=True)
-        self._stop.wait(SETTLE_S)
+        settle_s = 0.1  # a gyroscope starts within 70 ms
+        self._stop.wait(settle_s)
         self._set(Register.FIFO_CTRL4, chip.FIFO_CONTINUOUS)
         return 1.0 + chip.FREQ_FINE_STEP * fine
 
@@ -198,9 +197,11 @@ class Lsm6dsoxImu:
         """Take from the FIFO what is there, or wait a little."""
         low, high = self._get(Register.FIFO_STATUS1, 2)
         arrival_ns = self._clock.now_ns()
-        words = min((high & 3) << 8 | low, MOST_WORDS)
+        most_words = 90  # of one read: half a kilobyte
+        words = min((high & 3) << 8 | low, most_words)
         self._counts["imu.overrun"] += bool(high & chip.OVERRUN)
-        if self._heated_ns is None or arrival_ns - self._heated_ns >= TEMPERATURE_NS:
+        temperature_ns = 1_000_000_000
+        if self._heated_ns is None or arrival_ns - self._heated_ns >= temperature_ns:
             self._heated_ns = arrival_ns
             self._temperature_c = chip.temperature_c(self._get(Register.OUT_TEMP_L, 2))
         if not words:

@@ -53,17 +53,13 @@ OTHERS = {
     0x68: "MPU-6050",
 }
 SW_RESET = 0x01  # CTRL3_C, clears itself
-FIFO_OFF, FIFO_CONTINUOUS = (
-    0x40,
-    0x46,
-)  # FIFO_CTRL4: a time stamp in every slot; newest words replace the oldest
+FIFO_CONTINUOUS = 0x46  # newest words replace the oldest
 OVERRUN = 0x08  # FIFO_STATUS2: words were replaced since it was read
 WORD = 7  # bytes
 FREQ_FINE_STEP = 0.0015
 RAD_S_PER_LSB = float(np.radians(0.070))  # at 2000 deg/s, DS12814 table 2
 M_S2_PER_LSB = 0.488e-3 * STANDARD_GRAVITY  # at 16 g
 _GYRO, _ACCEL, _STAMP = 1, 2, 4
-_CLIPPED = 32767
 
 
 class Rate(NamedTuple):
@@ -84,6 +80,7 @@ def settings(rate: Rate) -> dict[Register, int]:
 
     16 g, 2000 deg/s, blocks that do not tear, time stamps.
     """
+    fifo_off = 0x40  # FIFO_CTRL4: a time stamp in every slot
     return {
         Register.CTRL9_XL: 0xE2,  # I3C off
         Register.CTRL3_C: 0x44,  # block data update; addresses count on
@@ -93,7 +90,7 @@ def settings(rate: Rate) -> dict[Register, int]:
         Register.FIFO_CTRL1: 0,
         Register.FIFO_CTRL2: 0,
         Register.FIFO_CTRL3: rate.code << 4 | rate.code,
-        Register.FIFO_CTRL4: FIFO_OFF,
+        Register.FIFO_CTRL4: fifo_off,
     }
 
 
@@ -161,6 +158,7 @@ class Slots:
 
     def _vector(self, word: bytes, scale: float) -> Float:
         raw = np.array(struct.unpack("<3h", word), float)
-        clipped = np.abs(raw) >= _CLIPPED
+        # clipped
+        clipped = np.abs(raw) >= 32767
         self.counts["clipped"] += int(clipped.sum())
         return np.where(clipped, np.nan, raw * scale)

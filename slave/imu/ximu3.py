@@ -37,15 +37,9 @@ from slave.imu.ximu3_protocol import Answer, Data, Decoder, Fault, Kind, encode,
 
 SAMPLE_RATE_HZ = 400.0  # of the inertial sensor, whatever of it is sent
 STANDARD_GRAVITY = 9.80665  # m/s^2
-TESLA_UNIT_UT = 50.0  # one a.u., the field at the magnetometer's calibration; "approximately", section 3.2.3
 RANGE_RAD_S, RANGE_M_S2 = 1.2 * math.radians(2000.0), 1.2 * 24.0 * STANDARD_GRAVITY  # sections 3.2.1, 3.2.2
-CLOCK_ERROR = 200e-6  # of its crystal against the slave's, each within 100 ppm
-BAUD = 115200
-MESSAGE_BITS = 340  # of one inertial message on a UART: 34 bytes with start and stop bit
-READ_S = 0.1  # a read waits so long, and looks whether it is to stop
-ANSWER_S, TRIES = 0.5, 4  # an answer is sent within milliseconds; only a full line delays it
+ANSWER_S = 0.5  # an answer is sent within milliseconds
 SILENT_READS = 20  # reads without a byte since the last sample: it sends no more
-LOGGED = 20  # notifications and errors of the device; more are counted only
 _NONE = (np.full(3, np.nan), np.full(4, np.nan))
 _LOG = logging.getLogger(__name__)
 
@@ -101,7 +95,9 @@ def open_port(place: SerialPlace) -> Port:
     Raises:
         OSError: It cannot be opened.
     """
-    return serial.Serial(place.path, place.baud or BAUD, timeout=READ_S, write_timeout=1.0, exclusive=True)
+    baud = 115200
+    read_s = 0.1  # a read waits so long, and looks whether it is to stop
+    return serial.Serial(place.path, place.baud or baud, timeout=read_s, write_timeout=1.0, exclusive=True)
 
 
 def ports() -> list[str]:
@@ -158,8 +154,10 @@ class Ximu3Imu:
         self._closed = False
         with self._errors("cannot be opened"):
             self._port = opener(place)
-        least_ns = 0 if place.baud is None else round(1e9 * MESSAGE_BITS / place.baud)
-        self._device_clock = DeviceClock(CLOCK_ERROR, least_ns)
+        message_bits = 340  # of one inertial message on a UART: 34 bytes with start and stop bit
+        least_ns = 0 if place.baud is None else round(1e9 * message_bits / place.baud)
+        clock_error = 200e-6  # of its crystal against the slave's, each within 100 ppm
+        self._device_clock = DeviceClock(clock_error, least_ns)
         try:
             self._begin()
         except ImuError:
@@ -224,7 +222,8 @@ class Ximu3Imu:
 
     def _ask(self, key: str, value: bool | int | None) -> Answer | None:
         """What it answers to a command; None: nothing, though asked repeatedly."""
-        for _ in range(TRIES):
+        tries = 4  # only a full line delays it
+        for _ in range(tries):
             with self._errors("is lost"):
                 self._port.write(encode(key, value))
             until_ns = self._clock.now_ns() + round(ANSWER_S * 1e9)
@@ -264,17 +263,20 @@ class Ximu3Imu:
 
     def _take(self, message: Data) -> ImuSample | None:
         """The sample in a message, or what else there is in it kept."""
+        logged = 20  # notifications and errors of the device; more are counted only
         match message.kind:
             case Kind.INERTIAL:
                 return self._inertial(message)
             case Kind.MAGNETOMETER:
-                mag = np.array(message.values) * TESLA_UNIT_UT
+                # one a.u., the field at the magnetometer's calibration; "approximately", section 3.2.3
+                tesla_unit_ut = 50.0
+                mag = np.array(message.values) * tesla_unit_ut
                 self._mag = np.where(np.isfinite(mag), mag, np.nan)
             case Kind.TEMPERATURE:
                 self._metric("temperature_c", message.values[0])
             case Kind.BATTERY:
                 self._metric("battery_percent", message.values[0])
-            case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= LOGGED:
+            case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= logged:
                 _LOG.warning(
                     "%s: the x-IMU3 reports: %s", self._place.path, message.text.decode(errors="replace")
                 )

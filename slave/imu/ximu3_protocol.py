@@ -27,7 +27,6 @@ import msgspec
 
 END, ESC, ESC_END, ESC_ESC = b"\n", b"\xdb", b"\xdb\xdc", b"\xdb\xdd"
 LONGEST = 4096  # bytes; the vendor's library drops what has not ended by then
-_BINARY = 0x80
 _FALSE_ESCAPE = re.compile(rb"\xdb(?![\xdc\xdd])")
 _COMMA = r"[ \t\r\n]*,[ \t\r\n]*+"
 _STAMP = rf"[A-Z]{_COMMA}\+?(\d+)"
@@ -167,7 +166,8 @@ def _message(line: bytes) -> Data | Answer | Fault | None:
     line = line.replace(ESC_END, END).replace(ESC_ESC, ESC)
     if (kind := KINDS.get(line[0])) is not None:
         return _text(kind, line)
-    if (kind := KINDS.get(line[0] - _BINARY)) is None:
+    binary = 0x80
+    if (kind := KINDS.get(line[0] - binary)) is None:
         return Fault.LETTER
     if kind.numbers:
         if len(line) != kind.binary.size:

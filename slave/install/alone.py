@@ -15,8 +15,6 @@ from pathlib import Path
 from slave.install.errors import InstallError
 
 LOCKED = "opt"
-WAIT_S = 600
-_POLL_S = 1.0
 
 
 @contextlib.contextmanager
@@ -34,19 +32,21 @@ def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], No
     (root / LOCKED).mkdir(parents=True, exist_ok=True)
     folder = os.open(root / LOCKED, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        for look in range(WAIT_S):
+        wait_s = 600
+        for look in range(wait_s):
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
                 if look == 0:
                     notify(
-                        f"another installation runs on this machine: waiting for its end, at most {WAIT_S} s"
+                        f"another installation runs on this machine: waiting for its end, at most {wait_s} s"
                     )
-                sleep(_POLL_S)
+                poll_s = 1.0
+                sleep(poll_s)
         else:
             raise InstallError(
-                f"another installation still runs on this machine after {WAIT_S} s; to see it there: "
+                f"another installation still runs on this machine after {wait_s} s; to see it there: "
                 "pgrep -af 'slave.*install'"
             )
         yield

@@ -27,7 +27,6 @@ from slave.install.systemd import Systemd
 from slave.install.wanted import ETC
 
 Notify = Callable[[str], None]
-_LEFT_S = 3600.0  # no installation takes so long
 
 
 def run_here(options: argparse.Namespace) -> int:
@@ -99,7 +98,8 @@ def _clear(stage: Path) -> None:
     What other installations left that were cut off long ago is removed, too.
     """
     for one in stage.parent.glob("*"):
-        if one == stage or time.time() - one.stat().st_mtime > _LEFT_S:
+        left_s = 3600.0  # no installation takes so long
+        if one == stage or time.time() - one.stat().st_mtime > left_s:
             shutil.rmtree(one, ignore_errors=True)
     with contextlib.suppress(OSError):  # somebody else's are there
         stage.parent.rmdir()

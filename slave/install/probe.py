@@ -23,9 +23,7 @@ from typing import Any
 PACKAGES = ("chrony", "python3-picamera2", "rsync")
 OLDEST, NEWEST = (3, 11), (3, 13)
 MACHINES = ("aarch64", "x86_64")
-LEAST_FREE_MB = 700.0  # wheels, what they unpack to, and the release before it
 RELEASES = "opt/phalanx"
-_QUICK_S = 20.0
 _FIND_CAMERAS = (
     "import json,sys; from picamera2 import Picamera2; "
     "print('CAMERAS', json.dumps([c.get('Model', '?') for c in Picamera2.global_camera_info()]))"
@@ -91,8 +89,9 @@ def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | No
             f"user {facts['user']} may not become root without a password: log in as root, or give "
             f"{facts['user']} passwordless sudo (Raspberry Pi OS does)"
         )
-    if facts["free_mb"] < LEAST_FREE_MB and not facts["releases"]:
-        return f"{facts['free_mb']:.0f} MB free below /opt, needs {LEAST_FREE_MB:.0f} MB"
+    least_free_mb = 700.0  # wheels, what they unpack to, and the release before it
+    if facts["free_mb"] < least_free_mb and not facts["releases"]:
+        return f"{facts['free_mb']:.0f} MB free below /opt, needs {least_free_mb:.0f} MB"
     if facts["cameras"] == []:
         return "libcamera finds no camera: look at its cable, then at `rpicam-hello --list-cameras`"
     driver, _, device = camera.partition(":")
@@ -141,8 +140,9 @@ def _output_of(command: list[str]) -> str | None:
     None: it does not exist, failed, or takes too long.
     """
     try:
+        quick_s = 20.0
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_QUICK_S, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=quick_s, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return None

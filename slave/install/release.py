@@ -30,12 +30,8 @@ from slave.install.wanted import OPT
 RELEASES = f"{OPT}/releases"
 OURS = "phalanx-hand"
 _PACKAGES = ("slave", "common", "master", "deploy")
-_UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
-_SPARE_MB = 50.0
-_PIP_S = 1500.0  # under emulation, too
 # What a slave loads; its service may not write, so what is not compiled now is compiled at each start.
 _LOADS = "import slave.__main__, slave.live, slave.sender, slave.devices, slave.simulated"
-_LOADS_S = 300.0
 _SCRIPT = """\
 #!{python}
 import sys
@@ -167,7 +163,9 @@ def _check_space(releases: Path, source: Source) -> None:
     else:
         assert source.site is not None
         size = sum(file.stat().st_size for file in source.site.rglob("*") if file.is_file())
-    needed_mb = size * 1e-6 * _UNPACKED + _SPARE_MB
+    unpacked = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
+    spare_mb = 50.0
+    needed_mb = size * 1e-6 * unpacked + spare_mb
     free_mb = shutil.disk_usage(releases).free * 1e-6
     if free_mb < needed_mb:
         raise InstallError(
@@ -199,12 +197,13 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
         *_QUIET,
         *names,
     ]
+    pip_s = 1500.0  # under emulation, too
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_PIP_S, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=pip_s, check=False
         )
     except subprocess.TimeoutExpired as error:
-        raise InstallError(f"pip: no end after {_PIP_S:.0f} s") from error
+        raise InstallError(f"pip: no end after {pip_s:.0f} s") from error
     if done.returncode != 0:
         errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
             done.stderr[-300:]
@@ -249,7 +248,8 @@ def _settle(fresh: Path, final: Path, root: Path) -> None:
     if not (fresh / "bin/phalanx-slave").is_file():
         raise InstallError(f"release {final.name}: has no phalanx-slave; is its wheel whole?")
     try:
-        run_command([str(fresh / "bin/python"), "-I", "-c", _LOADS], _LOADS_S)
+        loads_s = 300.0
+        run_command([str(fresh / "bin/python"), "-I", "-c", _LOADS], loads_s)
     except InstallError as error:
         raise InstallError(f"release {final.name} does not load: {str(error).partition(': ')[2]}") from error
     for script in (fresh / "bin").iterdir():

@@ -33,10 +33,6 @@ from slave.install.wanted import (
 )
 
 _UNITS = "phalanx-slave@{}.service"
-LEAST_S = (
-    10.0  # even a slave that starts in one second has so long, on a machine that is busy with its new release
-)
-TIMES = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +61,10 @@ class Machine:
         While it is waited for, its camera sees nothing: so it is judged by its own last start on this machine.
         """
         took_s = self.systemd.state(unit).start_s
-        return self.ready_s if took_s is None else min(self.ready_s, max(LEAST_S, TIMES * took_s))
+        # even a slave that starts in one second has so long, on a machine that is busy with its new release
+        least_s = 10.0
+        times = 4.0
+        return self.ready_s if took_s is None else min(self.ready_s, max(least_s, times * took_s))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
         """While nobody else installs on it.

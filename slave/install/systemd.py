@@ -14,9 +14,6 @@ from dataclasses import dataclass
 from slave.install.errors import InstallError, NotReadyError
 from slave.install.program import finished
 
-_STEP_S = 0.25
-_COMMAND_S = 60.0
-_TRIES = 2  # ends after which it is not going to run; each second of waiting is one without its camera
 # Where systemd ends a service before its program begins (systemd.exec(5)): status -> what is wrong.
 _STATUS = {
     200: "200/CHDIR: its folder is missing",
@@ -54,7 +51,7 @@ class UnitState:
 Run = Callable[[Sequence[str]], str]
 
 
-def run_command(command: Sequence[str], deadline_s: float = _COMMAND_S) -> str:
+def run_command(command: Sequence[str], deadline_s: float = 60.0) -> str:
     """Run a command and return its output.
 
     Raises:
@@ -133,7 +130,9 @@ class Systemd:
             for unit in limits:
                 state = self.state(unit)
                 first[unit] = min(first[unit], state.restarts)  # a start by hand begins to count again
-                if state.restarts >= first[unit] + _TRIES:
+                # ends after which it is not going to run; each second of waiting is one without its camera
+                tries = 2
+                if state.restarts >= first[unit] + tries:
                     raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state, since)}")
                 if not state.active:
                     steady.pop(unit, None)
@@ -155,7 +154,8 @@ class Systemd:
                 raise NotReadyError(f"{late[0]} is not ready after {passed_s:.0f} s: {why}")
             if stayed and self._now() > max(ends.values()) + settle_s:
                 raise NotReadyError(f"{next(iter(limits))} does not stay ready for {settle_s:g} s")
-            self.sleep(_STEP_S)
+            step_s = 0.25
+            self.sleep(step_s)
 
     def _why(self, unit: str, state: UnitState, since: float, pid: int = 0) -> str:
         """Return the last log lines of a unit since a time, or how systemd ended it.

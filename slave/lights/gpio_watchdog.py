@@ -20,8 +20,6 @@ import sys
 
 LIT, DARK = b"1", b"0"
 SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL of linux/gpio.h: _IOWR(0xB4, 0x0F, two 64-bit words)
-BOTH = 0b11  # lines of the request, in its order
-INACTIVE = 0
 
 
 def main() -> int:
@@ -45,7 +43,9 @@ def main() -> int:
 def darken(lines: int) -> int:
     """Set both lines of a request inactive; 1: it cannot be done."""
     try:
-        fcntl.ioctl(lines, SET_VALUES, struct.pack("=QQ", INACTIVE, BOTH))  # bits, mask
+        both = 0b11  # lines of the request, in its order
+        inactive = 0
+        fcntl.ioctl(lines, SET_VALUES, struct.pack("=QQ", inactive, both))  # bits, mask
     except OSError:
         return 1
     return 0

@@ -24,15 +24,11 @@ from common.calibration.strobe import StrobeCalibration
 from common.errors import LightsError
 from common.recording.frame_recording import Illumination
 
-ADDRESS = 0x63  # 8.5.2.4
 # 8.6.1 to 8.6.12
 ENABLE, LED1_FLASH, LED2_FLASH, TIMING, FLAGS1, FLAGS2, DEVICE_ID = 0x01, 0x03, 0x04, 0x08, 0x0A, 0x0B, 0x0C
 STANDBY = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has an effect
 FLASH = {Illumination.LASER: 0x0D, Illumination.LED: 0x0E}  # 8.6.1: mode 11 (flash) with LED1, with LED2
-IS_ON = 0x0F  # 8.6.1: mode and LED bits
-TIMEOUT_10_MS = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset
-ID_MASK, LM3644, LM3644TT = 0x3F, 0x02, 0x04  # 8.6.12
-LEAST_A, STEP_A, MOST_CODE = 0.0109, 0.011725, 0x7F  # 8.6.3, 8.6.4: I = code x 11.725 mA + 10.9 mA
+LM3644TT = 0x04  # 8.6.12
 # 8.6.10, 8.6.11, from bit 0 on
 FAULTS1 = (
     "timeout",
@@ -65,7 +61,8 @@ class FlashDriverLights:
         """
         bus, colon, address = place.partition(":")
         try:
-            self._number, self._address = int(bus), int(address, 0) if colon else ADDRESS
+            # 8.5.2.4
+            self._number, self._address = int(bus), int(address, 0) if colon else 0x63
         except ValueError as error:
             raise LightsError(
                 f"--lights i2c:{place}: write i2c:BUS, or i2c:BUS:ADDRESS, for example i2c:1:0x63"
@@ -101,7 +98,8 @@ class FlashDriverLights:
         if self._closed:
             return
         self._write(ENABLE, STANDBY)
-        if (got := self._read(ENABLE)) & IS_ON:
+        is_on = 0x0F  # 8.6.1: mode and LED bits
+        if (got := self._read(ENABLE)) & is_on:
             raise LightsError(f"{self._where}: was sent to standby, and reports 0x{got:02x}: it may be lit")
         self._count_faults()
 
@@ -127,12 +125,14 @@ class FlashDriverLights:
         if self._bus is None:
             self._bus = self._opened()
         self._write(ENABLE, STANDBY)
-        kind = self._read(DEVICE_ID) & ID_MASK
-        if kind != LM3644:
+        id_mask, lm3644 = 0x3F, 0x02  # 8.6.12
+        kind = self._read(DEVICE_ID) & id_mask
+        if kind != lm3644:
             what = "an LM3644TT, whose shortest time-out is 40 ms" if kind == LM3644TT else f"id 0x{kind:02x}"
-            raise LightsError(f"{self._where}: is {what}; an LM3644 (id 0x{LM3644:02x}) is needed")
+            raise LightsError(f"{self._where}: is {what}; an LM3644 (id 0x{lm3644:02x}) is needed")
         laser, led = self._codes  # bit 7 of LED1's register clear: LED2 has a current of its own (8.6.3)
-        wanted = {LED1_FLASH: laser, LED2_FLASH: led, TIMING: TIMEOUT_10_MS, ENABLE: STANDBY}
+        timeout_10_ms = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset
+        wanted = {LED1_FLASH: laser, LED2_FLASH: led, TIMING: timeout_10_ms, ENABLE: STANDBY}
         for register, value in wanted.items():
             self._write(register, value)
         for register, value in wanted.items():
@@ -214,11 +214,12 @@ def current_code(current_a: float | None, light: str) -> int:
     Raises:
         LightsError: There is none, or it is out of range.
     """
-    most_a = LEAST_A + MOST_CODE * STEP_A
-    if current_a is None or not LEAST_A <= current_a <= most_a:
+    least_a, step_a, most_code = 0.0109, 0.011725, 0x7F  # 8.6.3, 8.6.4: I = code x 11.725 mA + 10.9 mA
+    most_a = least_a + most_code * step_a
+    if current_a is None or not least_a <= current_a <= most_a:
         has = "missing" if current_a is None else f"{current_a:g}"
         raise LightsError(
-            f"--lights i2c: strobe.{light}.current_a of the rig file: {has}; the chip has {LEAST_A:g} to"
+            f"--lights i2c: strobe.{light}.current_a of the rig file: {has}; the chip has {least_a:g} to"
             f" {most_a:.2f} A"
         )
-    return int((current_a - LEAST_A) / STEP_A + 1e-9)
+    return int((current_a - least_a) / step_a + 1e-9)

@@ -20,7 +20,6 @@ import numpy as np
 from common.recording.frame_recording import Illumination
 
 CYCLE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
-KEPT = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by a microsecond
 LEAST = 9  # stamps before anything is predicted
 AHEAD = 9  # periods after the last stamp: a frame is handed over late, and some may be lost
 OFF_LINE = 0.25  # periods; a stamp farther from the line belongs to another one
@@ -81,7 +80,8 @@ class StrobeSchedule:
         self._nominal_ns = 1e9 / frame_rate_hz
         self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)
         self.expose(exposure_us)
-        self._stamps: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        kept = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by a microsecond
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=kept)
         self._line: _Line | None = None
         self.restarts = 0
 

@@ -14,8 +14,6 @@ from slave.markers.blobs import SCALE, Blob
 from slave.markers.group import on_fringe
 
 LEAST = 40.0  # px^2: specks come and go in every picture
-SHARE = 0.3  # of the marker's area
-APART = 1.0  # of the marker's size between the two: what is nearer may be a piece of it
 
 
 class ColourAmbiguityMonitor:
@@ -47,7 +45,8 @@ class ColourAmbiguityMonitor:
             own = chosen.get(m)
             if len(options) <= (own is not None):
                 continue
-            least = LEAST if own is None else max(LEAST, SHARE * own.area)
+            share = 0.3  # of the marker's area
+            least = LEAST if own is None else max(LEAST, share * own.area)
             rims = [blob for n, blob in chosen.items() if n != m]
             for blob in options:
                 if blob.area < least:
@@ -61,7 +60,8 @@ class ColourAmbiguityMonitor:
 
 def _far(blob: Blob, own: Blob) -> bool:
     """Whether the boxes lie further apart than the marker is large."""
-    gap = APART * max(own.right - own.left, own.bottom - own.top)
+    apart = 1.0  # of the marker's size between the two: what is nearer may be a piece of it
+    gap = apart * max(own.right - own.left, own.bottom - own.top)
     return (
         blob.left > own.right + gap
         or blob.right < own.left - gap

@@ -41,18 +41,7 @@ from slave.markers.colours import (
     rows_of,
 )
 
-FRAMES_LEAST, FRAMES_MOST = 8, 60
-PIXELS_MOST = 60_000_000  # of all frames together: 180 MB
-SMOOTH = 2.5  # hues: standard deviation with which the hues of things are smoothed before peaks are sought
-SEEN_SHARE = 0.1  # of the frames in which a marker colour must be seen,
-SEEN_LEAST = 4  # and at least so many
-SIZE_SHARE = 0.25  # of the typical area of all; a smaller thing is the fringe of another
-ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest marker colour, makes it ambiguous
-AMBIGUOUS_SIZE, AMBIGUOUS_SHARE = (
-    0.3,
-    0.4,
-)  # a second thing this large, in this share of the frames: two marker colours of one hue
-BACKGROUND_FRAMES = 12  # from which the background's share is counted
+FRAMES_LEAST = 8
 UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not marker colour
 
 Notify = Callable[[str], None]
@@ -130,7 +119,9 @@ def frames_for(pixels: int) -> int:
 
     They are limited, though more of them would give more information.
     """
-    return int(np.clip(PIXELS_MOST // pixels, FRAMES_LEAST, FRAMES_MOST))
+    frames_most = 60
+    pixels_most = 60_000_000  # of all frames together: 180 MB
+    return int(np.clip(pixels_most // pixels, FRAMES_LEAST, frames_most))
 
 
 def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surroundings) -> list[MarkerColour]:
@@ -140,11 +131,14 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
         FitError: They cannot be distinguished.
     """
     frames = len(things)
-    least = max(SEEN_LEAST, SEEN_SHARE * frames)
+    seen_share = 0.1  # of the frames in which a marker colour must be seen,
+    seen_least = 4  # and at least so many
+    least = max(seen_least, seen_share * frames)
     every = [colour for colour in _by_hue(things) if len(colour.things) >= least]
     near_skin = [colour for colour in every if colour.skin >= SKIN_AROUND]
     typical = float(np.median([colour.area for colour in near_skin])) if near_skin else 0.0
-    near_skin = [colour for colour in near_skin if colour.area >= SIZE_SHARE * typical]
+    size_share = 0.25  # of the typical area of all; a smaller thing is the fringe of another
+    near_skin = [colour for colour in near_skin if colour.area >= size_share * typical]
     moving = [colour for colour in near_skin if colour.moved]
     # A colour that rested all the time looks like clutter but for the skin around it. It is taken when it is needed.
     resting = [
@@ -163,7 +157,9 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
             f"{_why_fewer(every, around)}"
         )
     _refuse_ambiguous(things, found[:count])
-    if len(found) > count and len(found[count].things) >= ALTERNATIVE * len(found[count - 1].things):
+    # a further hue seen this often, relative to the rarest marker colour, makes it ambiguous
+    alternative = 0.5
+    if len(found) > count and len(found[count].things) >= alternative * len(found[count - 1].things):
         raise FitError(
             f"{len(found)} colours move with the hand (hues {hues}), the rig has {count} markers: take off or cover "
             f"what else is coloured (sleeve, ring, nails), or give clicks"
@@ -208,7 +204,9 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
     hue = np.array([thing.hue for thing in flat])
     counts = np.bincount(hue.round().astype(int) % HUES, minlength=HUES).astype(np.float64)
     reach = np.minimum(np.arange(HUES), HUES - np.arange(HUES))
-    kernel = np.exp(-0.5 * (reach / SMOOTH) ** 2)
+    # hues: standard deviation with which the hues of things are smoothed before peaks are sought
+    smooth = 2.5
+    kernel = np.exp(-0.5 * (reach / smooth) ** 2)
     density = np.real(np.fft.ifft(np.fft.fft(counts) * np.fft.fft(kernel)))
     peaks: list[int] = []
     for k in np.argsort(-density, kind="stable"):
@@ -237,14 +235,16 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
 def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[MarkerColour]) -> None:
     for colour in colours:
         double = 0
+        # a second thing this large, in this share of the frames: two marker colours of one hue
+        ambiguous_size, ambiguous_share = 0.3, 0.4
         for largest in colour.things:
             others = [
                 t for t in things[largest.frame]
-                if t is not largest and t.area > AMBIGUOUS_SIZE * largest.area
+                if t is not largest and t.area > ambiguous_size * largest.area
                 and hue_separation(t.hue, colour.hue) < HUE_SEPARATION
             ]  # fmt: skip
             double += bool(others)
-        if double > AMBIGUOUS_SHARE * len(colour.things):
+        if double > ambiguous_share * len(colour.things):
             raise FitError(
                 f"two things of hue {colour.hue:.0f} move with the hand in {double} of {len(colour.things)} frames: "
                 f"two paints look the same (repaint one), or clothing has a paint's colour (cover it)"
@@ -281,7 +281,8 @@ def _others(
     """
     skins: list[Image] = []
     grounds: list[Image] = []
-    chosen = spread(len(images), BACKGROUND_FRAMES)
+    background_frames = 12  # from which the background's share is counted
+    chosen = spread(len(images), background_frames)
     largest = max(thing.area for colour in colours for thing in colour.things)
     for k in chosen:
         hsv = hsv_of(images[k])

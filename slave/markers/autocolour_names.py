@@ -29,17 +29,11 @@ from slave.markers.classify import HUES
 
 Complex = npt.NDArray[np.complex128]
 
-MOST, LEAST = 7, 5  # colours whose orders are tried: 5040 at most; fewer than five have no shape to go by
-MOST_RESIDUAL = 0.25  # relative; a fist, or a hand from the side, has more
-CLEARER = 0.75  # of the runner-up's residual
-VOTES_LEAST = 5
-VOTES_SHARE = 0.8  # of all votes
-HUE_CLEARER = 0.25  # of the runner-up's sum of squares
+LEAST = 5  # fewer than five have no shape to go by
 _OPEN = (
     "show the open hand, fingers spread, its back to the camera, for a second or more; or give clicks, or --like with "
     "a camera file whose colours are named"
 )
-CLICK_REACH = 6.0  # px between a click and the nearest pixel of its marker colour
 
 
 def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambda _text: None) -> Namer:
@@ -54,9 +48,10 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambd
     pattern = pattern_of(profile, names)
 
     def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
-        if not LEAST <= len(names) <= MOST:
+        most = 7  # colours whose orders are tried: 5040 at most
+        if not LEAST <= len(names) <= most:
             raise FitError(
-                f"{len(names)} markers cannot be named from the shape of the hand, only {LEAST} to {MOST}: give "
+                f"{len(names)} markers cannot be named from the shape of the hand, only {LEAST} to {most}: give "
                 f"clicks, or --like with a camera file whose colours are named"
             )
         orders = np.array(list(permutations(range(len(names)))))
@@ -66,13 +61,15 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambd
                 f"in {mirrored} of {len(uv)} frames the hand is the mirror image of {profile.name!r} "
                 f"({profile.side}): show the back of the hand, or choose the profile of the other side (rig.hand)"
             )
-        if len(votes) < VOTES_LEAST:
+        votes_least = 5
+        if len(votes) < votes_least:
             raise FitError(
                 f"only {len(votes)} of {len(uv)} frames look like the open hand of {profile.name!r}: {_OPEN}"
             )
         best, count = Counter(votes).most_common(1)[0]
         share = count / len(votes)
-        if share < VOTES_SHARE:
+        votes_share = 0.8  # of all votes
+        if share < votes_share:
             raise FitError(
                 f"the frames disagree about the names ({share:.0%} of {len(votes)} votes for the best order): {_OPEN}"
             )
@@ -120,9 +117,11 @@ def votes_of(uv: Float, pattern: Float, orders: Int) -> tuple[list[int], int]:
         residual = np.sqrt(np.maximum(0.0, 1.0 - np.abs(ideal.conj() @ z) ** 2))
         reflected = np.sqrt(max(0.0, 1.0 - float(np.max(np.abs(ideal @ z))) ** 2))
         first, second = np.argpartition(residual, 1)[:2]
-        if reflected < CLEARER * residual[first] and reflected < MOST_RESIDUAL:
+        most_residual = 0.25  # relative; a fist, or a hand from the side, has more
+        clearer = 0.75  # of the runner-up's residual
+        if reflected < clearer * residual[first] and reflected < most_residual:
             mirrored += 1
-        elif residual[first] < MOST_RESIDUAL and residual[first] < CLEARER * min(residual[second], reflected):
+        elif residual[first] < most_residual and residual[first] < clearer * min(residual[second], reflected):
             votes.append(int(first))
     return votes, mirrored
 
@@ -163,7 +162,8 @@ def by_hues(
         residual = np.array([float(np.square(shift).sum()) for shift in shifts])
         best = int(np.argmin(residual))
         worst = float(np.abs(shifts[best]).max())
-        if len(old) > 1 and residual[best] > HUE_CLEARER * float(np.sort(residual)[1]):
+        hue_clearer = 0.25  # of the runner-up's sum of squares
+        if len(old) > 1 and residual[best] > hue_clearer * float(np.sort(residual)[1]):
             raise FitError(
                 f"{where}: its hues fit in two orders alike: the light is too different; give clicks, or leave the "
                 f"names to the shape of the hand"
@@ -223,7 +223,8 @@ def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...],
                 v, u = np.divmod(first[0], width) if first else (np.array([np.inf]), np.array([np.inf]))
                 away.append(float(np.hypot(u - clicks[marker][0], v - clicks[marker][1]).min()))
             best = int(np.argmin(away))
-            if away[best] > CLICK_REACH:
+            click_reach = 6.0  # px between a click and the nearest pixel of its marker colour
+            if away[best] > click_reach:
                 raise FitError(f"clicks.{marker}: no moving paint at {clicks[marker]} in the first frame")
             if best in of:
                 raise FitError(f"clicks.{marker}: on the same paint as clicks.{of[best]}")

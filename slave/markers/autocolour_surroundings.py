@@ -31,21 +31,14 @@ from slave.markers.colours import HUE_GROW, PALE, circular_median, hue_distance
 
 MEDIAN_FRAMES = 25  # enough for a median; more only cost memory
 DIFFERENT = 25  # grey levels that no noise reaches, in any channel
-MOVING_LEAST = 0.002  # share of the image that must differ from the background in a typical frame
 SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
 SKIN_SATURATION = 30, 210
-DESK_FRAMES = 3  # from which the saturation of the desk is measured, noise included
 TILES = 8  # the image in so many rows and columns:
-DESK_SHARE = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
-DESK_TILE = 100.0  # where one pixel in so many has it
-DESK_TAIL = 99.9  # percentile of the desk's saturation that a marker colour must exceed
-HUE_NEAR = 3  # hues of one tint
 SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
 WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
 MOVED_FRAMES = 3
 SKIN_AROUND = 0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
 RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
-SKIN_DESK = 0.2  # share of the background that has the colour of skin, from which skin proves nothing: wood
 
 
 def background_of(images: Sequence[Image]) -> Image:
@@ -80,13 +73,14 @@ def skin_of(images: Sequence[Image], background: Image) -> Skin:
         skin = (hue >= SKIN_HUES[0]) | (hue <= SKIN_HUES[1])
         skin &= (saturation >= SKIN_SATURATION[0]) & (saturation <= SKIN_SATURATION[1])
         samples.append(hsv[skin & (hsv[:, 2] >= SKIN_VALUE)])
-    if moving < MOVING_LEAST:
+    moving_least = 0.002  # share of the image that must differ from the background in a typical frame
+    if moving < moving_least:
         raise FitError(
             f"nothing moves in these frames ({moving:.2%} of the image on average): record a few seconds of the open, "
             f"painted hand, back to the camera, moving about by more than its width"
         )
     pixels = np.concatenate(samples)
-    if len(pixels) < MOVING_LEAST * moving * background.shape[0] * background.shape[1] * len(chosen):
+    if len(pixels) < moving_least * moving * background.shape[0] * background.shape[1] * len(chosen):
         raise FitError("what moves in these frames has no skin: record the bare, painted hand")
     hue, saturation = circular_median(pixels[:, 0]), float(np.median(pixels[:, 1]))
     return Skin(hue, (max(0.5 * saturation, SKIN_SATURATION[0] * 0.8), 1.6 * saturation))
@@ -96,7 +90,9 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
     """Desk and clutter: what of the background is coloured."""
     empty = Surroundings(skin, _floor(images, background, skin), ())
     standing = things_of(background, 0, empty, border=True)
-    wooden = float(skin.mask(hsv_of(background)).mean()) > SKIN_DESK
+    # share of the background that has the colour of skin, from which skin proves nothing: wood
+    skin_desk = 0.2
+    wooden = float(skin.mask(hsv_of(background)).mean()) > skin_desk
     clutter: list[Thing] = []
     for thing in standing:
         if _moved(thing, images):
@@ -120,25 +116,30 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
     row: Int = np.arange(height, dtype=np.int64) * TILES // height
     column: Int = np.arange(width, dtype=np.int64) * TILES // width
     tile: Int = row[:, None] * TILES + column
-    for k in spread(len(images), DESK_FRAMES):
+    desk_frames = 3  # from which the saturation of the desk is measured, noise included
+    for k in spread(len(images), desk_frames):
         hsv = hsv_of(images[k])
         desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= DIFFERENT
         desk &= (hsv[..., 1] >= PALE) & (hsv[..., 2] >= DARK)
         samples.append(hsv[desk])
-        np.add.at(tiles, (hsv[desk][:, 0], tile[desk]), DESK_TILE / DESK_FRAMES)
+        desk_tile = 100.0  # where one pixel in so many has it
+        np.add.at(tiles, (hsv[desk][:, 0], tile[desk]), desk_tile / desk_frames)
+    hue_near = 3  # hues of one tint
     # A hue belongs to the desk where it and its neighbours are seen all over it.
     around = np.stack(
         [
-            tiles.take(range(h - HUE_NEAR, h + HUE_NEAR + 1), axis=0, mode="wrap").sum(axis=0)
+            tiles.take(range(h - hue_near, h + hue_near + 1), axis=0, mode="wrap").sum(axis=0)
             for h in range(HUES)
         ]
     )
-    everywhere = (around >= height * width / TILES**2).mean(axis=1) >= DESK_SHARE
+    desk_share = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
+    everywhere = (around >= height * width / TILES**2).mean(axis=1) >= desk_share
     floor = np.full(HUES, float(PALE))
     pixels = np.concatenate(samples)
     for hue in np.flatnonzero(everywhere):
-        near = pixels[hue_distance(pixels[:, 0], float(hue)) <= HUE_NEAR, 1]
-        floor[hue] = float(np.percentile(near, DESK_TAIL))
+        near = pixels[hue_distance(pixels[:, 0], float(hue)) <= hue_near, 1]
+        desk_tail = 99.9  # percentile of the desk's saturation that a marker colour must exceed
+        floor[hue] = float(np.percentile(near, desk_tail))
     floor[hue_distance(np.arange(HUES), skin.hue) <= SKIN_HALF_WIDTH] = 256.0
     return floor
 

@@ -17,10 +17,7 @@ from slave.markers.colours import HUE_GROW, SMALLEST, circular_median, hue_dista
 SKIN_VALUE = 60
 SKIN_HALF_WIDTH = 12  # in hue; nearer than this no marker colour can be distinguished from skin
 DARK = 40  # value below which hue is noise
-LARGEST = 0.05  # share of the image; a larger coloured thing is a sleeve
 RING = 2, 5  # px: skin is sought outside the mixed pixels of the rim, and near
-HUES_OF_ONE = 3  # pieces into which a thing of several hues is cut at most
-COVERED = 0.3  # share of a thing that lies on clutter of its hue: it is that clutter, or hidden before it
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +97,8 @@ def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = 
     for label in range(1, count):
         x, y, w, h, area = (int(value) for value in stats[label])
         cut = x == 0 or y == 0 or x + w == width or y + h == height
-        if area < SMALLEST or area > LARGEST * mask.size or (cut and not border):
+        largest = 0.05  # share of the image; a larger coloured thing is a sleeve
+        if area < SMALLEST or area > largest * mask.size or (cut and not border):
             continue
         piece = np.asarray(labels[y : y + h, x : x + w] == label)
         for part in _cut_by_hue(hsv[y : y + h, x : x + w, 0], piece):
@@ -123,7 +121,8 @@ def hides(thing: Thing, clutter: Thing) -> bool:
     if hue_separation(thing.hue, clutter.hue) > HUE_GROW:
         return False
     inside = np.isin(thing.pixels, clutter.pixels, assume_unique=True)
-    return float(inside.mean()) > COVERED
+    covered = 0.3  # share of a thing that lies on clutter of its hue: it is that clutter, or hidden before it
+    return float(inside.mean()) > covered
 
 
 def hsv_of(image: Image) -> Image:
@@ -138,7 +137,8 @@ def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
     """
     parts: list[Bool] = []
     rest = piece.copy()
-    for _ in range(HUES_OF_ONE):
+    hues_of_one = 3  # pieces into which a thing of several hues is cut at most
+    for _ in range(hues_of_one):
         if int(rest.sum()) < SMALLEST:
             break
         counts = np.bincount(hue[rest], minlength=HUES)[:HUES]

@@ -24,10 +24,7 @@ from slave.markers.classify import Codes
 SCALE = 4  # distance of the grid's lines [px]
 MAX_CANDIDATES = 6  # of one colour, the largest ones
 FULL = 0.6  # share of its box that one compact blob fills at least: an upright ellipse fills 0.79, two discs less
-FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest piece's size
-FRAGMENT_LEAST = 8.0  # px^2
-FRAGMENT_UNKNOWN = 0.3  # of the largest piece: a larger one is an alternative, where the whole is not known
 POINT = float(SCALE * SCALE)  # px^2; areas are known to about this
 
 
@@ -131,13 +128,17 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
     left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
     reach = FRAGMENT_GAP * math.sqrt(blob.area)
     known = math.isfinite(whole)
-    most = 1.3 * max(whole - blob.area, 0.0) if known else FRAGMENT_UNKNOWN * blob.area
+    # of the largest piece: a larger one is an alternative, where the whole is not known
+    fragment_unknown = 0.3
+    most = 1.3 * max(whole - blob.area, 0.0) if known else fragment_unknown * blob.area
     area, u, v = blob.area, blob.u * blob.area, blob.v * blob.area
     for piece in options:
+        fragment_share = 0.04  # of the largest piece, below which a piece is noise or fringe
+        fragment_least = 8.0  # px^2
         if (
             piece is blob
             or piece.area > blob.area
-            or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area)
+            or piece.area < max(fragment_least, fragment_share * blob.area)
         ):
             continue
         # Boxes leave open where between two points of the grid the colour ends: on average half of it, on each side.

@@ -33,7 +33,6 @@ DEEP = 42  # three pixels inside
 HOLE = 26  # not in the mask yet inside it: outside a straight edge the neighbourhood holds at most 21
 MIN_PIXELS = 4
 WITHIN = np.uint32(1 << 24)  # a packed pixel with any fourth channel is at least this
-UNEQUAL = 3.0  # largest to smallest window of one stack: beyond it, padding costs more than another stack
 SQUARE = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 FIRST, SECOND = np.array([0, 0, 1]), np.array([0, 1, 1])  # x x, x y, y y
 
@@ -87,12 +86,13 @@ def measure(
     if not blobs:
         return []
     sides = [max(b.right - b.left, b.bottom - b.top) + 2 * PAD for b in blobs]
-    if max(sides) <= UNEQUAL * min(sides):
+    unequal = 3.0  # largest to smallest window of one stack: beyond it, padding costs more than another stack
+    if max(sides) <= unequal * min(sides):
         return _measure_stack(image, table, bits, blobs, alone)
     found: list[Measured | None] = [None] * len(blobs)
     order = sorted(range(len(blobs)), key=sides.__getitem__)
     while order:
-        limit = UNEQUAL * sides[order[0]]
+        limit = unequal * sides[order[0]]
         group = [i for i in order if sides[i] <= limit]
         order = order[len(group) :]
         results = _measure_stack(

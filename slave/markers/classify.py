@@ -30,7 +30,6 @@ HUES = 180
 PLANES = (
     16  # of the table that are made at once: a thread beside a busy loop waits for its turn at every step
 )
-COARSE = 0xF8F8F8  # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
 # Skin of every tone lies between red and orange, less saturated than markers (Kalbfleisch: collides with red, orange
 # and yellow markers, which is why those are not used).
 SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
@@ -153,10 +152,12 @@ class ColourTable:
         if self._index.shape != words.shape:
             self._index = np.empty(words.shape, np.int64)
             self._codes = np.empty(words.shape, self._table.dtype)
+        # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
+        coarse = 0xF8F8F8
         if self._coarse is not None:
-            np.bitwise_and(words >> (11 if late else 3), COARSE >> 3, out=self._index, casting="unsafe")
+            np.bitwise_and(words >> (11 if late else 3), coarse >> 3, out=self._index, casting="unsafe")
             return self._coarse.take(self._index, out=self._codes, mode="clip")
-        np.bitwise_and(words >> 8 if late else words, COARSE, out=self._index, casting="unsafe")
+        np.bitwise_and(words >> 8 if late else words, coarse, out=self._index, casting="unsafe")
         return self._table.take(self._index, out=self._codes, mode="clip")
 
 

@@ -20,12 +20,8 @@ from slave.markers.classify import HUES
 
 TIME_S = 0.5
 LEAST_S = 0.3  # of observations before a verdict
-GOOD = 0.4  # clarity of an observation that counts: a half covered marker is mixed with what covers it
-ROOM = 2.0  # spreads: less is a warning; a marker that is warned of is well again with
-WELL = 3.0
 # Smallest spread that is assumed, of hue (of 180), saturation and value (of 255): what noise leaves of one pixel.
 FLOOR = np.array([1.5, 8.0, 8.0])
-APART = 8.0  # hues: two marker colours nearer than this look the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +92,15 @@ class ColourMonitor:
         """
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0) * 1e-9, TIME_S)
         self._t_ns = t_ns
-        good = np.isfinite(light).all(axis=1) & (np.nan_to_num(clarity) >= GOOD)
+        # clarity of an observation that counts: a half covered marker is mixed with what covers it
+        good = np.isfinite(light).all(axis=1) & (np.nan_to_num(clarity) >= 0.4)
         if good.any():
             self._learn(good, hsv(np.maximum(light[good], 1e-5)), dt_s)
         room = self.room()
         with np.errstate(invalid="ignore"):
-            self._warned = np.where(np.isnan(room), self._warned, room < np.where(self._warned, WELL, ROOM))
+            # spreads: less is a warning; a marker that is warned of is well again with
+            well = 3.0
+            self._warned = np.where(np.isnan(room), self._warned, room < np.where(self._warned, well, 2.0))
         warned = [self._of(int(m), float(room[m])) for m in np.flatnonzero(self._warned)]
         return warned + self._ambiguous()
 
@@ -142,7 +141,8 @@ class ColourMonitor:
         apart = np.minimum(apart, HUES - apart)
         long = self._monitored_s >= LEAST_S
         with np.errstate(invalid="ignore"):
-            near = (apart < APART) & long[:, None] & long[None, :]
+            # hues: two marker colours nearer than this look the same
+            near = (apart < 8.0) & long[:, None] & long[None, :]
         return [
             ColourWarning(
                 self._names[a],

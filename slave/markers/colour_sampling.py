@@ -36,16 +36,6 @@ from slave.markers.colours import (
     surroundings,
 )
 
-NEAR_SHARE = 0.02  # of the image width: a click as far beside a marker is meant for it
-SLIP_PX = 4.0  # a click on the rim of a marker is meant for what lies so far inside
-LARGEST_SHARE = 0.1  # of the image; a larger patch is no marker
-UNEVEN = (
-    7.0  # hues: the 95th percentile of the distance from the median, of one marker colour in one light less
-)
-OWN_LEAST = 0.8  # share of the marker's pixels that its range must hold
-SKIN_MOST = 0.1  # share of the skin around that it may hold
-PIXELS_MOST = 4000  # of one marker colour that are kept
-
 
 @dataclass(frozen=True, slots=True)
 class ColourSample:
@@ -111,7 +101,8 @@ class SampledColours:
             for name, colour in ranges.items()
             if name not in picked
         }
-        picked[marker] = pixels[:: max(len(pixels) // PIXELS_MOST, 1)]
+        pixels_most = 4000  # of one marker colour that are kept
+        picked[marker] = pixels[:: max(len(pixels) // pixels_most, 1)]
         self._samples, self._made = picked, made
         return ColourSample(kept | made, rows[marker])
 
@@ -155,12 +146,14 @@ def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
             "on its middle"
         ) from error
     hues = hsv[..., 0][mask]
-    if (share := float(mask.mean())) > LARGEST_SHARE:
+    largest_share = 0.1  # of the image; a larger patch is no marker
+    if (share := float(mask.mean())) > largest_share:
         raise FitError(
             f"{where}: what has this colour covers {share:.0%} of the picture, which is no marker: click on the "
             "paint, or take away what has its colour"
         )
-    if (uneven := float(np.percentile(hue_distance(hues, circular_median(hues)), 95))) > UNEVEN:
+    # hues: the 95th percentile of the distance from the median, of one marker colour in one light less
+    if (uneven := float(np.percentile(hue_distance(hues, circular_median(hues)), 95))) > 7.0:
         raise FitError(
             f"{where} is not of one colour (hues {uneven:.0f} apart): repaint it evenly, or light it evenly"
         )
@@ -173,7 +166,8 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
     None: there is no coloured region.
     """
     width = hsv.shape[1]
-    near = NEAR_SHARE * width
+    near_share = 0.02  # of the image width: a click as far beside a marker is meant for it
+    near = near_share * width
     reach = int(near + 8)
     u0, v0 = max(round(uv[0]) - reach, 0), max(round(uv[1]) - reach, 0)
     window = hsv[v0 : round(uv[1]) + reach + 1, u0 : round(uv[0]) + reach + 1]
@@ -187,7 +181,8 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
     if nearest > near:
         return None
     depth = cv2.distanceTransform(coloured.astype(np.uint8), cv2.DIST_L2, 3)
-    allowed = inside & (away <= nearest + SLIP_PX)
+    slip_px = 4.0  # a click on the rim of a marker is meant for what lies so far inside
+    allowed = inside & (away <= nearest + slip_px)
     best = int(np.argmax(np.where(allowed, depth - 0.25 * away, -np.inf)))
     row, column = divmod(best, coloured.shape[1])
     return float(column + u0), float(row + v0)
@@ -215,12 +210,14 @@ def _refuse_like(marker: str, samples: Mapping[str, Image]) -> None:
 
 
 def _refuse_poor(row: ColourRow) -> None:
-    if row.own < OWN_LEAST:
+    own_least = 0.8  # share of the marker's pixels that its range must hold
+    if row.own < own_least:
         raise FitError(
             f"pick {row.name}: between its neighbours' hues its range {row.range.hsv_low}-{row.range.hsv_high} would "
             f"hold only {row.own:.0%} of its paint: repaint it in a colour farther from the others"
         )
-    if row.skin > SKIN_MOST:
+    skin_most = 0.1  # share of the skin around that it may hold
+    if row.skin > skin_most:
         raise FitError(
             f"pick {row.name}: its range would hold {row.skin:.0%} of the skin around: repaint it in a colour that is "
             "farther from skin (not red, orange or yellow)"

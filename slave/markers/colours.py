@@ -21,18 +21,12 @@ from common.geometry.srgb import to_linear
 from slave.markers.classify import HUES, in_range
 
 HUE_GROW = 10  # how far the hue of one marker varies between its lit and its shadow side
-HUE_MARGIN = 14  # widest half range; other marker colours and skin narrow it
 HUE_SEPARATION = 8  # two marker colours nearer than this look the same
-SATURATION_SHARE = 0.45  # of the marker's median: a rim pixel is about half marker
-SATURATION_LEAST = 50
-VALUE_SHARE = 0.3  # of the marker's median: the shadow side belongs to the cap
 VALUE_LEAST = 25  # below, hue is noise
 PALE = 60  # saturation below which no marker colour can be distinguished from a grey desk
 AROUND = 25  # px around the markers in which skin is sampled
 RIM = 4  # px around a marker that are partly marker colour
 SMALLEST = 6  # px of marker colour
-VISIBLE_PX = 24  # background pixels inside a range that may look like a marker; fewer are a speck
-BACKGROUND_TAIL = 99.9  # percentile of the background's saturation that a range stays above
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +120,11 @@ def report(rows: list[ColourRow]) -> str:
     bad = [r.name for r in rows if r.others or r.skin > 0.001 or r.background > 0.001]
     advice = "take another paint, or remove what has this colour from the picture"
     lines.append(f"collisions: {', '.join(bad)}: {advice}" if bad else "no collisions")
+    visible_px = 24  # background pixels inside a range that may look like a marker; fewer are a speck
     lines += [
         f"warning: {r.name}: {r.background_px:.0f} background pixels per frame are inside its range"
         for r in rows
-        if r.background_px >= VISIBLE_PX
+        if r.background_px >= visible_px
     ]
     return "\n".join(lines)
 
@@ -211,19 +206,24 @@ def _limits(name: str, hue: Mapping[str, float], skin_hue: float | None) -> tupl
     obstacles = [h for other, h in hue.items() if other != name] + ([] if skin_hue is None else [skin_hue])
     below = min((((hue[name] - h) % HUES) / 2.0 for h in obstacles), default=HUES)
     above = min((((h - hue[name]) % HUES) / 2.0 for h in obstacles), default=HUES)
+    hue_margin = 14  # widest half range; other marker colours and skin narrow it
     # One hue between two ranges belongs to neither: ranges that touch would both claim it after rounding.
-    return int(min(HUE_MARGIN, below - 0.5)), int(min(HUE_MARGIN, above - 0.5))
+    return int(min(hue_margin, below - 0.5)), int(min(hue_margin, above - 0.5))
 
 
 def _range(paint: Image, hue: float, limits: tuple[int, int], background: Image, frames: int) -> HsvRange:
     middle = round(hue)
     low, high = (middle - limits[0]) % HUES, (middle + limits[1]) % HUES
-    saturation = max(SATURATION_LEAST, SATURATION_SHARE * float(np.median(paint[:, 1])))
-    value = max(VALUE_LEAST, VALUE_SHARE * float(np.median(paint[:, 2])))
+    saturation_share = 0.45  # of the marker's median: a rim pixel is about half marker
+    saturation_least = 50
+    saturation = max(saturation_least, saturation_share * float(np.median(paint[:, 1])))
+    value_share = 0.3  # of the marker's median: the shadow side belongs to the cap
+    value = max(VALUE_LEAST, value_share * float(np.median(paint[:, 2])))
     same_hue = in_range(background, HsvRange(hsv_low=(low, 0, 0), hsv_high=(high, 255, 255)))
     seen = background[same_hue][:, 1]
     if seen.size > 1000 * frames:  # a desk of that tint, not an object
-        floor = float(np.percentile(seen, BACKGROUND_TAIL)) + 5.0
+        background_tail = 99.9  # percentile of the background's saturation that a range stays above
+        floor = float(np.percentile(seen, background_tail)) + 5.0
         saturation = max(saturation, min(floor, 0.7 * float(np.median(paint[:, 1]))))
     return HsvRange(
         hsv_low=(low, round(saturation), round(value)),

@@ -43,18 +43,7 @@ from slave.markers.roi import Track, Window, advance
 from slave.markers.scan import Scanned, Scanner
 from slave.markers.sigma import COVERED_PX, sigma_of
 
-CLICK_REACH = 6  # px between a click and the scanned box of its marker
-FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
-SLIVER = 14.0  # px^2; a thinner sliver cannot be distinguished from a fringe
-SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
-DIGITS = 6  # of what is reported: what comes after them differs between processors
 NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
-NEAR = 3.0  # sides of the marker: an alternative so near may be taken for it in the next frame
-ALTERNATIVES = 2  # that are measured in one frame
-ALTERNATIVE = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
-JUDGED = (
-    6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +176,8 @@ class MarkerDetector:
                 if alternative is not None:
                     alternatives[m] = alternative
         # An alternative costs as much as a marker, so a frame full of them is not measured through.
-        closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:ALTERNATIVES]
+        # that are measured in one frame
+        closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:2]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
         bits = [self._table.bits[m] for m, _ in asked]
@@ -195,10 +185,12 @@ class MarkerDetector:
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 alternatives[m] = alternatives[m]._replace(u=seen.u, v=seen.v)
+        fringe = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
+        sliver = 14.0  # px^2; a thinner sliver cannot be distinguished from a fringe
         seen_as = {
             m: seen
             for m, seen in zip(rows, measured, strict=False)
-            if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER))
+            if seen is not None and not (seen.thin and (seen.foreign > fringe or seen.area < sliver))
         }
         outlines = self._outlines.push(image, seen_as, [m for m in seen_as if windows[m] is None])
         reports: dict[int, tuple[float, ...]] = {}
@@ -211,7 +203,8 @@ class MarkerDetector:
         values: list[float] = []
         for m in range(len(self._names)):
             values += reports.get(m, NOT_SEEN)
-        result = np.array(values).round(DIGITS).reshape(-1, len(NOT_SEEN)).T
+        digits = 6  # of what is reported: what comes after them differs between processors
+        result = np.array(values).round(digits).reshape(-1, len(NOT_SEEN)).T
         return Detections(
             result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7], result[8:].T
         )
@@ -280,11 +273,14 @@ class MarkerDetector:
         """
         other = (math.nan, math.nan) if alternative is None else (alternative.u, alternative.v)
         support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
-        near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
+        # sides of the marker: an alternative so near may be taken for it in the next frame
+        near = math.hypot(other[0] - seen.u, other[1] - seen.v) < 3.0 * math.sqrt(blob.area)  # NaN is not
         if before is None:
             self._lonely[m] = alternative is None
         clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
-        if before is None or not clear or near or m % JUDGED == self._frame % JUDGED:
+        # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
+        judged = 6
+        if before is None or not clear or near or m % judged == self._frame % judged:
             self.evidence[m] = evidence_of(
                 seen, self._gains, self._colours[m], support, near or not self._lonely[m]
             )
@@ -295,7 +291,8 @@ class MarkerDetector:
         sigma = sigma_of(seen, before, track, self._exposure_s, outline)
         u, v, area = seen.u, seen.v, seen.area
         smear = math.hypot(track.du, track.dv) * self._exposure_s
-        if before is not None and track.covered and smear < SMEARED and clear:
+        smeared = 2.0  # px of way during the exposure from which an edge is no edge
+        if before is not None and track.covered and smear < smeared and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
             if whole is not None and fits_occlusion(
@@ -315,7 +312,8 @@ class MarkerDetector:
 
         Its size and motion must allow it; a blob that is the rim of another one is excluded.
         """
-        least, most = ALTERNATIVE * blob.area, blob.area / ALTERNATIVE
+        alternative = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
+        least, most = alternative * blob.area, blob.area / alternative
         others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
         if window is not None:
             others = [b for b in others if math.isfinite(window.cost(b))]
@@ -401,7 +399,8 @@ class MarkerDetector:
         if initial_uv is not None:
             x = max(blob.left - initial_uv[0], initial_uv[0] - blob.right, 0.0)
             y = max(blob.top - initial_uv[1], initial_uv[1] - blob.bottom, 0.0)
-            if max(x, y) <= CLICK_REACH:
+            click_reach = 6  # px between a click and the scanned box of its marker
+            if max(x, y) <= click_reach:
                 return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
         track = self._tracks[m]
         return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0

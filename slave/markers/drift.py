@@ -30,23 +30,11 @@ LIMIT_RED, LIMIT_BLUE = 2.2, 3.6
 LIMIT_EXPOSURE = 2.5  # of green
 LOG_LIMITS = math.log(LIMIT_BLUE), math.log(LIMIT_EXPOSURE), math.log(LIMIT_RED)
 RATE_PER_S = 0.5  # largest rate of each of the three: 3000 -> 6500 K within 10 s is at most 0.25
-TIME_S = 1.0  # time constant of following
-ANCHOR_S, MANY = 5.0, 4  # time constant of the anchor, and how many markers move it
-EVERY_NS = 100_000_000  # colours are looked at so often; light has no need of more
 # How far the light may be from the anchor (sd of each channel, and of all together): what a look constrains well it
 # decides, and a lone marker, which constrains two channels at most, moves the third one little.
 WEAK, WEAK_TOGETHER = 0.3, 0.6
 KNOWN = np.asarray(np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2), np.float64)
-OUTLIER = 0.01  # linear light of sheen and skin on a marker, as it comes and goes
-UNEVEN = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
-SHADING = 0.35  # relative: the light on one marker against another's
-CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it constrains no gain
-CAUCHY = (
-    2.5  # standard deviations (of three channels, whose mean is 1.6) at which a marker has half its weight
-)
-ROUNDS = 3
 EYE = np.eye(3)
-GAP_NS = 500_000_000  # a step in time is taken as no longer than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,17 +65,24 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
         return GainFit(known, residual)
     now, then = colour[seen], reference[seen]
     shift = np.log(now / then)
-    variance = UNEVEN**2 + (OUTLIER * np.exp(known) / now) ** 2 + (OUTLIER / then) ** 2
-    variance[now > CLIPPED] += 1.0
+    outlier = 0.01  # linear light of sheen and skin on a marker, as it comes and goes
+    uneven = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
+    variance = uneven**2 + (outlier * np.exp(known) / now) ** 2 + (outlier / then) ** 2
+    clipped = 0.9  # linear light; of a brighter mean many pixels are clipped, and it constrains no gain
+    variance[now > clipped] += 1.0
     # The inverse of diag(variance) + SHADING^2 for each marker, by Sherman and Morrison.
     sure = 1.0 / variance
-    shared = sure / np.sqrt(SHADING**-2 + sure.sum(axis=1, keepdims=True))
+    shading = 0.35  # relative: the light on one marker against another's
+    shared = sure / np.sqrt(shading**-2 + sure.sum(axis=1, keepdims=True))
     information = sure[:, :, None] * EYE - shared[:, :, None] * shared[:, None, :]
     trust, x = weight[seen], known
-    for _ in range(ROUNDS):
+    rounds = 3
+    for _ in range(rounds):
         away = shift - x
         distance = _distance(away, information)
-        heavy = (trust * (1.0 / (1.0 + (distance / CAUCHY) ** 2)))[:, None, None] * information
+        # standard deviations (of three channels, whose mean is 1.6) at which a marker has half its weight
+        cauchy = 2.5
+        heavy = (trust * (1.0 / (1.0 + (distance / cauchy) ** 2)))[:, None, None] * information
         total = heavy.sum(axis=0) + KNOWN
         right_side = (heavy @ shift[:, :, None]).sum(axis=0)[:, 0] + KNOWN @ known
         x = np.asarray(np.linalg.solve(total, right_side), np.float64)
@@ -164,15 +159,19 @@ class ColourDrift:
             clarity: (M,) 0..1; NaN: not seen.
             t_ns: Time of the frame [ns], rising.
         """
-        if self._t_ns is not None and 0 <= t_ns - self._t_ns < EVERY_NS:
+        every_ns = 100_000_000  # colours are looked at so often; light has no need of more
+        if self._t_ns is not None and 0 <= t_ns - self._t_ns < every_ns:
             return None
-        dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), GAP_NS) * 1e-9
+        gap_ns = 500_000_000  # a step in time is taken as no longer than this
+        dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), gap_ns) * 1e-9
         self._t_ns = t_ns
         fit = fit_gains(colour, self._reference, np.nan_to_num(clarity), self._anchor)
-        blue, green, red = (-math.expm1(-dt_s / TIME_S) * (fit.log_gains - self._x)).tolist()
+        time_s = 1.0  # time constant of following
+        blue, green, red = (-math.expm1(-dt_s / time_s) * (fit.log_gains - self._x)).tolist()
         most = RATE_PER_S * dt_s
         b, g, r = (min(max(step, -most), most) for step in (blue - green, green, red - green))
         self._x = bounded(self._x + np.array([g + b, g, g + r]))
-        if np.count_nonzero(np.isfinite(fit.residual)) >= MANY:
-            self._anchor = self._anchor - math.expm1(-dt_s / ANCHOR_S) * (self._x - self._anchor)
+        anchor_s, many = 5.0, 4  # time constant of the anchor, and how many markers move it
+        if np.count_nonzero(np.isfinite(fit.residual)) >= many:
+            self._anchor = self._anchor - math.expm1(-dt_s / anchor_s) * (self._x - self._anchor)
         return fit

@@ -22,15 +22,7 @@ from common.arrays import Float
 Float32: TypeAlias = npt.NDArray[np.float32]
 
 RAYS = 48
-STEP_PX = 0.5
-ROUNDS = 6
 KEEP = (RAYS // 2, RAYS * 11 // 20)  # rays that the first rounds trust
-DONE_PX = 0.06  # a shift that changes nothing
-SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
-LEFT = 0.45  # share of the rays that must be left
-FIT_PX = 0.35  # RMS of their residuals
-UNSURE = 0.05  # by so much the hidden share may be larger than estimated from the areas,
-UNSURE_PX = 0.3  # and a centre off: two standard deviations
 _ANGLES = np.arange(RAYS, dtype=np.float64) * (2.0 * math.pi / RAYS)
 DIRECTIONS: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1).astype(np.float64)
 
@@ -83,17 +75,20 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     centre: Float = np.array([u, v])
     own = np.ones(RAYS, np.bool_)
     residual: Float = np.zeros(RAYS)
-    for iteration in range(ROUNDS):
+    rounds = 6
+    for iteration in range(rounds):
         away = points - centre
         inner = away @ inverse
         level = np.sqrt(np.maximum((away * inner).sum(axis=1), 1e-9))  # 2 on the ellipse
         slope: Float = inner / level[:, None]
         length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
         residual = (level - 2.0) / length  # distance from the ellipse, outwards positive
+        short_px = 0.6  # a ray that ends so much before the ellipse sees something else
         # At first the centre is off by a part of the radius, and the own edge is where the distances are largest.
-        least = -SHORT_PX if iteration >= len(KEEP) else float(np.sort(residual)[RAYS - KEEP[iteration]])
+        least = -short_px if iteration >= len(KEEP) else float(np.sort(residual)[RAYS - KEEP[iteration]])
         kept = residual >= least
-        if kept.sum() < LEFT * RAYS:
+        left = 0.45  # share of the rays that must be left
+        if kept.sum() < left * RAYS:
             return None
         normal: Float = slope[kept] / length[kept, None]
         try:
@@ -101,11 +96,13 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         except np.linalg.LinAlgError:
             return None  # no edge about the centroid: that of a thin crescent lies beside its pixels
         centre += shift
-        if iteration >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
+        done_px = 0.06  # a shift that changes nothing
+        if iteration >= len(KEEP) and float(np.abs(shift).max()) < done_px:
             break
         own = kept
     rms = float(np.sqrt(np.mean(np.square(residual[own]))))
-    if rms > FIT_PX or float(np.hypot(*(centre - (u, v)))) > longest:
+    fit_px = 0.35  # RMS of their residuals
+    if rms > fit_px or float(np.hypot(*(centre - (u, v)))) > longest:
         return None
     return Centre(float(centre[0]), float(centre[1]), rms)
 
@@ -123,7 +120,9 @@ def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
         return False
     squared = (du * du * shape.yy - 2.0 * du * dv * shape.xy + dv * dv * shape.xx) / determinant
     radius = 2.0 * math.sqrt(math.sqrt(determinant))  # of a disc of the same area
-    return 0.5 * math.sqrt(squared) <= float(np.interp(hidden + UNSURE, _SHARE, _WAY)) + UNSURE_PX / radius
+    unsure = 0.05  # by so much the hidden share may be larger than estimated from the areas,
+    unsure_px = 0.3  # and a centre off: two standard deviations
+    return 0.5 * math.sqrt(squared) <= float(np.interp(hidden + unsure, _SHARE, _WAY)) + unsure_px / radius
 
 
 def _edge(share: Float32, start: Float, reach: float) -> Float:
@@ -131,10 +130,11 @@ def _edge(share: Float32, start: Float, reach: float) -> Float:
 
     The edge is where the shares fall to a half: the marker colour on each ray is added up.
     """
-    steps = (np.arange(math.ceil(reach / STEP_PX)) + 0.5) * STEP_PX
+    step_px = 0.5
+    steps = (np.arange(math.ceil(reach / step_px)) + 0.5) * step_px
     x = (start[0] + DIRECTIONS[:, :1] * steps).astype(np.float32)
     y = (start[1] + DIRECTIONS[:, 1:] * steps).astype(np.float32)
     along = cast(Float32, cv2.remap(share, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
     # Marker pixels beyond a gap are not on this ray's stretch: only what comes before the first empty step counts.
     gone = np.maximum.accumulate(along < 0.1, axis=1)
-    return np.where(gone, 0.0, along).sum(axis=1) * STEP_PX
+    return np.where(gone, 0.0, along).sum(axis=1) * step_px

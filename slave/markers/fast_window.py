@@ -24,7 +24,6 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 Three: TypeAlias = tuple[float, float, float]
 
 EDGE = 4  # px
-CACHE_LINE = 64  # bytes
 OWN, OTHER = 1, 2  # classes
 CORE, INNER, NEAR, SOLID = 1, 2, 4, 8  # kinds
 SHIFTS = tuple(np.uint64(n) for n in (3, 5, 10))  # of one type with what they shift
@@ -114,7 +113,8 @@ def _ask_ahead(image: Image, asked: Int, pad: int) -> int:
         x0, x1 = max(asked[k, LEFT] - pad, 0), min(asked[k, RIGHT] + pad, image.shape[1])
         for y in range(max(asked[k, TOP] - pad, 0), min(asked[k, BOTTOM] + pad, image.shape[0])):
             row = image[y, x0:x1]
-            for x in range(0, len(row), CACHE_LINE // 3):
+            cache_line = 64  # bytes
+            for x in range(0, len(row), cache_line // 3):
                 touched |= row[x, 0]
     return touched
 

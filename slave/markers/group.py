@@ -23,16 +23,9 @@ from slave.markers.classify import Codes
 REACH = 8.5  # marker sizes between neighbours of one hand
 SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
-FRINGE = 0.3  # what a fringe counts
-SAME = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
-FRINGE_RATIO = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
 CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every alternative of its marker
 TRACKED = 1.0  # bonus of the blob where the marker is expected: as much as being there
 SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
-STRANGE_SIZE = 2.5  # typical areas of the group, and
-STRANGE_SHARE = 0.6  # of its largest: above the lesser of the two, a skinless blob is clutter
-STRANGE_FILL = 0.3  # of its box; less is thin like a pen
-SECOND_HAND = 3  # markers
 
 
 class Candidate(NamedTuple):
@@ -61,7 +54,8 @@ class Candidate(NamedTuple):
 
 def candidate(marker: int, blob: Blob, skin: float, fringe: bool, bonus: float) -> Candidate:
     """A candidate with its size and its score."""
-    there = min(1.0, blob.area / SPECK) ** 2 * (FRINGE if fringe else 1.0)
+    # what a fringe counts
+    there = min(1.0, blob.area / SPECK) ** 2 * (0.3 if fringe else 1.0)
     score = there * (1.0 + min(1.0, 3.0 * skin)) + bonus
     return Candidate(marker, blob, skin, fringe, bonus, math.sqrt(blob.area), score)
 
@@ -89,15 +83,17 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
     It touches one that is much larger, or its middle lies in or next to the box of one that is as large: motion
     blur makes rims wide.
     """
+    same = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
+    fringe_ratio = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
     return any(
         blob.left < other.right  # boxes are as wide as the grid leaves open, so neighbours overlap
         and other.left < blob.right
         and blob.top < other.bottom
         and other.top < blob.bottom
         for other in others
-        if other.area > FRINGE_RATIO * blob.area
+        if other.area > fringe_ratio * blob.area
         or (
-            other.area > SAME * blob.area
+            other.area > same * blob.area
             and other.left - SCALE <= blob.u <= other.right + SCALE
             and other.top - SCALE <= blob.v <= other.bottom + SCALE
         )
@@ -149,7 +145,8 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     second = [candidates[i] for i in _best_group(candidates, links, free)]
     second = [c for c in second if c.blob.area >= SPECK or c.bonus >= TRACKED]
     solid = [c for c in second if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
-    if len(solid) >= SECOND_HAND:
+    second_hand = 3  # markers
+    if len(solid) >= second_hand:
         markers = {c.marker for c in solid}
         found |= {c.marker: c for c in second if c.marker in markers or not _strange(c, solid)}
     return found
@@ -231,8 +228,11 @@ def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
     slack = SCALE - 1  # of the box, see `Blob`
     fill = blob.area / (max(blob.right - blob.left - slack, 1) * max(blob.bottom - blob.top - slack, 1))
     largest, typical = max(c.blob.area for c in others), _median([c.blob.area for c in others])
-    return blob.area > min(STRANGE_SIZE * typical, STRANGE_SHARE * largest) or (
-        blob.area >= SPECK and fill < STRANGE_FILL
+    strange_size = 2.5  # typical areas of the group, and
+    strange_share = 0.6  # of its largest: above the lesser of the two, a skinless blob is clutter
+    strange_fill = 0.3  # of its box; less is thin like a pen
+    return blob.area > min(strange_size * typical, strange_share * largest) or (
+        blob.area >= SPECK and fill < strange_fill
     )
 
 

@@ -27,24 +27,15 @@ from common.geometry.srgb import gain_tables, to_linear
 from slave.markers.classify import ColourTable
 from slave.markers.drift import bounded, fit_gains
 
-WIEN_NM_K = 1.4388e7  # second radiation constant [nm K]
 WAVELENGTHS_NM = np.array([460.0, 540.0, 605.0])  # middles of blue, green and red of common sensors
-STEP, REACH = 15e-6, 210e-6  # reciprocal kelvin: 3000 to 6500 K is 180e-6
 STRIDE = 2  # pixels of every second row and column are plenty
-SPECK = 6  # of these pixels; smaller blobs prove nothing
-LARGEST = 0.1  # of the image; a larger blob is no marker
 FITS = (
     3.0  # standard deviations (of three channels, whose mean is 1.6) at which a blob proves nothing any more
 )
-TINT = 0.25  # log gain of red against green by which lamps of rooms may lie off the line of black bodies
 PROOF = 2  # markers that must fit: one colour fits some light always
-PROOF_ELSEWHERE = 3  # of a light that is clearly not the expected one: two colours fit some other light often
 AHEAD = 0.7  # markers by which the best light must lead every light that is clearly another
 OTHER = 0.2  # log gains of red or blue against green by which two lights are clearly different
-EXPECTED = 0.3  # markers that the expected light is worth by itself
 LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)
-BLOBS_EACH = 3  # of each colour, the largest
-ROUNDED = 1e-9  # log gains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +75,8 @@ def initial_white_balance(image: Image, table: ColourTable, reference: Float, ex
     def score_of(item: Evidence) -> float:
         if item.beyond:
             return 0.0
-        return item.score + (0.0 if different(item.log_gains, expected) else EXPECTED)
+        # markers that the expected light is worth by itself
+        return item.score + (0.0 if different(item.log_gains, expected) else 0.3)
 
     half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
     tried = [evidence(half, table, reference, gains) for gains in (expected, *lights())]
@@ -94,19 +86,24 @@ def initial_white_balance(image: Image, table: ColourTable, reference: Float, ex
         if score_of(again) < score_of(best):
             break
         best = again
-    if best.matched < PROOF or off_line(best.log_gains) > TINT:
+    tint = 0.25  # log gain of red against green by which lamps of rooms may lie off the line of black bodies
+    if best.matched < PROOF or off_line(best.log_gains) > tint:
         return best
     other = max((score_of(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
     typical = max((score_of(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
-    least = min(PROOF_ELSEWHERE, len(reference)) if different(best.log_gains, expected) else PROOF
+    # of a light that is clearly not the expected one: two colours fit some other light often
+    proof_elsewhere = 3
+    least = min(proof_elsewhere, len(reference)) if different(best.log_gains, expected) else PROOF
     proven = best.matched >= least and score_of(best) - other >= AHEAD
     return replace(best, proven=proven, excluded=score_of(best) - typical >= AHEAD)
 
 
 def lights() -> Float:
     """Log gains (L, 3) of the lights that are tried, from the coolest to the warmest."""
-    steps = np.arange(-REACH, REACH + STEP / 2, STEP)
-    gains = -WIEN_NM_K * steps[:, None] / WAVELENGTHS_NM
+    step, reach = 15e-6, 210e-6  # reciprocal kelvin: 3000 to 6500 K is 180e-6
+    steps = np.arange(-reach, reach + step / 2, step)
+    wien_nm_k = 1.4388e7  # second radiation constant [nm K]
+    gains = -wien_nm_k * steps[:, None] / WAVELENGTHS_NM
     return gains - gains[:, 1:2]
 
 
@@ -141,7 +138,8 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     close = np.nan_to_num(1.0 - (fit.residual / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
     light = bounded(fit.log_gains)
-    beyond = _separated_hues(light, fit.log_gains) > ROUNDED
+    rounded = 1e-9  # log gains
+    beyond = _separated_hues(light, fit.log_gains) > rounded
     return Evidence(light, score, int((close > 0.0).sum()), fit.residual, beyond=beyond)
 
 
@@ -163,13 +161,16 @@ def _colours(half: Image, mask: Image) -> list[Float]:
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     rows = cast(list[list[int]], stats.tolist())  # left, top, width, height, area
-    fair = [i for i in range(1, count) if SPECK <= rows[i][4] <= LARGEST * mask.size]
+    speck = 6  # of these pixels; smaller blobs prove nothing
+    largest = 0.1  # of the image; a larger blob is no marker
+    fair = [i for i in range(1, count) if speck <= rows[i][4] <= largest * mask.size]
     if not fair:
         return []
     # Outside the image counts as covered: a marker at the border keeps its inner pixels.
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8))
     found: list[Float] = []
-    for i in sorted(fair, key=lambda i: -rows[i][4])[:BLOBS_EACH]:
+    blobs_each = 3  # of each colour, the largest
+    for i in sorted(fair, key=lambda i: -rows[i][4])[:blobs_each]:
         x, y, w, h, _ = rows[i]
         box = slice(y, y + h), slice(x, x + w)
         own = labels[box] == i

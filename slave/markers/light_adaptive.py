@@ -25,7 +25,6 @@ from slave.markers.engine import NUMPY, Engine
 from slave.markers.white_balance import WhiteBalance, apart
 from slave.markers.workers import Workers
 
-STEP = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
 REFUSE = 0.2  # and from which the old one may take one marker for another: three to six hues
 
 
@@ -153,7 +152,8 @@ class LightAdaptiveDetector:
 
     def _adapt(self) -> None:
         """Have a table made where the light has moved; use the one that is ready."""
-        if self._making is None and apart(self.log_gains, self._in_use) > STEP:
+        step = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
+        if self._making is None and apart(self.log_gains, self._in_use) > step:
             gains = self.log_gains
             self._making = (
                 gains,

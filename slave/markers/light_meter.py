@@ -17,16 +17,8 @@ from common.arrays import Float, Image
 from common.geometry.srgb import to_linear
 
 GRID = 16  # points along each side
-DARK, BRIGHT = 12, 250  # bytes beyond which a point measures nothing: noise, or clipped
-ALIKE = 0.25  # a point agrees when its log ratios are this near the median: three standard deviations of a dark desk
 AGREE = 0.55  # share of the points that must agree
-LEAST = 48  # points that measure something
 EVERY_NS = 50_000_000  # a slow change is measured so often,
-LEAP, LEAPING = (
-    8,
-    0.2,
-)  # and at once when this share of the bytes leapt by so much (noise is 2) since the last frame
-QUICK_S, SLOW_S = 2.0, 10.0  # a point that agrees is learnt quickly, one that shows something else slowly
 LOG_LIGHT = np.log(np.maximum(to_linear(np.arange(256) / 255.0), 1e-4))
 
 
@@ -75,29 +67,37 @@ class LightMeter:
             self._still, self._t_ns = LOG_LIGHT.take(bytes_), t_ns
             return None
         if 0 <= t_ns - self._t_ns < EVERY_NS:
-            leaps = np.count_nonzero(np.abs(self._bytes - last) > LEAP)
-            if leaps < LEAPING * bytes_.size:
+            # and at once when this share of the bytes leapt by so much (noise is 2) since the last frame
+            leap, leaping = 8, 0.2
+            leaps = np.count_nonzero(np.abs(self._bytes - last) > leap)
+            if leaps < leaping * bytes_.size:
                 return None
         return self._measure(bytes_, self._still, t_ns)
 
     def _measure(self, bytes_: Image, still: Float, t_ns: int) -> Change:
         seen = LOG_LIGHT.take(bytes_)
         dt_s, self._t_ns = max(t_ns - self._t_ns, 0) * 1e-9, t_ns
-        usable = ((bytes_ >= DARK) & (bytes_ <= BRIGHT)).all(axis=1)
+        dark, bright = 12, 250  # bytes beyond which a point measures nothing: noise, or clipped
+        usable = ((bytes_ >= dark) & (bytes_ <= bright)).all(axis=1)
         ratio = seen - still
         count = int(np.count_nonzero(usable))
-        if count < LEAST:
+        least = 48  # points that measure something
+        if count < least:
             return Change(np.zeros(3), sure=False, agreeing=0.0)
         middle = np.partition(ratio[usable], count // 2, axis=0)[count // 2]
-        near = usable & (np.abs(ratio - middle) <= ALIKE).all(axis=1)
+        # a point agrees when its log ratios are this near the median: three standard deviations of a dark desk
+        alike = 0.25
+        near = usable & (np.abs(ratio - middle) <= alike).all(axis=1)
         agreeing = float(np.count_nonzero(near)) / count
         sure = agreeing >= AGREE
         change = np.zeros(3)
         if sure:
             change, self._light = middle - self._light, middle
+        # a point that agrees is learnt quickly, one that shows something else slowly
+        quick_s, slow_s = 2.0, 10.0
         # Ratios are learnt relative to the light, so that the light itself is never learnt away.
-        rate = np.full(GRID * GRID, -np.expm1(-dt_s / SLOW_S))
-        rate[near] = -np.expm1(-dt_s / QUICK_S)
+        rate = np.full(GRID * GRID, -np.expm1(-dt_s / slow_s))
+        rate[near] = -np.expm1(-dt_s / quick_s)
         rate[~usable] = 0.0
         still += rate[:, None] * (ratio - self._light)
         return Change(change, sure=sure, agreeing=agreeing)

@@ -30,20 +30,10 @@ Whole: TypeAlias = npt.NDArray[np.intp]
 
 RAYS, RADII = 64, 56  # samples of the picture: directions, and on each
 NEAREST, FARTHEST = 0.45, 1.85  # where they begin and end, in radii of the hull
-SMOOTH = 0.03  # of the radius: standard deviation of the blur before the gradient, at least one pixel
 STRONG = 80  # percentile of the gradients that counts as one edge
-LIMIT = 1.5  # edges: what a stronger one counts
-FAINT = 0.5  # edges: what is weaker is none
 SHIFTS = np.linspace(-0.45, 0.45, 10)  # of the centre, in radii of the hull
 SIZES = np.linspace(0.85, 1.5, 14)
 FINER = 0.06, 0.024  # half widths of the finer searches
-ROUNDS = 4
-TOLERANCE = 0.05  # of the radius: an edge so near to the circle is one of its own
-CAUCHY = 0.4  # of the tolerance
-HELD = 0.88  # share of the mask that lies inside the circle
-FILLED = 0.4  # share of the circle that the mask fills
-SUPPORTED = 0.6  # share of the directions that have an edge of the circle's own
-UNSEEN = 0.1  # of the radius: standard deviation of the centre where no direction had one
 _STEP = (FARTHEST - NEAREST) / (RADII - 1)
 _AT: Float = np.linspace(NEAREST, FARTHEST, RADII)
 _RAY = np.arange(RAYS)
@@ -94,14 +84,18 @@ def outline_of(image: Image, seen: Measured) -> Outline | None:
     x, y, radius = x + size * du, y + size * dv, size * radius
     v, u = np.nonzero(mask)
     inside = np.count_nonzero(np.hypot(u - x, v - y) <= radius + 1.0)
-    if support < SUPPORTED or inside < HELD * len(u) or inside < FILLED * math.pi * radius * radius:
+    held = 0.88  # share of the mask that lies inside the circle
+    filled = 0.4  # share of the circle that the mask fills
+    supported = 0.6  # share of the directions that have an edge of the circle's own
+    if support < supported or inside < held * len(u) or inside < filled * math.pi * radius * radius:
         return None
+    unseen = 0.1  # of the radius: standard deviation of the centre where no direction had one
     return Outline(
         seen.left + x,
         seen.top + y,
         radius,
         support,
-        math.hypot(size * sigma, UNSEEN * (1.0 - support) * radius),
+        math.hypot(size * sigma, unseen * (1.0 - support) * radius),
     )
 
 
@@ -113,7 +107,8 @@ def _edges(image: Image, u: float, v: float, size: float) -> Float32:
     reach = math.ceil(FARTHEST * size) + 2
     left, top = max(math.floor(u) - reach, 0), max(math.floor(v) - reach, 0)
     part = image[top : math.floor(v) + reach + 1, left : math.floor(u) + reach + 1]
-    smooth = cv2.GaussianBlur(part, (0, 0), max(1.0, SMOOTH * size)).astype(np.float32)
+    # of the radius: standard deviation of the blur before the gradient, at least one pixel
+    smooth = cv2.GaussianBlur(part, (0, 0), max(1.0, 0.03 * size)).astype(np.float32)
     x, y = u - left + np.outer(_COS, size * _AT), v - top + np.outer(_SIN, size * _AT)
     polar = cv2.remap(
         smooth, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -158,7 +153,8 @@ def _best(strength: Float32) -> Float:
 
     As du, dv, radius in radii of the hull.
     """
-    limited = np.minimum(strength, LIMIT)
+    limit = 1.5  # edges: what a stronger one counts
+    limited = np.minimum(strength, limit)
     circle: Float = _COARSE[int(np.argmax(limited.take(_COARSE_SAMPLES).sum(axis=1)))]
     for finer in _FINER:
         circles = circle + finer
@@ -173,9 +169,11 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
     """
     covariance: Float = np.eye(3)
     own: Bool = np.zeros(RAYS, np.bool_)
-    for iteration in range(ROUNDS):
+    rounds = 4
+    for iteration in range(rounds):
         x, y, radius = circle.tolist()
-        tolerance = TOLERANCE * radius * (2.0 if iteration == 0 else 1.0)
+        # of the radius: an edge so near to the circle is one of its own
+        tolerance = 0.05 * radius * (2.0 if iteration == 0 else 1.0)
         near = np.abs(_AT - _distance(circle[None]).T) <= tolerance + _STEP
         at = np.clip(np.where(near, strength, -1.0).argmax(axis=1), 1, RADII - 2)
         before, here, after = strength[_RAY, at - 1], strength[_RAY, at], strength[_RAY, at + 1]
@@ -184,8 +182,10 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
         away_x, away_y = found * _COS - x, found * _SIN - y
         away = np.hypot(away_x, away_y)
         residual = away - radius
-        own = (here >= FAINT) & (np.abs(residual) <= tolerance)
-        weight = np.where(here >= FAINT, 1.0 / (1.0 + np.square(residual / (CAUCHY * tolerance))), 0.0)
+        faint = 0.5  # edges: what is weaker is none
+        own = (here >= faint) & (np.abs(residual) <= tolerance)
+        cauchy = 0.4  # of the tolerance
+        weight = np.where(here >= faint, 1.0 / (1.0 + np.square(residual / (cauchy * tolerance))), 0.0)
         jacobian = np.stack([away_x / away, away_y / away, np.ones(RAYS)], axis=1)
         weighted = jacobian * weight[:, None]
         inverse = np.linalg.inv(weighted.T @ jacobian + 1e-3 * np.eye(3))

@@ -15,13 +15,6 @@ from slave.markers.centroid import Measured
 from slave.markers.outline import Outline, outline_of
 from slave.markers.quality import CLEAR_CONTRAST
 
-MOST = 2  # that are sought in one frame
-LEAST_PX2 = 60.0  # from which an outline can be distinguished from its pixels
-LARGE_PX2 = 500.0  # from which the outline of one of clear contrast is looked at,
-RARELY = 120  # in one frame of so many while its colour fills it,
-SURE = 0.8  # and taken with an edge in this share of the directions,
-FULLER = 1.08  # and so many times the colour's area
-
 
 class Outlines:
     """Frame count, and markers whose outline holds more than their colour."""
@@ -47,13 +40,17 @@ class Outlines:
         self._frame += 1
         sought: list[tuple[float, int]] = []
         for m, seen in seen_as.items():
-            if seen.area < LEAST_PX2 or seen.cut or seen.thin:
+            least_px2 = 60.0  # from which an outline can be distinguished from its pixels
+            if seen.area < least_px2 or seen.cut or seen.thin:
                 continue
-            due = m in self._outlined or m in reset or self._frame % RARELY == m % RARELY
-            if seen.contrast < CLEAR_CONTRAST or (seen.area >= LARGE_PX2 and due):
+            rarely = 120  # in one frame of so many while its colour fills it,
+            due = m in self._outlined or m in reset or self._frame % rarely == m % rarely
+            large_px2 = 500.0  # from which the outline of one of clear contrast is looked at,
+            if seen.contrast < CLEAR_CONTRAST or (seen.area >= large_px2 and due):
                 sought.append((seen.area, m))
         found: dict[int, Outline] = {}
-        for _, m in sorted(sought, reverse=True)[:MOST]:
+        most = 2  # that are sought in one frame
+        for _, m in sorted(sought, reverse=True)[:most]:
             outline = outline_of(image, seen_as[m])
             if outline is not None and _holds_more(outline, seen_as[m]):
                 found[m] = outline
@@ -70,4 +67,6 @@ def _holds_more(outline: Outline, seen: Measured) -> bool:
     """
     if seen.contrast < CLEAR_CONTRAST:
         return True
-    return outline.support >= SURE and math.pi * outline.radius**2 >= FULLER * seen.area
+    sure = 0.8  # and taken with an edge in this share of the directions,
+    fuller = 1.08  # and so many times the colour's area
+    return outline.support >= sure and math.pi * outline.radius**2 >= fuller * seen.area

@@ -22,8 +22,6 @@ from slave.markers.classify import HUES
 CLEAR_CONTRAST = (
     6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
 )
-SMALL = 40.0  # px^2 below which a colour is hardly that of the marker alone
-LARGEST_CONTRAST = 20.0  # no marker is the more certain beyond it
 
 
 class Evidence(NamedTuple):
@@ -52,7 +50,6 @@ class Evidence(NamedTuple):
     cut: float
 
 
-BIAS = -4.90
 WEIGHTS = Evidence(
     contrast=0.92,
     unclear=-1.15,
@@ -84,8 +81,9 @@ def evidence_of(
     low, high = colour.hsv_low, colour.hsv_high
     half = 0.5 * ((high[0] - low[0]) % HUES) + 0.5
     away = abs((hue - low[0] - half + 0.5 + HUES / 2) % HUES - HUES / 2) / half
+    largest_contrast = 20.0  # no marker is the more certain beyond it
     return Evidence(
-        contrast=math.log(min(max(seen.contrast, 1.0), LARGEST_CONTRAST)),
+        contrast=math.log(min(max(seen.contrast, 1.0), largest_contrast)),
         unclear=float(seen.contrast < CLEAR_CONTRAST),
         outlined=support,
         fullness=min(seen.area / (4.0 * math.pi * math.sqrt(longest * shortest)), 1.0),
@@ -99,7 +97,8 @@ def evidence_of(
 
 def probability_of(evidence: Evidence) -> float:
     """Probability 0..1 that it is a marker."""
-    logit = sum(map(mul, WEIGHTS, evidence), BIAS)
+    bias = -4.90
+    logit = sum(map(mul, WEIGHTS, evidence), bias)
     return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
@@ -112,8 +111,9 @@ def clarity_of(seen: Measured, whole: float) -> float:
     clarity = math.sqrt(area / whole) if area < whole else 1.0
     if contrast < CLEAR_CONTRAST:
         clarity *= contrast / CLEAR_CONTRAST
-    if area < SMALL:
-        clarity *= math.sqrt(area / SMALL)
+    small = 40.0  # px^2 below which a colour is hardly that of the marker alone
+    if area < small:
+        clarity *= math.sqrt(area / small)
     if seen.cut:
         clarity *= 0.5
     if seen.thin:

@@ -25,9 +25,7 @@ from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.scan_choice import ScanChoice
 from slave.tuning import CameraFiles, Prepare
 
-LOOKS = 60  # a first light takes some tens of frames to be proven, or is not there to be proven
 TIMEOUT_S = 0.5
-RECENT = 8  # frames whose detections are kept for whoever shows one of them
 AnyDetector: TypeAlias = MarkerDetector | LightAdaptiveDetector | CalibratedDetector
 
 
@@ -52,7 +50,8 @@ class ReloadableDetector:
         self.choice, self._processor_ns = choice, processor_ns
         self._next: deque[AnyDetector] = deque(maxlen=1)  # one thread fills it, another empties it
         self._frames = FrameObserver[tuple[Image, int]]()
-        self._found: deque[tuple[int, Float]] = deque(maxlen=RECENT)
+        recent = 8  # frames whose detections are kept for whoever shows one of them
+        self._found: deque[tuple[int, Float]] = deque(maxlen=recent)
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
@@ -88,7 +87,9 @@ class ReloadableDetector:
         """
         if isinstance(detector, LightAdaptiveDetector):
             try:
-                for image, t_ns in self._frames.following(LOOKS, TIMEOUT_S):
+                # a first light takes some tens of frames to be proven, or is not there to be proven
+                looks = 60
+                for image, t_ns in self._frames.following(looks, TIMEOUT_S):
                     detector.push(image, t_ns)
                     if detector.trusted:
                         break

@@ -13,14 +13,7 @@ from slave.markers.centroid import Measured
 
 HOLD_NS = 500_000_000  # a marker not seen for longer is sought like a new one
 VELOCITY_NS = 100_000_000  # a velocity is trusted no longer than this
-GROWTH_PER_S = 1.0  # of the image width: about 1 m/s at 0.6 m
-WHOLE_LIFE_S = 2.0  # the memory of the marker's whole area
-TYPICAL_LIFE_S = 0.25  # of its usual one: a finger turns in this time, something passes in front of it faster
-LARGEST = 4.0  # times the whole area
 SUDDEN = 2.5  # an area that changes by more between two frames is looked at closely
-COVERED = 0.06  # share of the usual area that is missing while something is in front
-COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
-ROTATING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
 
 
 class Window(NamedTuple):
@@ -100,12 +93,14 @@ class Track(NamedTuple):
         """
         away_ns = t_ns - self.t_ns
         if away_ns > VELOCITY_NS:
-            roi_margin += (away_ns - VELOCITY_NS) * 1e-9 * GROWTH_PER_S
+            growth_per_s = 1.0  # of the image width: about 1 m/s at 0.6 m
+            roi_margin += (away_ns - VELOCITY_NS) * 1e-9 * growth_per_s
             away_ns = VELOCITY_NS
         u, v = self.u + self.du * away_ns * 1e-9, self.v + self.dv * away_ns * 1e-9
         margin = image_width * roi_margin
         x, y = margin + self.width, margin + self.height
-        return Window(u, v, x, y, margin, self.area, LARGEST * self.whole + 40.0)
+        largest = 4.0  # times the whole area
+        return Window(u, v, x, y, margin, self.area, largest * self.whole + 40.0)
 
     def growing(self, t_ns: int) -> bool:
         """Whether the marker has not been seen for so long that its window grows."""
@@ -121,10 +116,13 @@ class Track(NamedTuple):
 
     def covers(self, area: float, t_ns: int) -> bool:
         """Whether something has come in front of the marker, or still is."""
-        if 1.0 - area / self.typical <= COVERED:
+        covered = 0.06  # share of the usual area that is missing while something is in front
+        if 1.0 - area / self.typical <= covered:
             return False
         lost = 1.0 - area / self.seen
-        return self.covered or lost > max(COVERING, ROTATING_PER_S * (t_ns - self.t_ns) * 1e-9)
+        covering = 0.08  # share of the area that must go from one frame to the next for that to begin, and
+        rotating_per_s = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
+        return self.covered or lost > max(covering, rotating_per_s * (t_ns - self.t_ns) * 1e-9)
 
     def hidden(self, area: float) -> float:
         """Share of the usual area that is missing, 0..1."""
@@ -146,11 +144,14 @@ def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track
     dt_s = (t_ns - track.t_ns) * 1e-9
     whole = area
     if area < track.whole:
-        whole += (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S)
+        whole_life_s = 2.0  # the memory of the marker's whole area
+        whole += (track.whole - area) * math.exp(-dt_s / whole_life_s)
     du = dv = 0.0
     if dt_s <= VELOCITY_NS * 1e-9:
         du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
-    keep = math.exp(-dt_s / TYPICAL_LIFE_S)
+    # of its usual one: a finger turns in this time, something passes in front of it faster
+    typical_life_s = 0.25
+    keep = math.exp(-dt_s / typical_life_s)
     typical = area + (track.typical - area) * keep
     covered = track.covers(area, t_ns)
     if covered:

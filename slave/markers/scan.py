@@ -24,7 +24,6 @@ from slave.markers.roi import Window
 FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
 OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
 STRIPS = 8  # of a frame: so many frames until a lost marker that lies still is found
-ROUNDS = 3  # of scans, each wider, before that of the whole frame: what reaches so far is no marker
 
 
 # A part of the frame in columns and rows of the scan's grid: left, top, right, bottom; the last two exclusive.
@@ -102,7 +101,8 @@ class Scanner:
         asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for some in windows for w in some]
         proposed = self._search(image, table, lost) if lost else {}
         asked += [self._of(blob) for blobs in proposed.values() for blob in blobs]
-        for _ in range(ROUNDS):
+        rounds = 3  # of scans, each wider, before that of the whole frame: what reaches so far is no marker
+        for _ in range(rounds):
             parts = merged(asked)
             scanned = [self._part(image, table, part) for part in parts]
             clipped = [blob for part, _, blobs in scanned for blob in self._clipped(part, blobs)]

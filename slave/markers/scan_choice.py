@@ -13,8 +13,6 @@ from common.calibration import CameraCalibration
 from slave.drivers import SCANS
 
 Scan: TypeAlias = Literal["auto", "full", "windows"]
-FULL_SHARE = 0.9  # of the time between two frames: where whole frames take more, they do not fit
-FITS_SHARE = 0.7  # and where they take less again, they do
 JUDGED = 30  # whole frames whose median is judged
 PROBE_EVERY = 600  # frames, 10 s at 60 Hz: one of so many is scanned whole while windows are chosen
 PROBES = 3  # of them whose median is judged then
@@ -68,7 +66,9 @@ class ScanChoice:
         self._costs.append(spent_ns)
         if len(self._costs) < (PROBES if self._windows else JUDGED):
             return
-        cost_ns, share = median(self._costs), FITS_SHARE if self._windows else FULL_SHARE
+        full_share = 0.9  # of the time between two frames: where whole frames take more, they do not fit
+        fits_share = 0.7  # and where they take less again, they do
+        cost_ns, share = median(self._costs), fits_share if self._windows else full_share
         self._costs.clear()
         if (cost_ns > share * self._period_ns) != self._windows:
             self._switch(cost_ns)

@@ -19,16 +19,8 @@ from slave.markers.outline import Outline
 from slave.markers.quality import CLEAR_CONTRAST
 from slave.markers.roi import Track
 
-EDGE_PX2 = 0.45  # error times radius
-LEAST_PX = 0.06  # at any radius
-CLEAR = 15.0  # contrast below which the edge is less sure
 BLUR = 0.04  # px per px of way during the exposure
-COVER = 0.65
-PERSISTENT = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
-CUT = 0.3  # of the radius
-THIN = 2.0  # times, for a sliver
 COVERED_PX = 0.15  # a centre found from the edge that is left
-PARTIAL = 0.5  # of the radius: a part of the marker's colour that has no outline
 
 
 def sigma_of(
@@ -46,15 +38,23 @@ def sigma_of(
     if outline is not None:
         return math.hypot(outline.sigma, BLUR * math.hypot(track.du, track.dv) * exposure_s)
     radius = math.sqrt((seen.area if seen.area > 1.0 else 1.0) / math.pi)
-    edge = math.hypot(EDGE_PX2 / radius, LEAST_PX)
-    if seen.contrast < CLEAR:
-        edge *= CLEAR / max(seen.contrast, 1.0)
+    edge_px2 = 0.45  # error times radius
+    least_px = 0.06  # at any radius
+    edge = math.hypot(edge_px2 / radius, least_px)
+    clear = 15.0  # contrast below which the edge is less sure
+    if seen.contrast < clear:
+        edge *= clear / max(seen.contrast, 1.0)
     blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
-    hidden = PERSISTENT * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
+    persistent = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
+    hidden = persistent * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
     if before is not None and track.covered:
         hidden = max(hidden, before.hidden(seen.area))
-    cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0
-    cut = CUT * radius if seen.cut else 0.0
-    partial = PARTIAL * radius if seen.contrast < CLEAR_CONTRAST else 0.0
+    # cover
+    cover = 0.65 * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0
+    # of the radius
+    cut = 0.3 * radius if seen.cut else 0.0
+    # of the radius: a part of the marker's colour that has no outline
+    partial = 0.5 * radius if seen.contrast < CLEAR_CONTRAST else 0.0
     sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut + partial * partial)
-    return THIN * sigma if seen.thin else sigma
+    thin = 2.0  # times, for a sliver
+    return thin * sigma if seen.thin else sigma

@@ -33,14 +33,6 @@ from slave.markers.initial_white_balance import (
 from slave.markers.light_meter import Change, LightMeter
 from slave.markers.workers import Workers
 
-SUDDEN = (
-    0.2  # log gains of red or blue against green between two frames: a lamp was switched, or a hand came near
-)
-CLEAR = 0.75  # share of still points that must agree on a sudden change that the markers do not vouch for
-DIM = 0.15  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
-AGAIN_NS = 500_000_000  # between two attempts to prove the light
-POOR_FITS = 5  # looks in a row, half a second, in which the markers fit badly and make the light uncertain
-
 
 class WhiteBalance:
     """Light of one camera.
@@ -110,7 +102,9 @@ class WhiteBalance:
                 self._poor_fits = 0
             else:
                 self._poor_fits += 1
-                if self._poor_fits >= POOR_FITS:
+                # looks in a row, half a second, in which the markers fit badly and make the light uncertain
+                poor_fits = 5
+                if self._poor_fits >= poor_fits:
                     self._lose_proof()
         return fit
 
@@ -132,8 +126,11 @@ class WhiteBalance:
 
     def _change(self, image: Image, change: Change) -> None:
         """Add a change of the light unless an object in front of the camera mimics one."""
-        sudden = apart(change.log_gains, np.zeros(3)) > SUDDEN
-        if sudden and change.agreeing < CLEAR:
+        # log gains of red or blue against green between two frames: a lamp was switched, or a hand came near
+        sudden = apart(change.log_gains, np.zeros(3)) > 0.2
+        # share of still points that must agree on a sudden change that the markers do not vouch for
+        clear = 0.75
+        if sudden and change.agreeing < clear:
             half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
             before, after = (
                 evidence(half, self._table, self._reference, light).score
@@ -152,7 +149,8 @@ class WhiteBalance:
             self.proven, self._plausible, self._tried_ns = False, False, None
 
     def _prove(self, image: Image, t_ns: int) -> None:
-        if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= AGAIN_NS):
+        again_ns = 500_000_000  # between two attempts to prove the light
+        if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= again_ns):
             self._tried_ns = t_ns
             job = self._workers.submit(
                 partial(initial_white_balance, image.copy(), self._table, self._reference, self.log_gains)
@@ -167,7 +165,8 @@ class WhiteBalance:
                 self._drift.restart(light.log_gains + since)
 
 
-def apart(a: Float, b: Float, dim: float = DIM) -> float:
+# what a change of brightness counts against a change of hue: the ranges are wide in brightness
+def apart(a: Float, b: Float, dim: float = 0.15) -> float:
     """Return how different two lights (3,) look to the colour table.
 
     In log gains of red or blue against green.

@@ -13,7 +13,6 @@ from typing import Any, Protocol, cast
 from common.errors import TrackerError
 
 INSTALL = "pip install 'phalanx-hand[vive]', on a PC with an x86 processor; elsewhere use --device survive"
-_NO_SERVER, _NO_HEADSET = 121, 108  # VRInitError_Init_NoServerForBackgroundApp, _Init_HmdNotFound
 
 
 class VrSystem(Protocol):
@@ -98,9 +97,10 @@ def connect(library: Library) -> VrSystem:
 def _why(error: Exception) -> str:
     kind = type(error).__name__
     number = getattr(error, "error_value", None)
-    if number == _NO_SERVER:
+    no_server, no_headset = 121, 108  # VRInitError_Init_NoServerForBackgroundApp, _Init_HmdNotFound
+    if number == no_server:
         return "SteamVR does not run: start it, with the tracker switched on and paired (docs/tracker.md)"
-    if number == _NO_HEADSET:
+    if number == no_headset:
         return (
             'SteamVR wants a headset: set "requireHmd" to false in its settings and enable the null driver '
             "(docs/tracker.md)"

@@ -22,10 +22,6 @@ from common.geometry.transforms import matrix_to_quaternion
 from common.messages import TrackerPose
 from slave.objects.openvr_library import Library, VrSystem, connect, load_library
 
-RATE_HZ = 120.0
-LOST_EVERY = 30  # poses of NaN: four a second suffice
-POLL_NS = 1_000_000_000  # between two searches for the device
-_UNIT_WITHIN = 1e-3
 _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
 
@@ -42,7 +38,7 @@ class OpenVrTracker:
         clock: Clock,
         stop: threading.Event,
         loader: Callable[[], Library] = load_library,
-        rate_hz: float = RATE_HZ,
+        rate_hz: float = 120.0,
     ) -> None:
         """Connect to SteamVR.
 
@@ -126,7 +122,8 @@ class OpenVrTracker:
         found = None if index is None else self._valid(poses[index])
         if found is None:
             self._lost += 1
-            if self._lost % LOST_EVERY != 1:
+            lost_every = 30  # poses of NaN: four a second suffice
+            if self._lost % lost_every != 1:
                 return None
         else:
             self._lost = 0
@@ -139,7 +136,8 @@ class OpenVrTracker:
 
         It is searched again once a second until the device is there.
         """
-        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= POLL_NS):
+        poll_ns = 1_000_000_000  # between two searches for the device
+        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= poll_ns):
             self._looked_ns = now_ns
             self._index = self._search(system)
         if self._index is None:
@@ -205,6 +203,7 @@ def matrix34(matrix: object) -> tuple[Float, Float] | None:
     if rows.shape != (3, 4) or not np.isfinite(rows).all():
         return None
     axes = rows[:, :3]
-    if not np.allclose(axes @ axes.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(axes) < 0.0:
+    unit_within = 1e-3
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=unit_within) or np.linalg.det(axes) < 0.0:
         return None
     return rows[:, 3], matrix_to_quaternion(axes)

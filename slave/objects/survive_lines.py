@@ -37,7 +37,6 @@ from slave.clocks import ClockSteppedError, DeviceClock
 LONGEST = 1 << 17  # bytes; the longest lines are CONFIG, some 10 kB
 _SERIAL = re.compile(rb'"device_serial_number"\s*:\s*"([^"]{1,64})"')
 _DEVICE = re.compile(rb"[A-Za-z0-9_.-]{1,32}")
-_SIZE = 7  # numbers of a pose
 
 
 class Pose(NamedTuple):
@@ -123,7 +122,8 @@ def read_line(line: bytes) -> Found | None:
 
 def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
     words = rest.split()
-    if len(words) != _SIZE:
+    size = 7  # numbers of a pose
+    if len(words) != size:
         return Fault.LENGTH
     try:
         t_s = _number(stamp)
@@ -133,7 +133,7 @@ def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
     if not math.isfinite(t_s) or t_s < 0.0:
         return Fault.NUMBER
     if any(math.isnan(value) for value in values):  # it writes them when its solver fails
-        values = [math.nan] * _SIZE
+        values = [math.nan] * size
     x, y, z, *quaternion = values
     place, (qw, qx, qy, qz) = (x, y, z), quaternion
     length = math.hypot(*quaternion)

@@ -27,23 +27,7 @@ from common.geometry.srgb import to_linear
 
 LIGHT = to_linear(np.arange(256) / 255.0)  # of a byte
 ALONG, ACROSS = 18, 9  # samples of a side: places on it, and steps from black to white
-ENDS_PX = 1.6  # of a side that are not sampled at either end: there the next side begins
-REACH_PX = 3.5  # to either side of the edge, at most
-CELL = 0.55  # of the border's width that is looked at
-PASSES, STEPS = 2, 3
-WIDEST_PX, SHARPEST_PX = 4.0, 0.25  # an edge
-FLOOR_PX = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
-CLEAR_PX, BLURRED = (
-    0.8,
-    0.05,
-)  # an edge that is wider is off by so much of what it is wider: motion has its own law
-BILINEAR = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
-MOST_RESIDUAL = 0.15  # of the contrast: an edge that departs more from the law has something on it,
-COARSE_RESIDUAL = 0.4  # or is that of a small tag whose code is not known yet
-LEAST_CONTRAST = 0.008  # in linear light, white is 1
-SLIMMEST = 0.1  # sine of the angle between two sides
-LEAST_REACH_PX = 1.2
-ROOM = 6  # px about the tags that are looked at
+WIDEST_PX = 4.0  # an edge
 RIDGE = 1e-9 * np.eye(6)
 LARGEST_STEP = np.array([1.0, 1.0, 1.5, 1.5, 0.3, 0.7])
 SQRT_2_PI = np.sqrt(2.0 * np.pi)
@@ -81,15 +65,17 @@ def refine(
     uv = np.asarray(corners, np.float64)
     if not len(uv):
         return Corners(uv, np.zeros(0), np.zeros(0), np.zeros(0))
-    left, top = np.maximum(np.floor(uv.min(axis=(0, 1))).astype(int) - ROOM, 0)
-    right, bottom = np.maximum(np.ceil(uv.max(axis=(0, 1))).astype(int) + ROOM, 1)
+    room = 6  # px about the tags that are looked at
+    left, top = np.maximum(np.floor(uv.min(axis=(0, 1))).astype(int) - room, 0)
+    right, bottom = np.maximum(np.ceil(uv.max(axis=(0, 1))).astype(int) + room, 1)
     light = LIGHT[grey[top:bottom, left:right]]
     if not light.size:
         nothing = np.full(len(uv), np.nan)
         return Corners(uv, nothing, nothing, nothing)
     shift = np.array([left, top], np.float64)
     fitted = _fit(light, shift, uv, cells, lens, inner)
-    for _ in range(PASSES - 1):
+    passes = 2
+    for _ in range(passes - 1):
         fitted = _fit(light, shift, fitted.uv, cells, lens, inner)
     return fitted
 
@@ -104,8 +90,12 @@ def _fit(
     x, y = uv[..., 0], uv[..., 1]
     area = 0.5 * np.abs((x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1))
     cell = area[:, None] / length / cells
-    reach = np.clip(CELL * cell, LEAST_REACH_PX, REACH_PX)
-    margin = np.clip(ENDS_PX / length, 0.02, 0.3)
+    reach_px = 3.5  # to either side of the edge, at most
+    # of the border's width that is looked at
+    least_reach_px = 1.2
+    reach = np.clip(0.55 * cell, least_reach_px, reach_px)
+    ends_px = 1.6  # of a side that are not sampled at either end: there the next side begins
+    margin = np.clip(ends_px / length, 0.02, 0.3)
     place = margin[..., None] + (1.0 - 2.0 * margin[..., None]) * (np.arange(ALONG) + 0.5) / ALONG
     across = reach[..., None] * np.linspace(-1.0, 1.0, ACROSS)
     on = _on_side(begin, end, place, lens) - shift
@@ -120,7 +110,9 @@ def _fit(
         None if inner is None else inner.reshape(4 * n, cells),
     )
     density = ALONG * ACROSS / (length * (1.0 - 2.0 * margin) * 2.0 * reach)  # samples per square pixel
-    most_residual = COARSE_RESIDUAL if inner is None else MOST_RESIDUAL
+    # of the contrast: an edge that departs more from the law has something on it,
+    coarse_residual = 0.4  # or is that of a small tag whose code is not known yet
+    most_residual = coarse_residual if inner is None else 0.15
     return _met(uv, outward, reach, density, most_residual, _edges(sides))
 
 
@@ -191,7 +183,8 @@ def _edges(sides: _Sides) -> _Lines:
     reach = sides.across[:, -1]
     normal = np.zeros((s, 6, 6))
     residual = np.zeros((s, ALONG * ACROSS))
-    for _ in range(STEPS):
+    steps = 3
+    for _ in range(steps):
         jacobian, model = _law(p, sides)
         residual = (seen - model).reshape(s, -1)
         transposed = jacobian.transpose(0, 2, 1)
@@ -200,7 +193,8 @@ def _edges(sides: _Sides) -> _Lines:
         p += np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         p[:, 2:4] = np.clip(p[:, 2:4], -reach[:, None], reach[:, None])
         p[:, 4] = np.clip(p[:, 4], -0.8, 0.8)
-        p[:, 5] = np.clip(p[:, 5], np.log(SHARPEST_PX), np.log(WIDEST_PX))
+        sharpest_px = 0.25  # an edge
+        p[:, 5] = np.clip(p[:, 5], np.log(sharpest_px), np.log(WIDEST_PX))
     variance = np.asarray(np.linalg.inv(normal), np.float64)[:, (2, 3), (2, 3)]
     return _Lines(p[:, 2:4], variance, (residual**2).mean(axis=1), p[:, 1] - p[:, 0], np.exp(p[:, 5]))
 
@@ -257,22 +251,28 @@ def _met(
     """Where the lines of neighbouring sides meet, and how sure that is."""
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)
-    noise = line.most_residual.reshape(n, 4) * np.maximum(BILINEAR * density, 1.0)
+    bilinear = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
+    noise = line.most_residual.reshape(n, 4) * np.maximum(bilinear * density, 1.0)
     contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
-    floor = FLOOR_PX**2 + (BLURRED * np.maximum(width - CLEAR_PX, 0.0)) ** 2
+    floor_px = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
+    # an edge that is wider is off by so much of what it is wider: motion has its own law
+    clear_px, blurred = 0.8, 0.05
+    floor = floor_px**2 + (blurred * np.maximum(width - clear_px, 0.0)) ** 2
     variance = noise[..., None] * line.variance.reshape(n, 4, 2) + floor[..., None]
     # Corner k ends side k - 1 and begins side k. Each line measures how far it moved across itself, there.
     normals = np.stack([np.roll(outward, 1, axis=1), outward], axis=-2)
     moved = np.stack([np.roll(offset[..., 1], 1, axis=1), offset[..., 0]], axis=-1)
     edge_variance = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=-1)
-    meet = np.abs(np.linalg.det(normals)) > SLIMMEST
+    slimmest = 0.1  # sine of the angle between two sides
+    meet = np.abs(np.linalg.det(normals)) > slimmest
     inverse = np.linalg.inv(np.where(meet[..., None, None], normals, np.eye(2)))
     met = uv + np.einsum("nkij,nkj->nki", inverse, moved)
     spread = np.einsum("nkij,nkj->nk", inverse**2, edge_variance)
+    least_contrast = 0.008  # in linear light, white is 1
     good = (
         meet
         & (np.abs(offset).max(axis=-1) < reach)
-        & (contrast > LEAST_CONTRAST)
+        & (contrast > least_contrast)
         & (width < 0.99 * WIDEST_PX)
     )
     good &= line.most_residual.reshape(n, 4) < (most_residual * contrast) ** 2

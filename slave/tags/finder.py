@@ -31,15 +31,7 @@ from slave.tags.reading import Codes
 
 HOLD_NS = 500_000_000  # a tag not seen for longer is anywhere
 VELOCITY_NS = 50_000_000  # a velocity is trusted no longer than this
-NEAR = 0.9  # of a tag's size about it, where the next face of its box may be
-MARGIN = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone astray
-SAME = 0.35  # of a tag's size: a patch whose middle is nearer to a tag that was found is that tag
 PARTS = ((0.0, 0.0), (0.4, 0.4), (0.4, 0.0), (0.0, 0.4))  # left, top of the parts, shares of the image
-PART = (
-    0.6  # their size; what is larger than the overlap is found in the image at half its size, the fifth part
-)
-IDLE = 4  # while all that were seen are, every so many frames is searched beside them, and a part
-DIGITS = 6  # of what is reported: what comes after them differs between processors
 Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 
 
@@ -141,10 +133,11 @@ class TagFinder:
             n: track for n, track in tracks.items() if n not in found
         }
         numbers = sorted(found)[:MAX_TAGS]
+        digits = 6  # of what is reported: what comes after them differs between processors
         return FoundTags(
             np.array(numbers, np.uint16),
-            np.array([found[n][0] for n in numbers]).reshape(-1, 4, 2).round(DIGITS),
-            np.array([found[n][1] for n in numbers]).round(DIGITS),
+            np.array([found[n][0] for n in numbers]).reshape(-1, 4, 2).round(digits),
+            np.array([found[n][1] for n in numbers]).round(digits),
         )
 
     def _expected(
@@ -204,13 +197,15 @@ class TagFinder:
         """
         boxes: list[Box] = []
         for number, track in tracks.items():
+            margin = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone astray
             astray = (
                 0.0
                 if number in found
-                else MARGIN * self._size[1] * (1.0 + (t_ns - track.t_ns) / VELOCITY_NS / 4)
+                else margin * self._size[1] * (1.0 + (t_ns - track.t_ns) / VELOCITY_NS / 4)
             )
             uv = found[number][0] if number in found else track.expected(t_ns)
-            boxes.append(self._about(uv, NEAR * track.size + astray))
+            near = 0.9  # of a tag's size about it, where the next face of its box may be
+            boxes.append(self._about(uv, near * track.size + astray))
         return _joined(boxes)
 
     def _about(self, uv: Float, margin: float) -> Box:
@@ -225,7 +220,8 @@ class TagFinder:
         height, width = self._size
         if self._cycle < 0:
             return [(0, 0, width, height)]
-        self._idle = (self._idle + 1) % IDLE
+        idle = 4  # while all that were seen are, every so many frames is searched beside them, and a part
+        self._idle = (self._idle + 1) % idle
         if seen and self._idle:
             self._cycle = self._cycle % len(PARTS)
             return []
@@ -234,7 +230,9 @@ class TagFinder:
             return []
         x, y = PARTS[self._cycle]
         left, top = int(x * width), int(y * height)
-        return [(left, top, left + math.ceil(PART * width), top + math.ceil(PART * height))]
+        # their size; what is larger than the overlap is found in the image at half its size, the fifth part
+        part = 0.6
+        return [(left, top, left + math.ceil(part * width), top + math.ceil(part * height))]
 
 
 def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
@@ -267,8 +265,9 @@ def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
 def _known(quad: Float, found: dict[int, tuple[Float, float]]) -> bool:
     """Whether a patch is a tag that was found."""
     middle = quad.mean(axis=0)
+    same = 0.35  # of a tag's size: a patch whose middle is nearer to a tag that was found is that tag
     return any(
-        np.abs(uv.mean(axis=0) - middle).max() < SAME * np.ptp(uv, axis=0).max() for uv, _ in found.values()
+        np.abs(uv.mean(axis=0) - middle).max() < same * np.ptp(uv, axis=0).max() for uv, _ in found.values()
     )
 
 

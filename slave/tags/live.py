@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 
 SHARE = 0.8  # of the time between two frames that markers and tags together may take
-LEARNING = 0.2  # weight of the newest search in what one is expected to take
-LONGEST_NS = 250_000_000  # without a search: half of what an object is held for without its tags
 
 
 class Pace:
@@ -53,7 +51,8 @@ class Pace:
         self._frame_ns = t_ns
         most = max(self._takes_ns, SHARE * self._period_ns)
         self._left_ns = min(max(self._left_ns + SHARE * since_ns - spent_ns, -most), most)
-        late = self._sought_ns is None or t_ns - self._sought_ns >= LONGEST_NS
+        longest_ns = 250_000_000  # without a search: half of what an object is held for without its tags
+        late = self._sought_ns is None or t_ns - self._sought_ns >= longest_ns
         granted = late or self._left_ns >= self._takes_ns
         if granted:
             self._sought_ns = t_ns
@@ -63,7 +62,8 @@ class Pace:
         """A search took so long."""
         self._left_ns -= spent_ns
         known = self._takes_ns > 0.0
-        self._takes_ns += (spent_ns - self._takes_ns) * (LEARNING if known else 1.0)
+        learning = 0.2  # weight of the newest search in what one is expected to take
+        self._takes_ns += (spent_ns - self._takes_ns) * (learning if known else 1.0)
 
 
 class LiveTags:

@@ -23,7 +23,6 @@ SPOTS = np.array(
 )  # of a cell, where it is looked at
 SURE = {4: 0.97, 5: 0.88, 6: 0.82}  # cells of code -> correlation from which a tag is accepted
 EXPECTED = {4: 0.8, 5: 0.7, 6: 0.6}  # and where it is expected
-DARK_BORDER = 0.4  # of the way from black to white that no cell of the border may pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +104,8 @@ class Codes:
         """Whether the border of each is black all round."""
         low, high = seen.min(axis=(1, 2)), seen.max(axis=(1, 2))
         border = np.concatenate([seen[:, 0], seen[:, -1], seen[:, 1:-1, 0], seen[:, 1:-1, -1]], axis=1)
-        return border.max(axis=1) < low + DARK_BORDER * (high - low)
+        dark_border = 0.4  # of the way from black to white that no cell of the border may pass
+        return border.max(axis=1) < low + dark_border * (high - low)
 
 
 def _blur(cells: int, width: float) -> Float:

@@ -8,9 +8,6 @@ import numpy as np
 
 from common.arrays import Image
 
-WHITE = 250  # grey levels of a frame: as bright or brighter
-LEAST = 16  # grey levels that were added: less is noise beside what is white anyway
-
 
 def lit_line(frame: Image, ambient: Image) -> Image:
     """Return the image (H, W) of the laser's line, as `lit` does.
@@ -20,8 +17,10 @@ def lit_line(frame: Image, ambient: Image) -> Image:
     In the sun a line has less room up to white the brighter the skin is: what is left of it does not measure the line.
     """
     out = lit(frame, ambient)
-    white = cv2.threshold(frame, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
-    added = cv2.threshold(out, LEAST, 255, cv2.THRESH_BINARY)[1]
+    # grey levels of a frame: as bright or brighter
+    white = cv2.threshold(frame, 250 - 1, 255, cv2.THRESH_BINARY)[1]
+    least = 16  # grey levels that were added: less is noise beside what is white anyway
+    added = cv2.threshold(out, least, 255, cv2.THRESH_BINARY)[1]
     return np.asarray(cv2.max(out, cv2.bitwise_and(white, added)), np.uint8)
 
 

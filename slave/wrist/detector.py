@@ -26,8 +26,6 @@ from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
-RECENT = 4  # strobe cycles
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristFound:
@@ -82,7 +80,8 @@ class WristDetector:
         """
         self._strobe = Strobe(frame_rate_hz)
         self._engine = engine
-        self._found: deque[tuple[int, Float, Float]] = deque(maxlen=RECENT)
+        recent = 4  # strobe cycles
+        self._found: deque[tuple[int, Float, Float]] = deque(maxlen=recent)
         self._view = prepared(view, engine)
 
     @property

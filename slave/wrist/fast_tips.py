@@ -19,7 +19,6 @@ from slave.wrist.outline import Circles
 from slave.wrist.postures import Postures, postures_of
 from slave.wrist.view import WristView
 
-_VARIANTS = 3  # abductions of a row
 _COLUMNS = 11  # of what is found of a finger
 
 
@@ -217,7 +216,8 @@ def _search(
     Fills in the outline (x, y, radius, sigma, shown), residual, and `Ends`; NaN: no posture of the finger fits.
     """
     length = table.laser.shape[3]
-    most = _VARIANTS * length
+    variants = 3  # abductions of a row
+    most = variants * length
     found = _Found(np.empty(most), np.empty(most), np.empty(most), np.empty(most), np.empty((most, 4)))
     circle, best = np.empty(5), np.empty(5)
     which = np.empty(limits.modes, np.int64)

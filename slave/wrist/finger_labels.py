@@ -16,17 +16,12 @@ from slave.wrist.finger_lines import NONE
 from slave.wrist.runs import SHORT, Runs
 from slave.wrist.workspace import LaserWorkspace
 
-_THUMB, _INDEX = 0, 1
-_OUTSIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
 # Where `LaserWorkspace.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
 # fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
 _TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
 _ALL = (3.2, 4.4)  # place: from the outside of the index to that of the little finger
-_GAP = 0.08  # place: a larger step is no line
-_FULL = 0.72  # share of that way that the lines of four fingers side by side fill, at least
 _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has not turned unseen
-_CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
 def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
@@ -37,8 +32,9 @@ def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorksp
     beyond, place = workspace.on_plane(points)
     on = finger != NONE
     near = on & workspace.only_thumb(beyond, place)
-    out = np.where(near, _THUMB, finger)
-    place = place - _shift(place[out > _THUMB])
+    thumb, index = 0, 1
+    out = np.where(near, thumb, finger)
+    place = place - _shift(place[out > thumb])
     out = _at_creases(out, runs)
     ends = out[1:] != out[:-1]
     ends[runs.first[1:] - 1] = True
@@ -47,14 +43,15 @@ def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorksp
     middle = np.add.reduceat(place, first) / count
     of = out[first]
     nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
-    no_thumb = (of == _THUMB) & workspace.no_thumb(np.add.reduceat(beyond, first) / count, middle)
-    aside = (of > _THUMB) & ((middle < _FROM[of]) | (middle > _TO[of]))
+    no_thumb = (of == thumb) & workspace.no_thumb(np.add.reduceat(beyond, first) / count, middle)
+    aside = (of > thumb) & ((middle < _FROM[of]) | (middle > _TO[of]))
     aside &= _room(of, nearest, aside | no_thumb)
     of = np.where(no_thumb | aside, nearest, of)
     if workspace.flexed:
-        beyond_index = (of == _INDEX) & (middle < _OUTSIDE_INDEX)
-        if ((of == _INDEX) & ~beyond_index).any():
-            of = np.where(beyond_index, _THUMB, of)
+        outside_index = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
+        beyond_index = (of == index) & (middle < outside_index)
+        if ((of == index) & ~beyond_index).any():
+            of = np.where(beyond_index, thumb, of)
     return np.repeat(of, count)
 
 
@@ -72,7 +69,9 @@ def _shift(place: Float) -> float:
     across = np.sort(place)
     steps, wide = np.diff(across), float(across[-1] - across[0])
     off = 0.5 * float(across[0] + across[-1]) - 2.5
-    full = float(steps[steps < _GAP].sum()) > _FULL * wide
+    gap = 0.08  # place: a larger step is no line
+    # share of that way that the lines of four fingers side by side fill, at least
+    full = float(steps[steps < gap].sum()) > 0.72 * wide
     return off if full and _ALL[0] < wide < _ALL[1] and _ASIDE[0] < abs(off) < _ASIDE[1] else 0.0
 
 
@@ -121,7 +120,8 @@ def _climb(start: int, along: range, row: Float, same: Bool) -> int:
     """
     last = start
     for count, k in enumerate(along, 1):
-        if not (same[k] and (count < _CREASE_PX or row[k] < row[last])):
+        crease_px = 20  # columns on either side of a seam in which the crease may be
+        if not (same[k] and (count < crease_px or row[k] < row[last])):
             break
         last = k
     return last

@@ -26,9 +26,7 @@ from slave.wrist.palm_pose import PalmPose, find_palm_pose
 from slave.wrist.search_bands import STATION_PX, Float32, SearchBands, search_bands_of
 from slave.wrist.view import WristView
 
-_SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
-_SAME_MINIMUM = 0.35  # of the distance of two search bands, and of the rows of the hand
 _HALF_WIDTH = 3.0  # samples of the thumb's search band: half the breadth of such a minimum
 _CREASE = np.ones((5, 5), dtype=np.uint8)
 
@@ -74,7 +72,8 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     search_bands = search_bands_of(palm_pose.view)
     dark = cv2.erode(led, _CREASE)
     palm = dark[search_bands.palm[:, 1], search_bands.palm[:, 0]] if len(search_bands.palm) else dark
-    shown = bool(2 * np.count_nonzero(palm > _SHOWN) > palm.size)
+    # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
+    shown = bool(2 * np.count_nonzero(palm > 24) > palm.size)
     straightened = cast(
         Image,
         cv2.remap(
@@ -108,8 +107,9 @@ def _part(
     `paths` (3, S) and `energy` are changed.
     """
     lit = straightened[:, : STARTS[3]].max(axis=1) > DARK
-    near = _SAME_MINIMUM * np.abs(np.diff(search_bands.middle[:3], axis=0))
-    most = _SAME_MINIMUM * np.count_nonzero(lit)
+    same_minimum = 0.35  # of the distance of two search bands, and of the rows of the hand
+    near = same_minimum * np.abs(np.diff(search_bands.middle[:3], axis=0))
+    most = same_minimum * np.count_nonzero(lit)
     for seam in range(2):
         across = search_bands.across(slice(0, 3), paths)
         same = (np.abs(np.diff(across, axis=0)) < near) & lit

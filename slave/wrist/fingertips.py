@@ -32,9 +32,7 @@ from slave.wrist.postures import (
 )
 from slave.wrist.view import WristView
 
-CLIPPED = 247  # grey levels of the LED frame, from which a sample may be brighter than it looks
 LEAST_NEAR = np.float32(1.5)  # roots of grey levels: noise
-SHADE = 0.96  # of the light of skin that faces the camera: what a finger returns at its laser point
 MOST_ABDUCTION = 1.7  # of the outer two of the table
 # How far a posture may meet the laser from where it was seen: flesh is off its cones.
 WITHIN_M, SIGMA_M = 4e-3, 2.5e-3
@@ -52,7 +50,6 @@ DARKER, AS_BRIGHT = 0.65, 0.95  # of a finger's nearness: what is beyond its end
 ABOVE_MOST, ABOVE_UNKNOWN = 9.0, 0.33  # and of the root of that where the image is saturated
 # Above a folded finger, the same: what is lit there may be an object that hides the rest of an extended one.
 FOLDED_DARKER, FOLDED_AS_BRIGHT = 0.15, 0.35
-OVER_PX = 100  # above a folded finger: how far a fingertip may be seen again beyond such an object
 UNKNOWN_COST = (
     1.0  # of a sample outside of the image, or where that is saturated, or where something hides it
 )
@@ -73,11 +70,9 @@ ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
 CORRELATED = 2.5  # samples that differ for one reason
 # Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
 LEAST_SHOWN = np.array([0.75, 0.6])
-MOST_RESIDUAL, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the residual at which they are twice as large.
 PIXEL, SURFACE, PULP, COST_SCALE = 0.7, 0.05, 0.08, 20.0
-OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +109,8 @@ class LedImage(NamedTuple):
     @classmethod
     def of(cls, near: Float32, clipped: Bool) -> Self:
         """Of nearness and bound."""
-        rows = OVER_PX // SHRINK
+        over_px = 100  # above a folded finger: how far a fingertip may be seen again beyond such an object
+        rows = over_px // SHRINK
         column = np.ones((rows, 1), np.uint8)
         over = cv2.dilate(near, column, anchor=(0, rows - 1), borderType=cv2.BORDER_REPLICATE)
         return cls(near, clipped, np.asarray(over, np.float32))
@@ -396,8 +392,9 @@ class Ends(NamedTuple):
 def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candidates:
     """Ends of K fingers, by the circles about them."""
     radius = circle.radius
+    of_spread = 0.6  # postures that are possible differ by more than the mean of them is off
     surface = radius * np.sqrt(
-        SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
+        SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (of_spread * ends.spread) ** 2
     )
     sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + residual / COST_SCALE)
     at = circle.middle + ends.towards * radius[:, None]
@@ -474,7 +471,8 @@ def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | Non
     if not good.any():
         return None
     distance = np.sqrt((laser_m[known][good] ** 2).sum(axis=1))
-    return float(np.median(near[good] * distance)) / SHADE
+    shade = 0.96  # of the light of skin that faces the camera: what a finger returns at its laser point
+    return float(np.median(near[good] * distance)) / shade
 
 
 def fingertips(
@@ -492,12 +490,14 @@ def fingertips(
     out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     optics = led_optics(view)
     near = nearness(shrink(led), optics)
-    image = LedImage.of(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED)
+    clipped = 247  # grey levels of the LED frame, from which a sample may be brighter than it looks
+    image = LedImage.of(near, frame[1::SHRINK, 1::SHRINK] > clipped)
     found = search(led, image, laser_uv, view)
     if found is None:
         return out
     kind = np.minimum(found.finger, 1)
-    most = MOST_RESIDUAL * np.minimum(found.seen / LIKELY, 1.0)
+    most_residual, likely = 32.0, 0.4  # of one that is less likely to be seen in proportion
+    most = most_residual * np.minimum(found.seen / likely, 1.0)
     good = (found.shown > LEAST_SHOWN[kind]) & (found.residual < most)
     for k in np.flatnonzero(good).tolist():
         finger, at = int(found.finger[k]), found.uv[k]

@@ -32,7 +32,6 @@ _NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px 
 _SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
 _NOISE_OF_LEVEL = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
 _LINE = 20  # levels beyond that: a line that a centroid can be taken of
-_SATURATED = 250  # level of a cell
 # Neighbourhoods, (rows, columns) of cells.
 _SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
 _COLUMN = np.ones((9, 1), np.uint8)
@@ -42,12 +41,8 @@ _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a windo
 
 LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
 LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
-HALO = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
-LASER_LEAST = 8  # cells of flash: the line on one finger
 # How many times as many cells of flash on the hand as there are
 LASER_OF_ELSEWHERE = 4.0  # of flash elsewhere
-LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
-LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
 VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
 
 
@@ -106,25 +101,29 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
         return NO_EVIDENCE
     lit = _octaves(_broad(led_gain) / valid, LED_LEAST)
     laser_gain, laser_loss = _each_over(laser, ambient)
-    if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
+    laser_least = 8  # cells of flash: the line on one finger
+    if not lit > 0.0 or cv2.countNonZero(laser_gain) <= laser_least:
         return Evidence(lit, -inf, -inf, -inf)
     led_loss = cv2.subtract(cv2.subtract(ambient, led), noise)
-    above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
+    halo = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
+    above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=halo))
     steady = -_octaves(max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, LED_NEVER)
     if not steady > 0.0:
         return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
     line = cv2.subtract(_above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=_LINE))
     flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
-    if cv2.countNonZero(flash) <= LASER_LEAST:
+    if cv2.countNonZero(flash) <= laser_least:
         return Evidence(lit, -inf, -inf, steady)
     near = _near(cv2.min(led_gain, led_over_laser))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
     own = _shared(cv2.min(laser_loss, led_loss), lambda: _near(led_over_laser))
     excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
-    rest = max(LASER_OF_ELSEWHERE * elsewhere, LASER_OF_OWN * own, LASER_OF_EXCESS * excess)
-    return Evidence(lit, _octaves(on_hand, LASER_LEAST), _octaves(on_hand, rest), steady)
+    laser_of_own = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
+    laser_of_excess = 8.0  # of lines within the hand that the ambient frame has and another has not
+    rest = max(LASER_OF_ELSEWHERE * elsewhere, laser_of_own * own, laser_of_excess * excess)
+    return Evidence(lit, _octaves(on_hand, laser_least), _octaves(on_hand, rest), steady)
 
 
 def unlit(frames: Sequence[Image]) -> bool:
@@ -161,7 +160,8 @@ def _valid(darker: _Cells) -> int:
 
     `darker` is the darker of both frames.
     """
-    return cv2.countNonZero(cv2.threshold(darker, _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1])
+    saturated = 250  # level of a cell
+    return cv2.countNonZero(cv2.threshold(darker, saturated - 1, 255, cv2.THRESH_BINARY_INV)[1])
 
 
 def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:

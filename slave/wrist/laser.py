@@ -19,13 +19,9 @@ from slave.wrist.thumb_line import beyond_ball, on_ball
 from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
-_LEAST_M = 2e-3  # of line that must be seen
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
 _LINE_PX = 0.6  # one whole line
-_THUMB_PX = 1.5  # at least, of the thumb: its line runs into that of its ball
-_IN_PARTS_PX = 2.0  # at least, of a line in parts, some of which may be another's, or of one cut by the image
-_FAINT, _FAINT_PX = 3.0 * FLOOR, 5.0  # a line no brighter: what is left of one where the sun saturates
-_UNSHOWN_PX = 4.0  # no seam was seen
+_FAINT = 3.0 * FLOOR  # a line no brighter: what is left of one where the sun saturates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +53,8 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
     finger[workspace.on_palm(points)] = NONE
     finger_lines = engine.measure(runs, finger, view.optics.width_px)
     uv, length = finger_lines.uv, finger_lines.line
-    seen = length * workspace.metres_per_px(uv) >= _LEAST_M
+    least_m = 2e-3  # of line that must be seen
+    seen = length * workspace.metres_per_px(uv) >= least_m
     sigma = _sigma_px(finger_lines, shown=fingers.shown)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
@@ -65,7 +62,8 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
         off, extra_sigma = beyond_ball(runs, thumb, beyond)
         seen[0] = not (workspace.flexed and on_ball(beyond))
         uv[0] += off
-        sigma[0] = np.hypot(np.hypot(sigma[0], extra_sigma), _THUMB_PX)
+        thumb_px = 1.5  # at least, of the thumb: its line runs into that of its ball
+        sigma[0] = np.hypot(np.hypot(sigma[0], extra_sigma), thumb_px)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
 
@@ -78,9 +76,13 @@ def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
     Of a line in parts all but the longest may be another finger's, or what hides the middle of its own.
     """
     apart = finger_lines.apart
+    # at least, of a line in parts, some of which may be another's, or of one cut by the image
+    in_parts_px = 2.0
     in_parts = np.where(
-        np.isnan(apart), np.where(finger_lines.cut, _IN_PARTS_PX, 0.0), np.fmax(apart, _IN_PARTS_PX)
+        np.isnan(apart), np.where(finger_lines.cut, in_parts_px, 0.0), np.fmax(apart, in_parts_px)
     )
-    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
-    unshown = 0.0 if shown else _UNSHOWN_PX
+    faint_px = 5.0  # a line no brighter: what is left of one where the sun saturates
+    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(faint_px, in_parts), in_parts)
+    unshown_px = 4.0  # no seam was seen
+    unshown = 0.0 if shown else unshown_px
     return np.sqrt(_LINE_PX**2 + in_parts**2 + unshown**2)

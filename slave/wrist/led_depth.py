@@ -29,7 +29,6 @@ from slave.wrist.view import WristView
 Float32: TypeAlias = npt.NDArray[np.float32]
 
 SHRINK = 4  # the LED image is read at a quarter of its resolution
-DARK = 4.0  # grey levels: what the noise of a difference of two frames leaves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +74,8 @@ def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px:
     """
     row, column, reach = round(v / SHRINK), round(u / SHRINK), max(round(radius_px / SHRINK), 1)
     about = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
-    lit = near[about] > np.sqrt(DARK) * optics.level[: len(near)][about]
+    dark = 4.0  # grey levels: what the noise of a difference of two frames leaves
+    lit = near[about] > np.sqrt(dark) * optics.level[: len(near)][about]
     depth = optics.cosine[: len(near)][about][lit] / near[about][lit]
     return float(depth.min()) if len(depth) else float("nan")
 

@@ -29,19 +29,14 @@ from slave.wrist.workspace_samples import NEAREST_M, in_image
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees
 _TYPICAL_RAD = np.radians((15.0, 8.0))  # standard deviations of the prior
-_EVIDENCE = 14.0  # logarithm of probability per unit of E
-_TOP = 0.4  # contrast that an open gap exceeds: a deeper one adds no evidence
 _DARK = np.float32(2.0)  # root of grey levels: noise
-_WEB = 0.4  # of the proximal phalanx: where the webs end (`search_bands`)
 _BELOW_M = (-16e-3, -11e-3, -6e-3, -1e-3)  # of that: whole skin
 _BEYOND_M = (5.5e-3, 9e-3, 12.5e-3, 16e-3)  # a gap
-_INSIDE_M, _OUTSIDE_M = 3.5e-3, 5e-3  # of the skin's edge
 _METACARPAL, _LITTLE, _INDEX = (
     (0.4, 0.52, 0.64, 0.76, 0.88, 1.0),
     (0.15, 0.35),
     (0.2, 0.4),
 )  # along these bones
-_EDGE_WEIGHT = 0.125
 # A bend is accepted that shows so much of what it should, and is so much more probable than a straight wrist: fists
 # have gaps of their own. One that shows less of it must be more probable.
 _ACCEPTED = ((0.6, 3.0), (0.45, 5.0))
@@ -139,7 +134,8 @@ def wrist_angles_seen(near: Float32, view: WristView) -> Float:
     """
     marks = _marks(view)
     shown = _shown(near.ravel(), marks)
-    score = np.float32(_EVIDENCE) * shown - marks.prior
+    evidence = 14.0  # logarithm of probability per unit of E
+    score = np.float32(evidence) * shown - marks.prior
     best = int(score.argmax())
     more = float(score[best] - score[marks.near_straight].max())
     if not any(shown[best] >= least and more >= least_more for least, least_more in _ACCEPTED):
@@ -155,9 +151,10 @@ def _shown(near: Float32, marks: _Marks) -> Float32:
     low, high, middle = (near[marks.gap[:, k]] for k in range(3))
     sides = np.minimum(low, high)
     gaps = (sides - middle) / (sides + middle + _DARK)
-    gaps = np.where(marks.gap_weight < 0.0, np.abs(gaps), gaps).clip(0.0, _TOP)
+    top = 0.4  # contrast that an open gap exceeds: a deeper one adds no evidence
+    gaps = np.where(marks.gap_weight < 0.0, np.abs(gaps), gaps).clip(0.0, top)
     inside, outside = near[marks.edge[:, 0]], near[marks.edge[:, 1]]
-    edges = ((inside - outside) / (inside + outside + _DARK)).clip(0.0, _TOP)
+    edges = ((inside - outside) / (inside + outside + _DARK)).clip(0.0, top)
     out: Float32 = (gaps * marks.gap_weight).sum(axis=1) + (edges * marks.edge_weight).sum(axis=1)
     return out
 
@@ -215,7 +212,8 @@ def _gaps(view: WristView) -> tuple[Float, Float]:
     points: list[Float] = []
     for k in range(3):
         root, way = (knuckles[k] + knuckles[k + 1]) / 2.0, (bone[k] + bone[k + 1]) / 2.0
-        middle = root + (_WEB + beyond[:, None] / np.linalg.norm(way)) * way
+        web = 0.4  # of the proximal phalanx: where the webs end (`search_bands`)
+        middle = root + (web + beyond[:, None] / np.linalg.norm(way)) * way
         sides = [knuckles[f] + ((middle - knuckles[f]) @ along[f])[:, None] * along[f] for f in (k, k + 1)]
         points.append(np.stack([*sides, middle]))
     weight = np.where(beyond < 0.0, -1.0 / len(_BELOW_M), 1.0 / len(_BEYOND_M))
@@ -240,7 +238,9 @@ def _edges(view: WristView) -> tuple[Float, Float]:
         share = np.array(shares)[:, None]
         axis = rest[start] + share * (rest[end] - rest[start])
         thick = radius[start] + share * (radius[thick_as] - radius[start])
-        points.append(np.stack([axis + (thick + off) * way for off in (-_INSIDE_M, _OUTSIDE_M)]))
+        inside_m, outside_m = 3.5e-3, 5e-3  # of the skin's edge
+        points.append(np.stack([axis + (thick + off) * way for off in (-inside_m, outside_m)]))
     few = len(_LITTLE) + len(_INDEX)
-    weight = np.concatenate([np.full(len(_METACARPAL), 1.0 / len(_METACARPAL)), np.full(few, _EDGE_WEIGHT)])
+    edge_weight = 0.125
+    weight = np.concatenate([np.full(len(_METACARPAL), 1.0 / len(_METACARPAL)), np.full(few, edge_weight)])
     return np.concatenate(points, axis=1), weight

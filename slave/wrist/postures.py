@@ -32,24 +32,13 @@ PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))
 DIP_PER_PIP = (0.6, 0.84)
 ABDUCTION_RAD = float(np.radians(15.0))  # the outer two of the three abductions
 THUMB_POSTURES = (7, 8, 5, 6)  # values of its angles
-OVERHANG = 1.3  # of the radius of the tip: how far skin reaches beyond the tip joint, 1.0 to 1.7 by hand
-BALL = (
-    0.7  # of how far the fingertip's outermost point lies towards the nail: the middle of what is seen of it
-)
 DIRECTIONS = 8  # of the outline of a fingertip, from the right clockwise
-_AROUND = 1.4  # of its radius: where other parts of the finger are looked for
-SOFT = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
-HIDDEN_M = 4e-3  # so far behind the finger's own skin its end still counts as seen
-BEYOND_END = 0.25  # of the last bone: how far its skin goes on beyond its joint
-SURFACE_SHARE = 0.8  # of the radius: where the middle of a visible line on a finger is before its axis
 # Samples: the middle of the fingertip, along the bones, the highest joint of the finger in the image; above that; and
 # the end of the finger.
 END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
 SAMPLES = APEX + 1
 _ALONG = ((2, 0.35), (1, 0.75), (1, 0.3), (0, 0.75), (0, 0.5))  # bone, share of it
 _ABOVE = tuple((far, angle) for far in (1.4, 1.9) for angle in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
-_TWIST_RAD = 0.05  # for derivatives
-_CHUNK = 4096
 _ORIGIN = np.zeros(3)
 
 
@@ -158,8 +147,11 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     tip = joints.rotation[:, CHAINS[finger, 3]]
     along = -tip[:, :, 2]
     dorsal_m = Fingertips.of(view.model).dorsal_m
-    end = chain[:, 3] + (OVERHANG - 1.0) * radius[3] * along + BALL * dorsal_m * tip[:, :, 1]
-    apex = end + radius[3] * along + (1.0 - BALL) * dorsal_m * tip[:, :, 1]
+    overhang = 1.3  # of the radius of the tip: how far skin reaches beyond the tip joint, 1.0 to 1.7 by hand
+    # of how far the fingertip's outermost point lies towards the nail: the middle of what is seen of it
+    ball = 0.7
+    end = chain[:, 3] + (overhang - 1.0) * radius[3] * along + ball * dorsal_m * tip[:, :, 1]
+    apex = end + radius[3] * along + (1.0 - ball) * dorsal_m * tip[:, :, 1]
     bones = np.concatenate([chain[:, :3], end[:, None]], axis=1)
     surface = _surface_lines(bones, radius)
     laser = _on_plane(view, surface)
@@ -175,13 +167,15 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     twist = _twist(view, finger, angles[:, middle], bones, apex, radius)
     size = view.optics.matrix[0, 0] * radius[3] / np.maximum(bones[:, 3, 2], NEAREST_M)
     angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
-    ring = uv[:, middle, END, None] + _AROUND * size[:, None, None] * np.stack(
+    around = 1.4  # of its radius: where other parts of the finger are looked for
+    ring = uv[:, middle, END, None] + around * size[:, None, None] * np.stack(
         [np.cos(angle), np.sin(angle)], axis=-1
     )
     near, first = _drawn(view, bones, radius, np.concatenate([uv[:, middle], ring], axis=1))
     distance = np.linalg.norm(apex, axis=-1)
     facing = -(along * apex).sum(axis=-1) / distance
-    seen = distance < first[:, APEX] + HIDDEN_M
+    hidden_m = 4e-3  # so far behind the finger's own skin its end still counts as seen
+    seen = distance < first[:, APEX] + hidden_m
     good = (bones[..., 2] > NEAREST_M).all(axis=1) & np.isfinite(uv.reshape(count, -1)).all(axis=1)
     laser[~good.repeat(nodes)] = np.nan
     near[~good] = 0.0
@@ -204,7 +198,8 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
     straight[..., 1:] = 0.0
     chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
     axis = chain[1] - chain[0]
-    rotation = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
+    twist_rad = 0.05  # for derivatives
+    rotation = rotation_vector_to_matrix(twist_rad * axis / np.linalg.norm(axis))
     moved: list[Float] = []
     for by in (np.eye(3), rotation):
         rotated, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
@@ -214,7 +209,7 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
                 [view.optics.project(rotated[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
             )
         )
-    return (moved[1] - moved[0]) / _TWIST_RAD
+    return (moved[1] - moved[0]) / twist_rad
 
 
 def _parabola(values: Float) -> Float:
@@ -240,8 +235,10 @@ def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
         toward = -0.5 * (start + stop)
         toward -= (toward * way).sum(axis=-1, keepdims=True) * way
         toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
+        # of the radius: where the middle of a visible line on a finger is before its axis
+        surface_share = 0.8
         out.append(
-            (start + SURFACE_SHARE * radius[k] * toward, stop + SURFACE_SHARE * radius[k + 1] * toward)
+            (start + surface_share * radius[k] * toward, stop + surface_share * radius[k + 1] * toward)
         )
     return out
 
@@ -257,7 +254,8 @@ def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
         before, behind = (point @ view.normal - view.offset_m for point in (start, stop))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = before / (before - behind)
-        meets = (share >= -0.02) & (share <= 1.02 + (k == 2) * BEYOND_END)
+        beyond_end = 0.25  # of the last bone: how far its skin goes on beyond its joint
+        meets = (share >= -0.02) & (share <= 1.02 + (k == 2) * beyond_end)
         point = start + np.where(meets, share, 0.0)[:, None] * (stop - start)
         distance = np.where(meets, np.linalg.norm(point, axis=-1), np.inf)
         better = distance < nearest
@@ -288,8 +286,9 @@ def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Flo
     The pixels are (T, S, 2), the joints of the fingers (T, 4, 3) [m].
     """
     near, first = np.zeros(uv.shape[:2]), np.full(uv.shape[:2], np.inf)
-    for k in range(0, len(bones), _CHUNK):
-        part = slice(k, k + _CHUNK)
+    chunk = 4096
+    for k in range(0, len(bones), chunk):
+        part = slice(k, k + chunk)
         near[part], first[part] = _drawn_some(view, bones[part], radius, uv[part])
     return near, first
 
@@ -306,6 +305,7 @@ def _drawn_some(view: WristView, bones: Float, radius: Float, uv: Float) -> tupl
     body = (3 * np.arange(count, dtype=np.int64)[:, None] + which)[hit]
     normal = capsules.normals(body, ray[hit] * distance[hit][:, None])
     near = np.zeros(distance.shape)
-    shade = np.sqrt((np.clip(-(normal * ray[hit]).sum(axis=-1), 0.0, 1.0) + SOFT) / (1.0 + SOFT))
+    soft = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
+    shade = np.sqrt((np.clip(-(normal * ray[hit]).sum(axis=-1), 0.0, 1.0) + soft) / (1.0 + soft))
     near[hit] = shade / distance[hit]
     return near, distance

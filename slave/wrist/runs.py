@@ -15,23 +15,14 @@ import numpy as np
 from common.arrays import Bool, Float, Image, Int
 
 FLOOR = 16.0  # grey levels: less is noise even in the dark
-_NOISE = 6.0  # standard deviations above the mean of what no laser reaches
-_ENOUGH_ROWS = 40  # above the laser's reach, to know the noise from
-_OF_BRIGHTEST = 0.1  # of the brightest of the image: less is glow
-_OF_NEIGHBOURHOOD = 0.5  # of the brightest within `_NEIGHBOURHOOD` rows: less is glow beside the line
 _NEIGHBOURHOOD = np.ones((33, 1), dtype=np.uint8)
-_NEAR_PX = 24  # cells in which lines are compared with what is near by
 _NEAR = np.ones((5, 3), dtype=np.uint8)
-_SECOND = 0.65  # of the brightest run of the same column
-_FADED = 0.5  # of the brightest of the line: its edge, through the blur of the camera
-_GLOW = 0.4  # of the brightest near by: a darker line is glow
-SHORT, _GLOW_OF_SHORT = 8, 0.7  # of so few columns it must be brighter
+SHORT = 8  # of so few columns it must be brighter
 TOP, FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
 OF_PEAK, OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
 _COLUMN = 1024.0  # rows of a column when all are counted through: more than an image has
 JUMP_PX = 6.0  # between columns: another surface
 THICKEST_PX = 64  # the line on a thumb right before the camera; what is thicker is no line
-_FEWEST = 3  # columns of a line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,17 +70,21 @@ def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]
     And at which column and row of the image it begins.
     """
     band = laser[first_row:]
-    mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= _ENOUGH_ROWS else laser)
-    noise = float(mean[0, 0]) + _NOISE * float(deviation[0, 0])
-    threshold = min(max(FLOOR, noise, _OF_BRIGHTEST * cv2.minMaxLoc(band)[1]), 255.0)
+    enough_rows = 40  # above the laser's reach, to know the noise from
+    mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= enough_rows else laser)
+    # standard deviations above the mean of what no laser reaches
+    noise = float(mean[0, 0]) + 6.0 * float(deviation[0, 0])
+    of_brightest = 0.1  # of the brightest of the image: less is glow
+    threshold = min(max(FLOOR, noise, of_brightest * cv2.minMaxLoc(band)[1]), 255.0)
     band = cv2.threshold(band, np.ceil(threshold) - 1.0, 0.0, cv2.THRESH_TOZERO)[1]
     left, top, width, height = cv2.boundingRect(band)
     corner = (left, top + first_row)
     band = band[top : top + height, left : left + width]
     if not band.size:
         return np.empty((0, 0), np.uint8), np.empty((0, 0), np.uint8), corner
+    of_neighbourhood = 0.5  # of the brightest within `_NEIGHBOURHOOD` rows: less is glow beside the line
     # Above a half less 3/4: half or more, and not 0.
-    least = cv2.convertScaleAbs(cv2.dilate(band, _NEIGHBOURHOOD), alpha=_OF_NEIGHBOURHOOD, beta=-0.75)
+    least = cv2.convertScaleAbs(cv2.dilate(band, _NEIGHBOURHOOD), alpha=of_neighbourhood, beta=-0.75)
     return np.asarray(cv2.transpose(band), np.uint8), np.asarray(cv2.transpose(least), np.uint8), corner
 
 
@@ -150,7 +145,8 @@ def in_lines(runs: Runs) -> Bool:
     columns = np.diff(np.append(runs.first, len(peak)))
     brightest = np.zeros(len(joins))
     np.maximum.at(brightest, joins, np.maximum.reduceat(peak, runs.first))
-    row, column = runs.start // _NEAR_PX, runs.column // _NEAR_PX
+    near_px = 24  # cells in which lines are compared with what is near by
+    row, column = runs.start // near_px, runs.column // near_px
     across = int(column.max()) + 1
     cell = row * across + column
     around = np.zeros((int(row.max()) + 1) * across)
@@ -161,10 +157,15 @@ def in_lines(runs: Runs) -> Bool:
     of_column = np.zeros(int(runs.column.max()) + 1)
     np.maximum.at(of_column, runs.column, peak)
     joined = np.bincount(joins, columns, len(joins))
-    share = np.where(joined < SHORT, _GLOW_OF_SHORT, _GLOW)
-    line = (brightest >= share * nearby) & (joined >= _FEWEST)
-    least = np.repeat(np.where(line, _FADED * brightest, np.inf)[joins], columns)
-    np.maximum(least, _SECOND * of_column[runs.column], out=least)
+    glow = 0.4  # of the brightest near by: a darker line is glow
+    glow_of_short = 0.7  # of so few columns it must be brighter
+    share = np.where(joined < SHORT, glow_of_short, glow)
+    fewest = 3  # columns of a line
+    line = (brightest >= share * nearby) & (joined >= fewest)
+    faded = 0.5  # of the brightest of the line: its edge, through the blur of the camera
+    least = np.repeat(np.where(line, faded * brightest, np.inf)[joins], columns)
+    second = 0.65  # of the brightest run of the same column
+    np.maximum(least, second * of_column[runs.column], out=least)
     return peak >= least
 
 

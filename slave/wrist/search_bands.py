@@ -31,17 +31,9 @@ Float32 = npt.NDArray[np.float32]
 
 STATION_PX = 10.0
 _FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
-_UNUSED_PX = 80.0  # rows not used: the fingers end below the upper edge of the image
 LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
 MARGIN = 12  # samples beyond either edge of a search band: about a finger's breadth
 _NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
-_RARE = 0.02  # share of the postures of a sweep rejected at either end
-_OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
-_LEAST_OF_SPACING = 0.25
-_MOST_OF_SPACING = 0.7  # half width of a search band, in spacings of fingers: beyond lies another seam
-_WEB = 0.4  # of the proximal phalanx: where the webs between the fingers end, and the palm begins
-_WEB_OFF_M = 4e-3  # how far the palm may lie from where it is thought to: 3 degrees at the knuckles
-_OF_PALM = 0.05  # weight of what the palm shows, against fingers
 _UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate the palm's pose"
 
 
@@ -135,7 +127,8 @@ def search_bands_of(view: WristView) -> SearchBands:
     thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
     root = in_image(view, view.model.rest_position_m[2])[0]
     up = (knuckles[1] - root) / np.linalg.norm(knuckles[1] - root)
-    stations = int((view.optics.height_px - _UNUSED_PX) // STATION_PX)
+    unused_px = 80.0  # rows not used: the fingers end below the upper edge of the image
+    stations = int((view.optics.height_px - unused_px) // STATION_PX)
     row = view.optics.height_px - STATION_PX * stations
     empty = np.empty((4, stations))
     still = SearchBands(
@@ -179,9 +172,12 @@ def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
         uv, depth = in_image(view, mid)
         scale = focal / np.maximum(depth, NEAREST_M)
         spacing = scale * np.linalg.norm(a[:, :1] - b[:, :1], axis=-1)
-        lean = np.abs(limits[seam + 1 : seam + 3, ABDUCTION]).max() * _OF_SPREAD
+        of_spread = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
+        lean = np.abs(limits[seam + 1 : seam + 3, ABDUCTION]).max() * of_spread
         free = scale * np.linalg.norm((mid - mid[:, :1])[..., ::2], axis=-1) * np.sin(lean)
-        free = np.minimum(np.maximum(free, _LEAST_OF_SPACING * spacing), _MOST_OF_SPACING * spacing)
+        least_of_spacing = 0.25
+        most_of_spacing = 0.7  # half width of a search band, in spacings of fingers: beyond lies another seam
+        free = np.minimum(np.maximum(free, least_of_spacing * spacing), most_of_spacing * spacing)
         seen = (depth > NEAREST_M) & np.isfinite(uv).all(axis=-1)
         out[:, seam] = _band(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
     return out[0], out[1]
@@ -191,10 +187,13 @@ def _weight(view: WristView, rows: Float) -> Float32:
     """`SearchBands.weight` of stations at the given rows (S,)."""
     knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
     along = ends - knuckles
-    off = _WEB + _WEB_OFF_M / np.linalg.norm(along, axis=1, keepdims=True)
+    web = 0.4  # of the proximal phalanx: where the webs between the fingers end, and the palm begins
+    web_off_m = 4e-3  # how far the palm may lie from where it is thought to: 3 degrees at the knuckles
+    off = web + web_off_m / np.linalg.norm(along, axis=1, keepdims=True)
     webs = in_image(view, knuckles + off * along)[0][:, 1]
     columns = [np.full(n + 2 * MARGIN, 0.5 * (webs[k] + webs[k + 1])) for k, n in enumerate(LATERAL[:3])]
-    return np.where(rows[:, None] < np.concatenate(columns), 1.0, _OF_PALM).astype(np.float32)
+    of_palm = 0.05  # weight of what the palm shows, against fingers
+    return np.where(rows[:, None] < np.concatenate(columns), 1.0, of_palm).astype(np.float32)
 
 
 def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
@@ -231,7 +230,8 @@ def _thumb_workspace(view: WristView, still: SearchBands, stations: int) -> tupl
     ends = depth[:, -1] > NEAREST_M
     if not ends.any():
         raise CalibrationError(_UNSEEN.format("thumb"))
-    low, high = np.quantile((angle - breadth)[seen], (_RARE, 1.0 - _RARE))
+    rare = 0.02  # share of the postures of a sweep rejected at either end
+    low, high = np.quantile((angle - breadth)[seen], (rare, 1.0 - rare))
     tips = radius.reshape(len(points), -1)[:, -1]
-    crossed = (np.quantile(tips[ends], _RARE) - _FIRST_RADIUS_PX) / STATION_PX
+    crossed = (np.quantile(tips[ends], rare) - _FIRST_RADIUS_PX) / STATION_PX
     return (low + high) / 2.0, (high - low) / 2.0, int(np.clip(crossed, 0, stations))

@@ -27,8 +27,6 @@ from slave.sources import Frame
 from slave.wrist.illumination import NO_EVIDENCE, brighter, coarse, evidence, unlit
 
 CYCLE = 3  # periods
-OFF_BEAT = 0.3  # periods; a frame farther from the beat of the camera has no place in the cycle
-FORGOTTEN = 90  # periods without a frame, after which a rate 0.3 % off could have moved the cycle by a frame
 EVENTS = ("cycles", "doubled", "gaps", "out_of_step", "unsure", "unlit")
 
 
@@ -94,14 +92,17 @@ class Strobe:
         cells = coarse(frame.image)
         last = self._seen[-1] if self._seen else None
         periods = 0.0 if last is None else (frame.t_ns - last.latest.t_ns) / self._period_ns
-        if last is None or abs(periods) > FORGOTTEN:
+        # periods without a frame, after which a rate 0.3 % off could have moved the cycle by a frame
+        forgotten = 90
+        if last is None or abs(periods) > forgotten:
             self._begin(frame, cells)
             return None
         if _copied(last, frame, cells):
             self.counts["doubled"] += 1
             self._seen[-1] = replace(last, latest=frame)  # the strobe did not go on meanwhile
             return None
-        follows = abs(periods - 1.0) <= OFF_BEAT and frame.seq == last.latest.seq + 1
+        off_beat = 0.3  # periods; a frame farther from the beat of the camera has no place in the cycle
+        follows = abs(periods - 1.0) <= off_beat and frame.seq == last.latest.seq + 1
         self.counts["gaps"] += not follows
         self._seen = [*self._seen[-2:], _Seen(frame, cells, last.place + round(periods), follows, frame)]
         return self._completed()

@@ -17,8 +17,6 @@ _BORDER_M, _BORDER_SIGMA_M = -1.5e-3, 4e-3
 # Middles of nine parts, alike in probability, of Student's t with three degrees of freedom: some hands are far off.
 _T3 = np.array([-2.23, -1.15, -0.66, -0.31, 0.0, 0.31, 0.66, 1.15, 2.23])
 _BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _T3
-_TAILS = 1.5  # centroids lump at the whole line and at its end: 1.96 deviations of that hold less than 95 %
-_LEAST_PX = 4.0  # of line, for a centroid
 
 
 def on_ball(beyond_m: Float) -> bool:
@@ -43,13 +41,14 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
     """
     points: Float = np.stack([runs.column[of_thumb], runs.row[of_thumb]], axis=-1, dtype=np.float64)
     length = np.ones(len(points))
+    least_px = 4.0  # of line, for a centroid
     if len(points) > 2:
-        down = np.minimum(np.abs(np.diff(points[:, 1])), _LEAST_PX)
+        down = np.minimum(np.abs(np.diff(points[:, 1])), least_px)
         step = np.sqrt(1.0 + down * down)
         length[1:-1] = 0.5 * (step[1:] + step[:-1])
     weights = (beyond_m > _BORDERS_M[:, None]) * length
     total = weights.sum(axis=1)
-    seen = total >= _LEAST_PX
+    seen = total >= least_px
     # Sums, not products of matrices, and no hypot: they are the same bits on every processor.
     whole = (length[:, None] * points).sum(axis=0) / length.sum()
     if (
@@ -58,4 +57,6 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
         return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
     off = (weights[seen, :, None] * points).sum(axis=1) / total[seen, None] - whole
     mean = off.mean(axis=0)
-    return mean, _TAILS * float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))
+    # centroids lump at the whole line and at its end: 1.96 deviations of that hold less than 95 %
+    tails = 1.5
+    return mean, tails * float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))

@@ -31,14 +31,9 @@ from slave.wrist.workspace_samples import (
 Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
-_THUMB = 0
 # Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
 # half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
 _THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
-_BALL_M = -3e-3  # nearer there is no finger
-_LEAST_SPACING_M = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
-_OUTSIDE_PALM = 0.5  # place: beyond the outside of the index
-_FOLDED_RADII = 2.0  # of the knuckle, above the palm's bones: what a finger folded to the palm is beyond
 _ORIGIN = np.zeros(3)
 
 
@@ -71,8 +66,10 @@ class LaserWorkspace:
     def holds(self, finger: Int, uv: Float) -> Bool:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
+        thumb = 0
+        ball_m = -3e-3  # nearer there is no finger
         return self.cells[finger, row // _CELL_PX, column // _CELL_PX] & (
-            (finger == _THUMB) | (self.beyond_m(uv) > _BALL_M)
+            (finger == thumb) | (self.beyond_m(uv) > ball_m)
         )
 
     def beyond_m(self, uv: Float) -> Float:
@@ -108,7 +105,8 @@ class LaserWorkspace:
 
     def no_thumb(self, beyond_m: Float, place: Float) -> Bool:
         """Whether there (N,) the laser never meets the thumb."""
-        return (beyond_m > _NO_THUMBS_M) & (place > _OUTSIDE_PALM)
+        outside_palm = 0.5  # place: beyond the outside of the index
+        return (beyond_m > _NO_THUMBS_M) & (place > outside_palm)
 
     def metres_per_px(self, uv: Float) -> Float:
         """Return how much of the plane one pixel shows [m] at pixels (N, 2).
@@ -168,7 +166,8 @@ class Palm:
         off = points[:, ::2] @ self.aside.T - (flat * self.aside).sum(axis=1)  # falls finger by finger
         left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
         here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
-        return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
+        least_spacing_m = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
+        return 1.0 + left[:, 0] + here / np.maximum(here - there, least_spacing_m)
 
     def surface(self, points: Float, place: Float) -> Bool:
         """Return whether points (N, 3) of these places (N,) are on the palm's skin.
@@ -179,7 +178,9 @@ class Palm:
         """
         at = np.arange(1.0, 5.0)
         y, z, thick = (np.interp(place, at, of) for of in (*self.knuckles_m.T[1:], self.radius_m))
-        return (points[:, 2] < z) & (y - points[:, 1] < _FOLDED_RADII * thick)
+        # of the knuckle, above the palm's bones: what a finger folded to the palm is beyond
+        folded_radii = 2.0
+        return (points[:, 2] < z) & (y - points[:, 1] < folded_radii * thick)
 
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie

@@ -8,8 +8,6 @@ from slave.wrist.view import WristView
 
 PER_BONE = 6  # points along each bone
 NEAREST_M = 0.03  # what is nearer to the camera is not seen as a finger
-_DIP_PER_PIP = 0.84  # of natural flexion (Kim et al. 2012)
-_PIP, _DIP = 2, 3
 
 
 def finger_postures(view: WristView, *counts: int) -> Float:
@@ -19,7 +17,9 @@ def finger_postures(view: WristView, *counts: int) -> Float:
     """
     low, high = view.model.limits_rad[1].T
     out = _all(*[_spread(low[k], high[k], n) for k, n in enumerate(counts)], np.zeros(1))
-    out[..., _DIP] = _DIP_PER_PIP * out[..., _PIP]
+    dip_per_pip = 0.84  # of natural flexion (Kim et al. 2012)
+    pip, dip = 2, 3
+    out[..., dip] = dip_per_pip * out[..., pip]
     return out
 
 

@@ -22,8 +22,6 @@ PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6
 THING_GROUP = len(GROUPS)  # of what is no hand: bodies that follow those of the flesh
 THUMB_SEGMENTS, FINGER_SEGMENTS = (0, 1, 3), (1, 2, 3)  # by phalanx: 3 is the last of every finger
 
-_RADIUS_SPREAD = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
-_FOREARM_PARTS = 2
 _PAD_M, _PULP_M = (0.0002, 0.0010), (0.0006, 0.0016)  # how far pads and pulps stand out of the cone
 
 
@@ -59,10 +57,12 @@ class HandCapsules:
     def of(cls, model: HandModel, seed: int) -> "HandCapsules":
         """Draw the flesh of one hand; the same seed, the same flesh."""
         rng = np.random.default_rng([seed, 21])
-        radius = (model.radius_m * np.clip(rng.normal(1.0, _RADIUS_SPREAD, 26), 0.88, 1.12)).tolist()
+        radius_spread = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
+        radius = (model.radius_m * np.clip(rng.normal(1.0, radius_spread, 26), 0.88, 1.12)).tolist()
         parts = _palm(model, radius, rng)
         still = len(parts)
-        forearm = np.arange(still, still + _FOREARM_PARTS) - _FOREARM_PARTS
+        forearm_parts = 2
+        forearm = np.arange(still, still + forearm_parts) - forearm_parts
         tips: list[int] = []
         for finger in range(5):
             parts += _finger(model, radius, finger, rng)

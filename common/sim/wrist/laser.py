@@ -20,11 +20,7 @@ from common.geometry.tapered_capsules import Capsules, distances
 from common.hand.model import HandJoints
 from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules
 
-RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
-FINER = 24  # parts of a gap between rays at the end of a part
-JOINED_M = 0.004  # longer chords jump from one part to another
 SEEN_WITHIN_M = 2e-4
-LEAST_M = 2e-4  # of visible line, for a centroid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +96,8 @@ class LaserSheet:
         forward = np.array(laser.forward) - (np.array(laser.forward) @ normal) * normal
         forward /= np.linalg.norm(forward)
         across = np.cross(normal, forward)
-        angle = np.linspace(-0.5, 0.5, RAYS) * laser.fan_rad
+        rays = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
+        angle = np.linspace(-0.5, 0.5, rays) * laser.fan_rad
         still = capsules.bodies(joints).of(slice(capsules.still))
         near, body = _nearest(distances(still, origin, _fan(forward, across, angle)))
         return cls(origin, normal, offset, forward, across, angle, capsules, still, near, body)
@@ -119,9 +116,11 @@ class LaserSheet:
         else:
             near, body = self._meet(bodies, rays)
         met = np.where(np.isfinite(near), capsules.group_of(body), -1)
+        joined_m = 0.004  # longer chords jump from one part to another
         with np.errstate(invalid="ignore"):
-            ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > JOINED_M))
-        part = np.arange(1, FINER) / FINER * (self.angle_rad[1] - self.angle_rad[0])
+            ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > joined_m))
+        finer = 24  # parts of a gap between rays at the end of a part
+        part = np.arange(1, finer) / finer * (self.angle_rad[1] - self.angle_rad[0])
         between = (self.angle_rad[ends][:, None] + part).ravel()
         more = _fan(self.forward, self.across, between)
         more_near, more_body = self._meet(bodies, more)
@@ -133,7 +132,7 @@ class LaserSheet:
         group, segment = capsules.parts(bodies, body, points)
         joined = np.zeros(len(lit), dtype=np.bool_)
         chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
+        joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < joined_m)
         return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
 
     def _meet(self, bodies: Capsules, rays: Float, first: int = 0) -> tuple[Float, Int]:
@@ -208,7 +207,8 @@ class LineTruth:
         lit_m = np.bincount(group, length, count).astype(np.float64)
         chords, group, length = chords[both], group[both], length[both]
         seen_m = np.bincount(group, length, count).astype(np.float64)
-        enough = seen_m >= LEAST_M
+        least_m = 2e-4  # of visible line, for a centroid
+        enough = seen_m >= least_m
 
         def mean(value: Float, weight: Float) -> Float:
             middle = 0.5 * (value[chords] + value[chords + 1])

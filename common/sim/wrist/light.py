@@ -15,16 +15,13 @@ from common.arrays import Bool, Float, Image
 from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 
 BLACK_LEVEL = 2.0
-LED_LEVEL = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
 LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SURFACE_AT_M
 SURFACE_AT_M = 0.13
-SHADOW_GAP_M = 0.001  # nearer to a body nothing is in its shadow: it may be on the body itself
 SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
 GLOW = (
     (5.0, 0.13),
     (14.0, 0.10),
 )  # what comes out of the skin beside the line: sigma [px], share of the line's light
-_READ_VARIANCE, _SHOT_VARIANCE = 0.35, 0.032  # of the noise [levels^2], and per level
 _TILE_MARGIN = 128
 _LEVELS = {  # on the hand, behind it, of the window, of sun on skin
     "dark": (0.6, 0.4, 0.0, 0.0),
@@ -125,7 +122,8 @@ class Leds:
             for led, place in enumerate(self._led):
                 faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
         faced /= square * np.sqrt(square)
-        return faced.sum(axis=1) * np.float32(LED_LEVEL * SURFACE_AT_M**2 / len(self._led))
+        led_level = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
+        return faced.sum(axis=1) * np.float32(led_level * SURFACE_AT_M**2 / len(self._led))
 
 
 def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
@@ -137,7 +135,8 @@ def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) ->
     ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)
     known = terms(before, origin.astype(np.float64), np.float32)
     reach = np.min([first_hits(body, ways) for body in known.T], axis=0)
-    return reach < far - np.float32(SHADOW_GAP_M)
+    shadow_gap_m = 0.001  # nearer to a body nothing is in its shadow: it may be on the body itself
+    return reach < far - np.float32(shadow_gap_m)
 
 
 class Sensor:
@@ -148,7 +147,8 @@ class Sensor:
         rng = np.random.default_rng([seed, 32])
         self._tile = rng.standard_normal((height + _TILE_MARGIN, width + _TILE_MARGIN), dtype=np.float32)
         level = np.arange(256, dtype=np.float32)
-        self._sigma = np.sqrt(_READ_VARIANCE + _SHOT_VARIANCE * np.maximum(level - BLACK_LEVEL, 0.0))
+        read_variance, shot_variance = 0.35, 0.032  # of the noise [levels^2], and per level
+        self._sigma = np.sqrt(read_variance + shot_variance * np.maximum(level - BLACK_LEVEL, 0.0))
 
     def bytes_of(self, level: Plane, key: int) -> Image:
         """Convert levels to an image, black at BLACK_LEVEL.

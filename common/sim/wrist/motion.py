@@ -27,7 +27,6 @@ from common.sim.motion import (
     smooth_step,
 )
 
-MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
 MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # Kamper's ratios, in Kim et al. 2012
@@ -113,7 +112,8 @@ class Stations:
         self._postures += rng.normal(0.0, (1.0, 2.5, 4.0), self._postures.shape)
         self._period_s = period_s
         self._each_s = period_s / len(postures)
-        self._move_s = min(MOVE_S, 0.7 * self._each_s)
+        move_s = 0.8  # at most: the way from one posture to the next
+        self._move_s = min(move_s, 0.7 * self._each_s)
 
     @property
     def period_s(self) -> float:

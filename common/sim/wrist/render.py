@@ -20,7 +20,6 @@ from common.sim.wrist.scene import WristScene
 from common.sim.wrist.stripe import draw_stripe
 from common.sim.wrist.surface import HandSurface, SurfaceView
 
-SURFACE_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
 LIVE_STEP = 4
@@ -38,7 +37,12 @@ class WristRenderer:
     """
 
     def __init__(
-        self, scene: WristScene, camera: str, step: int = SURFACE_STEP, wrist_step_rad: float = 0.0
+        # px between the rays that shade skin; 1 is twice as sharp and four times slower
+        self,
+        scene: WristScene,
+        camera: str,
+        step: int = 2,
+        wrist_step_rad: float = 0.0,
     ) -> None:
         """Prepare all that stands still (some tenths of a second).
 

@@ -26,7 +26,6 @@ from common.sim.wrist.motion import wrist_motion
 from common.sim.wrist.things import bodies_of, with_things
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
-TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
 MOTIONS = ("standard", "curl", "subject", "poses", "spread", "random")
 WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
@@ -190,6 +189,8 @@ class WristScene:
         bodies = self._bodies(state, joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
         tips = self.capsules.tips(bodies)
+        # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
+        tip_within_m = 0.003
         return WristTruth(
             t_s,
             state.angles_rad,
@@ -202,7 +203,7 @@ class WristScene:
             line.segment,
             tips,
             self.optics.project(tips),
-            self.sheet.seen(bodies, tips, TIP_WITHIN_M),
+            self.sheet.seen(bodies, tips, tip_within_m),
             state.wrist_angles_rad,
         )
 

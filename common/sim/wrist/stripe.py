@@ -18,10 +18,6 @@ from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
 
 LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
-LENS_SIGMA_PX = 0.9
-LEAST_COSINE = 0.12  # skin that the laser grazes flatter is lit as if it were this steep
-_NUDGE_M = 1e-4
-_EDGE_PX = 40
 
 
 def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) -> None:
@@ -37,10 +33,12 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) 
     points = curve.points[chords]
     ray = curve.rays[chords]
     normals = bodies.normals(curve.body[chords], points)
-    facing = np.maximum(-np.einsum("ij,ij->i", normals, ray), LEAST_COSINE)
+    least_cosine = 0.12  # skin that the laser grazes flatter is lit as if it were this steep
+    facing = np.maximum(-np.einsum("ij,ij->i", normals, ray), least_cosine)
     rise = sheet.normal + ((normals @ sheet.normal) / facing)[:, None] * ray
     uv = optics.project(points)
-    way = (optics.project(points + _NUDGE_M * rise) - uv) / _NUDGE_M  # px per metre across the sheet
+    nudge_m = 1e-4
+    way = (optics.project(points + nudge_m * rise) - uv) / nudge_m  # px per metre across the sheet
     piece = optics.project(curve.points[chords + 1]) - uv
     heights = LAYERS * SHEET_SIGMA_M
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
@@ -63,9 +61,10 @@ def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
     place, amount = place[inside], amount[inside]
     if not len(place):
         return
+    edge_px = 40
     (x0, y0), (x1, y1) = (
-        np.maximum(place.min(axis=0).astype(int) - _EDGE_PX, 0).tolist(),
-        np.minimum(place.max(axis=0).astype(int) + _EDGE_PX, [width, height]).tolist(),
+        np.maximum(place.min(axis=0).astype(int) - edge_px, 0).tolist(),
+        np.minimum(place.max(axis=0).astype(int) + edge_px, [width, height]).tolist(),
     )
     w, h = x1 - x0, y1 - y0
     at = place - np.array([x0, y0])
@@ -76,7 +75,8 @@ def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
     share = np.concatenate([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]) * np.tile(amount, 4)
     line = np.bincount(four, share, w * h).reshape(h, w).astype(np.float32)
     glow = _glow(line, hand, (x0, y0, x1, y1), width)
-    light = cv2.GaussianBlur(line, (0, 0), LENS_SIGMA_PX)
+    lens_sigma_px = 0.9
+    light = cv2.GaussianBlur(line, (0, 0), lens_sigma_px)
     light += cv2.resize(glow, (w, h), interpolation=cv2.INTER_LINEAR)
     level[y0:y1, x0:x1] += light
 

@@ -17,11 +17,6 @@ from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
 
-CREASE_M, CREASE_DEPTH = 0.0008, 0.08
-PALM_SMOOTH_PX = 9.0  # about 2 mm at the palm's distance
-TEXELS_PER_M = 2000.0
-_MARGIN = 1.5  # of the boxes, on the grid
-_NEAREST_M = 0.01  # a body that comes nearer may be anywhere in the picture
 _AROUND = (0, 0, 0, 1, 1, 2, 2, 2), (0, 1, 2, 0, 2, 0, 1, 2)  # corners and middles of a box
 _ORIGIN = np.zeros(3)
 
@@ -145,9 +140,10 @@ class HandSurface:
         square = np.stack([bodies.start_radius_m, bodies.stop_radius_m], axis=1) ** 2
         x, z = centre[..., :2], np.maximum(centre[..., 2:], 0.0)
         gap = z[..., 0] ** 2 - square
-        whole = np.min(gap, axis=1) < _NEAREST_M**2
+        nearest_m = 0.01  # a body that comes nearer may be anywhere in the picture
+        whole = np.min(gap, axis=1) < nearest_m**2
         # Where planes through the lens touch a sphere, by column and by row.
-        gap = np.maximum(gap, _NEAREST_M**2)[..., None]
+        gap = np.maximum(gap, nearest_m**2)[..., None]
         half = np.sqrt(square[..., None] * np.maximum(x * x + gap, 0.0))
         low, high = ((x * z + sign * half) / gap for sign in (-1.0, 1.0))
         # Beyond the picture the polynomial of the lens means nothing.
@@ -159,7 +155,8 @@ class HandSurface:
             np.stack([sides[i, :, 1] for i in _AROUND[1]]),
         )
         uv = self._scene.optics.distort(np.stack(around, axis=-1)) / self._step
-        first, last = uv.min(axis=0) - _MARGIN, uv.max(axis=0) + _MARGIN + 1.0
+        margin = 1.5  # of the boxes, on the grid
+        first, last = uv.min(axis=0) - margin, uv.max(axis=0) + margin + 1.0
         first[whole], last[whole] = 0.0, np.inf
         size = np.array(self.size)
         return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
@@ -176,10 +173,12 @@ class HandSurface:
         own = table.astype(np.float32)[body]
         along = np.einsum("ij,ij->i", points - own[:, :3], own[:, 3:6])
         across = np.einsum("ij,ij->i", normals, own[:, 6:])
-        row, column = ((x * np.float32(TEXELS_PER_M)).astype(np.int32) for x in (along, across))
+        texels_per_m = 2000.0
+        row, column = ((x * np.float32(texels_per_m)).astype(np.int32) for x in (along, across))
         last = self._texture.shape[0] - 1
         texture = self._texture[row & last, (column + 37 * body) & last]
-        albedo = texture * (1.0 - CREASE_DEPTH * np.exp(-((along / np.float32(CREASE_M)) ** 2)))
+        crease_m, crease_depth = 0.0008, 0.08
+        albedo = texture * (1.0 - crease_depth * np.exp(-((along / np.float32(crease_m)) ** 2)))
         # Things give back what they do, however bright the skin of this hand is.
         albedo[body >= len(self._scene.capsules.group)] = ALBEDO / self._scene.reflectance
         return albedo
@@ -189,7 +188,8 @@ class HandSurface:
         if not len(palm.pixel):  # bent out of the picture
             return palm
         width, height = self.size
-        sigma = PALM_SMOOTH_PX / self._step
+        palm_smooth_px = 9.0  # about 2 mm at the palm's distance
+        sigma = palm_smooth_px / self._step
         cloud = np.zeros((height, width, 4), dtype=np.float32)
         cloud.reshape(-1, 4)[palm.pixel] = np.column_stack(
             [palm.normals, np.ones(len(palm.pixel), np.float32)]

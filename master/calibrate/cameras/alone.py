@@ -19,8 +19,6 @@ from master.calibrate.cameras.views import BoardViews
 
 MIN_VIEWS = 4  # three determine a lens in principle; a fourth can contradict it
 _ROUNDS = 8
-_BLURRED = 2.5  # times the blur of the camera's other images: more of the edge than a window holds
-_BLURRED_PX = 1.5  # less is no harm, however sharp the others are
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +139,13 @@ def _robust(
 def _blurred(blur_px: Float) -> dict[int, str]:
     """Images that are blurred where the others are not: index -> reason."""
     typical = float(np.median(blur_px))
+    blurred = 2.5  # times the blur of the camera's other images: more of the edge than a window holds
+    blurred_px = 1.5  # less is no harm, however sharp the others are
     return {
         int(
             i
         ): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
-        for i in np.flatnonzero(blur_px > max(_BLURRED * typical, _BLURRED_PX))
+        for i in np.flatnonzero(blur_px > max(blurred * typical, blurred_px))
     }
 
 

@@ -28,7 +28,6 @@ PAPERS_MM = {
 }
 _EDGE_MM = 8.0  # printers leave some millimetres blank, and a board needs white about it
 _FOOT_MM = 20.0  # ruler and text
-_RULER_MM = 100.0
 Rectangle = tuple[float, float, float, float]
 """x, y, width, height [mm]; y down."""
 
@@ -137,15 +136,16 @@ def _fill(axes: Axes, rectangles: list[Rectangle]) -> None:
 def _foot(axes: Axes, page: Page, board: Board) -> None:
     """The ruler, and what to type."""
     left, top = _EDGE_MM + 2, page.height_mm - _FOOT_MM + 6
-    marks = [(left, top, _RULER_MM, 0.3)]
-    for step in range(0, int(_RULER_MM) + 1, 5):
+    ruler_mm = 100.0
+    marks = [(left, top, ruler_mm, 0.3)]
+    for step in range(0, int(ruler_mm) + 1, 5):
         length = 3.0 if step % 50 == 0 else 2.0 if step % 10 == 0 else 1.2
-        at = min(max(step - 0.1, 0.0), _RULER_MM - 0.2)  # the end marks end with the ruler
+        at = min(max(step - 0.1, 0.0), ruler_mm - 0.2)  # the end marks end with the ruler
         marks.append((left + at, top, 0.2, length))
     _fill(axes, marks)
     axes.text(left, top + 7, f"{board}:   {options_of(board)}", fontsize=7, va="center")
     axes.text(
-        left + _RULER_MM + 3,
+        left + ruler_mm + 3,
         top + 1.2,
         "100 mm: measure it. Print at 100 %, not fitted to the page; if it differs, give the measured square.",
         fontsize=6,

@@ -21,11 +21,6 @@ from common.arrays import Bool, Float, Int
 from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-SHAPE_SD_M = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
-_MOST_STEPS = 100
-_ALMOST_NOTHING = 1e-3  # px^2 per rad^2 or m^2, where one view has 10^7 and more
-_STOP = 1e-9  # relative gain of a step
-_STOP_ROBUST = 1e-6  # robust fits only judge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,10 +128,12 @@ def solve(
     What the observations do not determine has an enormous standard deviation in the result.
     """
     mask = free.mask(len(start.drawn_m))
-    prior = (sigma_px / SHAPE_SD_M) ** 2 if free.shape else 0.0
+    shape_sd_m = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
+    prior = (sigma_px / shape_sd_m) ** 2 if free.shape else 0.0
     now, damping = start, 1e-3
     cost, normal = _normal_equations(observations, now, prior, cauchy_px)
-    for _ in range(_MOST_STEPS):
+    most_steps = 100
+    for _ in range(most_steps):
         step = _step(normal, mask, damping)
         tried = now if step is None else _retracted(now, *step)
         new_cost, new_normal = _normal_equations(observations, tried, prior, cauchy_px)
@@ -144,7 +141,9 @@ def solve(
             gain = cost - new_cost
             now, cost, normal = tried, new_cost, new_normal
             damping = max(damping / 10, 1e-10)
-            if gain <= (_STOP if cauchy_px is None else _STOP_ROBUST) * cost:
+            stop = 1e-9  # relative gain of a step
+            stop_robust = 1e-6  # robust fits only judge
+            if gain <= (stop if cauchy_px is None else stop_robust) * cost:
                 break
         else:
             damping *= 10
@@ -270,8 +269,9 @@ def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, 
     """
     shared, mixed, own, right, right_own = normal
     shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
+    almost_nothing = 1e-3  # px^2 per rad^2 or m^2, where one view has 10^7 and more
     # A board that wrong corners drove far away no longer moves any pixel; its equations must stay solvable.
-    damped: Float = own * (1.0 + damping * np.eye(6)) + _ALMOST_NOTHING * np.eye(6)
+    damped: Float = own * (1.0 + damping * np.eye(6)) + almost_nothing * np.eye(6)
     sides: Float = np.concatenate([mixed.transpose(0, 2, 1), right_own[:, :, None]], axis=2)
     back = cast(Float, np.linalg.solve(damped, sides))
     by_shared, by_right = back[:, :, :-1], back[:, :, -1]

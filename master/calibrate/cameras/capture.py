@@ -25,10 +25,7 @@ from master.calibrate.cameras.live_views import LiveViews, Verdict
 from master.calibrate.tree_files import date_now
 from master.run.ingest import Ingest
 
-ROUND_S = 0.3
-ANSWER_NS = 1_000_000_000
 _ASK_S = 0.5
-_LOG_NS = 2_000_000_000  # the same text is not logged more often
 NOTES = "capture.json"
 
 
@@ -79,15 +76,17 @@ def capture(
         round_ = take()
         verdict = live.push(round_.images) if round_.images else Verdict(False, "no camera answers")
         text = verdict.text + _without(live.cameras, round_)
+        log_ns = 2_000_000_000  # the same text is not logged more often
         if verdict.kept:
             view = live.views[-1]
             spread.append(round_.spread_ms)
             _keep(folder, view.name, {name: round_.stills[name] for name in view.observations})
             notify(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
-        elif text != previous or began_ns - notified_ns > _LOG_NS:
+        elif text != previous or began_ns - notified_ns > log_ns:
             notify(text)
             previous, notified_ns = text, began_ns
-        stop.wait(max(0.0, ROUND_S - (now_ns() - began_ns) * 1e-9))
+        round_s = 0.3
+        stop.wait(max(0.0, round_s - (now_ns() - began_ns) * 1e-9))
     if live.views:
         _note(folder, live, spread)
     return len(live.views)
@@ -119,7 +118,8 @@ class StillTaker:
         for thread in askers:
             thread.start()
         stills: dict[str, Still] = {}
-        end_ns = now_ns() + ANSWER_NS
+        answer_ns = 1_000_000_000
+        end_ns = now_ns() + answer_ns
         while len(stills) < len(self._cameras) and (left_ns := end_ns - now_ns()) > 0:
             message = self._next_round.get(left_ns * 1e-9)
             if isinstance(message, Still) and message.camera in self._cameras:

@@ -24,11 +24,6 @@ from master.run.ingest import Ingest
 from master.run.master_bus import host_bus
 from master.run.stopping import stop_on_signals
 
-FEWEST = 5  # from which a lens can be fitted at all
-_START_S = 5.0
-_POLL_S = 0.2
-_HINT_ROUNDS = 50  # ten seconds
-
 
 def capture_views(options: Namespace) -> None:
     """Keep an image whenever the board is held still somewhere new.
@@ -48,15 +43,17 @@ def capture_views(options: Namespace) -> None:
     with ExitStack() as stack:
         link = host_bus(options.bus, live.cameras)
         stack.callback(link.close)
-        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, _START_S)
+        start_s = 5.0
+        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, start_s)
         stack.callback(ingest.close)
         _wait(ingest, live.cameras, stop)
         taker = StillTaker(link, ingest, sizes)
         stack.callback(taker.close)
         kept = capture(taker.take, live, options.out, options.views, stop, echo, live.missing)
-    if kept < FEWEST:
+    fewest = 5  # from which a lens can be fitted at all
+    if kept < fewest:
         raise CalibrationError(
-            f"{options.out}: {kept} views kept; a calibration needs {FEWEST}, better {options.views}"
+            f"{options.out}: {kept} views kept; a calibration needs {fewest}, better {options.views}"
         )
     echo(f"{kept} views in {options.out}; next: phalanx calibrate {_next(live, options.out, options.rig)}")
 
@@ -97,9 +94,11 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
             echo(f"waiting for {absent or 'the start'}")
             previous = here
         rounds += 1
-        if rounds % _HINT_ROUNDS == 0 and not here:
+        hint_rounds = 50  # ten seconds
+        if rounds % hint_rounds == 0 and not here:
             echo(
                 "no slave answers: is it running, with the same rig key, and does --beacon reach it? See its log"
             )
-        if stop.wait(_POLL_S):
+        poll_s = 0.2
+        if stop.wait(poll_s):
             raise CalibrationError("stopped before any slave was there")

@@ -15,9 +15,6 @@ from master.calibrate.cameras.first_guess import guess_lens, place_board
 from master.calibrate.cameras.views import BoardViews
 
 CELLS = (6, 8)  # rows and columns: a cell is about as large as a board's square seen near
-ENOUGH_SHARE = 0.7
-ENOUGH_TILT_DEG = 40.0
-ENOUGH_RANGE = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,16 +73,19 @@ def coverage(
 
 def advice(covered: Coverage) -> str:
     """The view that would help most, or "" where all is covered."""
-    if covered.tilt_spread_deg < ENOUGH_TILT_DEG:
+    enough_tilt_deg = 40.0
+    if covered.tilt_spread_deg < enough_tilt_deg:
         sideways, upright = covered.across
         about = "its upright axis (left edge nearer, then right edge)"
         if upright < sideways:
             about = "its level axis (top edge nearer, then bottom edge)"
         return f"tilt the board 20 to 40° about {about}"
-    if covered.share < ENOUGH_SHARE:
+    enough_share = 0.7
+    if covered.share < enough_share:
         return f"show the board {_emptiest(covered.cells)}"
-    if covered.distance_m.max() < ENOUGH_RANGE * covered.distance_m.min():
-        near, far = covered.distance_m.max() / ENOUGH_RANGE, covered.distance_m.min() * ENOUGH_RANGE
+    enough_range = 1.5
+    if covered.distance_m.max() < enough_range * covered.distance_m.min():
+        near, far = covered.distance_m.max() / enough_range, covered.distance_m.min() * enough_range
         return f"show the board nearer than {near:.2f} m or beyond {far:.2f} m"
     return ""
 

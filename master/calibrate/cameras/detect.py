@@ -16,11 +16,8 @@ import numpy as np
 from common.arrays import Float, Image, Int
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, grid_edges, grid_shape
 
-_INNER_WINDOW = 0.5  # of the distance to the next grid line
-_OUTER_WINDOW = 0.3
 _WINDOW_PX = (3, 15)  # smaller ones hold too little of the edges: five times the error
 _REFINE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-MIN_CORNERS = 8  # a pose and a few corners to check it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +49,8 @@ def find_board(board: Board, image: Image) -> ImageObservation | None:
     if corners is None:
         return None
     corners = _refine(board, grey, corners)
-    if np.isfinite(corners[:, 0]).sum() < MIN_CORNERS:
+    min_corners = 8  # a pose and a few corners to check it
+    if np.isfinite(corners[:, 0]).sum() < min_corners:
         return None
     return ImageObservation(corners, _blur(board, grey, corners))
 
@@ -139,8 +137,10 @@ def _windows(board: Board, corners: Float) -> Float:
         for j in (0, 1):
             part = reach[i : rows - 1 + i, j : columns - 1 + j]
             np.fmin(part, height, out=part)
-    share = np.full((rows, columns), _OUTER_WINDOW)
-    share[1:-1, 1:-1] = _INNER_WINDOW
+    outer_window = 0.3
+    share = np.full((rows, columns), outer_window)
+    inner_window = 0.5  # of the distance to the next grid line
+    share[1:-1, 1:-1] = inner_window
     if isinstance(board, Charuco):
         share = np.minimum(share, 0.5 * (1.0 - board.marker_m / board.square_m))
     half = np.minimum(np.maximum(np.round(share * reach), _WINDOW_PX[0]), _WINDOW_PX[1])

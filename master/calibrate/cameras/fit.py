@@ -23,9 +23,7 @@ from master.calibrate.cameras.judge import Seen, Shot, judge, place_boards
 from master.calibrate.cameras.links import link
 from master.calibrate.cameras.views import BoardViews
 
-MIN_SHARED = 3  # views that a camera must share with the others: one can be wrong, two cannot outvote it
 _ROUNDS = 6
-_SURE = 3.0  # standard deviations that a term of the distortion must be away from zero
 _TANGENTIAL = (6, 7)
 _TERMS = ((8,), _TANGENTIAL, (5,), (4,))  # k3, p1 and p2, k2, k1: in this order they are given up
 
@@ -218,7 +216,8 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
             at = 9 * camera + np.array(index)
             covariance = solution.covariance[np.ix_(at, at)]
             square = float(lens[index] @ cast(Float, np.linalg.solve(covariance, lens[index])))
-            if square < len(index) * _SURE**2:
+            sure = 3.0  # standard deviations that a term of the distortion must be away from zero
+            if square < len(index) * sure**2:
                 kept[camera, index] = False
                 break
             if term != _TANGENTIAL and not kept[camera, _TANGENTIAL[0]]:
@@ -247,8 +246,10 @@ def _check_enough(
                 f"camera {camera!r}: only {len(own)} of {len(views.of(camera))} images agree with each other"
             )
         shared = sum(places.count(shot.place) > 1 for shot in own)
-        if len(views.cameras) > 1 and shared < MIN_SHARED:
+        # views that a camera must share with the others: one can be wrong, two cannot outvote it
+        min_shared = 3
+        if len(views.cameras) > 1 and shared < min_shared:
             raise FitError(
                 f"camera {camera!r} shares {shared} good views of the board with the other cameras, at least"
-                f" {MIN_SHARED} are needed (better 15)"
+                f" {min_shared} are needed (better 15)"
             )

@@ -25,10 +25,6 @@ from master.calibrate.cameras.judge import Seen, Shot, place_boards
 MIN_VIEWS = (
     8  # dealt into five folds they leave six to fit: fewer cannot distinguish a bent board from a bent lens
 )
-CHANCE = 0.01  # that a flat board is taken for a bent one
-_FOLDS = 5  # Hastie et al., section 7.10: five or ten
-_MIN_IMAGES = 3  # of each camera in every fit: three views determine a lens
-_MIN_HALF = 4  # corners that place a board
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +85,8 @@ def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> Board
         )
     flat_log, bent_log = np.log(flat_px[scored]), np.log(bent_px[scored])
     gain = flat_log - bent_log
-    bound = float(stdtrit(views - 1, 1.0 - CHANCE)) * float(gain.std(ddof=1)) / np.sqrt(views)
+    chance = 0.01  # that a flat board is taken for a bent one
+    bound = float(stdtrit(views - 1, 1.0 - chance)) * float(gain.std(ddof=1)) / np.sqrt(views)
     return BoardChoice(
         bent=bool(gain.mean() > bound),
         flat_px=float(np.exp(flat_log.mean())),
@@ -107,8 +104,9 @@ def _folds(shots: Sequence[Shot]) -> Iterator[tuple[list[Shot], list[Shot]]]:
     for shot in shots:
         cameras[shot.place] = (*cameras.get(shot.place, ()), shot.camera)
     places = sorted(cameras, key=lambda place: cameras[place])  # stable: in the order of the views
-    fold = {place: i % _FOLDS for i, place in enumerate(places)}
-    for k in range(min(_FOLDS, len(places))):
+    folds = 5  # Hastie et al., section 7.10: five or ten
+    fold = {place: i % folds for i, place in enumerate(places)}
+    for k in range(min(folds, len(places))):
         yield [s for s in shots if fold[s.place] != k], [s for s in shots if fold[s.place] == k]
 
 
@@ -118,7 +116,8 @@ def _lacking(seen: Seen, training: Sequence[Shot], free: Free) -> str:
     for c, camera in enumerate(seen.views.cameras):
         own = [shot for shot in training if shot.camera == camera]
         shared = sum(places.count(shot.place) > 1 for shot in own)
-        if (free.lenses[c].any() and len(own) < _MIN_IMAGES) or (free.cameras[c] and shared < _MIN_IMAGES):
+        min_images = 3  # of each camera in every fit: three views determine a lens
+        if (free.lenses[c].any() and len(own) < min_images) or (free.cameras[c] and shared < min_images):
             return camera
     return ""
 
@@ -152,7 +151,8 @@ def _predicted(
     halves: dict[int, list[Observation]] = {}
     for o in observations:
         half = _only(o, is_odd[o.corners] == odd)
-        if len(half.corners) >= _MIN_HALF:
+        min_half = 4  # corners that place a board
+        if len(half.corners) >= min_half:
             halves.setdefault(o.view, []).append(half)
     if not halves:
         return

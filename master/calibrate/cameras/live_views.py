@@ -18,9 +18,6 @@ from master.calibrate.cameras.coverage import advice_so_far
 from master.calibrate.cameras.detect import ImageObservation, find_board
 from master.calibrate.cameras.views import BoardViews, View
 
-STILL_PX = 0.5
-NEW_SHARE = 0.06  # of the image's width: how far corners must be from where an earlier view had them
-
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -59,7 +56,8 @@ class LiveViews:
             return Verdict(False, "no camera sees the board")
         by = " and ".join(seen)
         moved = {name: _moved(seen[name], last[name]) if name in last else float("inf") for name in seen}
-        if max(moved.values()) > STILL_PX:
+        still_px = 0.5
+        if max(moved.values()) > still_px:
             return Verdict(False, f"{by}: hold it still")
         if not self._is_new(seen):
             return Verdict(False, f"{by}: seen there already; move, turn or tilt it")
@@ -98,7 +96,9 @@ class LiveViews:
                 _moved(observation, view.observations[name]) / self._sizes[name][0]
                 for name, observation in seen.items()
             ]
-            if max(change) < NEW_SHARE:
+            # of the image's width: how far corners must be from where an earlier view had them
+            new_share = 0.06
+            if max(change) < new_share:
                 return False
         return True
 

@@ -7,7 +7,6 @@ from common.arrays import Float
 
 FALSE_ALARM = 0.05  # chance that a set of good views loses one; one view less costs little, a wrong one much
 GOOD_PX = 0.12  # as well as corners can be found: such a view is right, however good the others are
-_LEAST_SPREAD = 0.1  # of log rms: below it, views of one camera hardly ever agree
 
 
 def limit(errors: Float, dof: Float) -> float:
@@ -29,7 +28,8 @@ def limit(errors: Float, dof: Float) -> float:
     logs = np.log(np.maximum(errors, 1e-6))
     middle = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    least_spread = 0.1  # of log rms: below it, views of one camera hardly ever agree
     # The logarithm of an rms of n normal numbers has the standard deviation 1 / sqrt(2 n).
-    spread = max(spread, _LEAST_SPREAD, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
+    spread = max(spread, least_spread, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
     quantile = float(stdtrit(len(errors) - 1, 1.0 - FALSE_ALARM / len(errors)))
     return max(float(np.exp(middle + quantile * spread)), GOOD_PX)

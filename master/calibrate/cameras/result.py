@@ -21,11 +21,6 @@ from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.held_out import BoardChoice
 from master.calibrate.cameras.lens_files import camera_model, intrinsics_of, matrix_of
 
-MOST_FOCAL_SD = 0.01  # of the focal length: one percent of every depth
-MOST_RMS = 0.0025  # of the image's width: five times what poor pictures of a good board leave
-LEAST_TILT_DEG = 10.0
-LEAST_COVER = 0.25
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensResult:
@@ -129,7 +124,8 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
     covered = coverage(fit.views.sizes_px[name], uv, T_camera_board, bundle.drawn_m.mean(axis=0))
     lens, sd = bundle.lenses[index], fit.solution.lens_sd(index)
     error = rms([fit.solution.residuals[i] for i in own])
-    if error > MOST_RMS * fit.views.sizes_px[name][0]:
+    most_rms = 0.0025  # of the image's width: five times what poor pictures of a good board leave
+    if error > most_rms * fit.views.sizes_px[name][0]:
         raise FitError(
             f"camera {name!r}: corners are off by {error:.2f} px rms over {len(own)} images: they do not agree on any"
             " place of the board; is it rigid and flat, are columns and rows right, did the zoom or focus change?"
@@ -152,14 +148,17 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
 
 def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: int) -> None:
     what = ""
-    if covered.tilt_spread_deg < LEAST_TILT_DEG or not focal_sd <= MOST_FOCAL_SD:
+    most_focal_sd = 0.01  # of the focal length: one percent of every depth
+    least_tilt_deg = 10.0
+    least_cover = 0.25
+    if covered.tilt_spread_deg < least_tilt_deg or not focal_sd <= most_focal_sd:
         what = (
             f"the focal length is not determined (standard deviation {min(100 * focal_sd, 999):.2g} %, at most"
-            f" {100 * MOST_FOCAL_SD:g} %): the board's tilts lie within {covered.tilt_spread_deg:.0f}° of each other"
+            f" {100 * most_focal_sd:g} %): the board's tilts lie within {covered.tilt_spread_deg:.0f}° of each other"
         )
-    elif covered.share < LEAST_COVER:
+    elif covered.share < least_cover:
         what = (
-            f"corners cover {100 * covered.share:.0f} % of the image, at least {100 * LEAST_COVER:.0f} %"
+            f"corners cover {100 * covered.share:.0f} % of the image, at least {100 * least_cover:.0f} %"
             " are needed: beyond them the distortion would be a guess"
         )
     if what:

@@ -30,10 +30,6 @@ from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw, ideal_law
 
 Fit = Callable[[Float, Float], tuple[DepthLaw, Float]]
 
-_MAX_PAIRS = 5000  # of points, from which robust laws are drawn: all of them for up to 100 points
-_GROSS = 0.01  # error of depth below which a point is never called an outlier: a ruler's, a mount's
-_SCALES = 3.0  # robust standard deviations beyond which a point is an outlier
-
 
 def fit_power_law(disparity: Float, distance: Float) -> tuple[PowerLaw, Float]:
     """D = k x^z by least squares in ln D (Kalbfleisch, eq. 12).
@@ -122,7 +118,8 @@ def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
     Slope and offset.
     """
     i, j = np.triu_indices(x.size, 1)
-    some = slice(None, None, -(-i.size // _MAX_PAIRS))
+    max_pairs = 5000  # of points, from which robust laws are drawn: all of them for up to 100 points
+    some = slice(None, None, -(-i.size // max_pairs))
     i, j = i[some], j[some]
     slope = (y[j] - y[i]) / (x[j] - x[i])
     offset = y[i] - slope * x[i]
@@ -137,4 +134,6 @@ def _beyond(error: Float) -> Bool:
     Shape (N,); robust scale with the small sample factor of Rousseeuw & Leroy 1987.
     """
     scale = 1.4826 * (1.0 + 5.0 / max(error.size - 2, 1)) * float(np.median(error))
-    return error > max(_SCALES * scale, _GROSS)
+    gross = 0.01  # error of depth below which a point is never called an outlier: a ruler's, a mount's
+    scales = 3.0  # robust standard deviations beyond which a point is an outlier
+    return error > max(scales * scale, gross)

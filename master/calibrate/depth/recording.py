@@ -24,12 +24,6 @@ from master.replay.recorded import recorded_detections
 
 STILL_S = 0.5  # shortest stretch that counts as standing
 STILL_FRAMES = 5
-STILL_SIGMAS = 6.0  # distance of a frame's centroid from the mean of its stretch
-AROUND_S = 0.25  # frames before and after a time that `--distances FILE` names
-_NOISE_PX = 0.1  # of a centroid whose sigma is not stated
-_UNSURE_PX = (
-    0.2  # of a target at rest; more is stated of what moves suddenly, and must not excuse that it moves
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +152,8 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
     since_s = (pairs.t_ns - pairs.t_ns[0]) * 1e-9
     number_of = np.arange(since_s.size, dtype=np.float64)
     of_pair = {"t_s": since_s, "frame": number_of, "seq": pairs.seq.astype(np.float64)}[key]
-    around = AROUND_S if key == "t_s" else 0.0
+    around_s = 0.25  # frames before and after a time that `--distances FILE` names
+    around = around_s if key == "t_s" else 0.0
     runs: list[Int] = []
     for (number, _), v in zip(rows, column(path, rows, key).tolist(), strict=True):
         run = np.flatnonzero(np.abs(of_pair - v) <= around)
@@ -169,7 +164,7 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
             )
         if run.size > 1 and not _is_still(pairs, run):
             raise CalibrationError(
-                f"{path}: line {number}: the target moves within {AROUND_S} s of t_s {v:g}; still are"
+                f"{path}: line {number}: the target moves within {around_s} s of t_s {v:g}; still are"
                 f" {_times(pairs, still_runs(pairs))}"
             )
         runs.append(run)
@@ -200,8 +195,12 @@ def _near(pairs: Pairs, run: Int, new: int | Int) -> bool:
     False where one is not seen.
     """
     off = np.abs(pairs.uv[:, new] - pairs.uv[:, run].mean(axis=1).reshape(2, *([1] * np.ndim(new)), 2))
-    sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], _NOISE_PX), _UNSURE_PX)[..., None]
-    return bool((off <= STILL_SIGMAS * sigma).all())
+    noise_px = 0.1  # of a centroid whose sigma is not stated
+    # of a target at rest; more is stated of what moves suddenly, and must not excuse that it moves
+    unsure_px = 0.2
+    sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], noise_px), unsure_px)[..., None]
+    still_sigmas = 6.0  # distance of a frame's centroid from the mean of its stretch
+    return bool((off <= still_sigmas * sigma).all())
 
 
 def _is_still(pairs: Pairs, run: Int) -> bool:

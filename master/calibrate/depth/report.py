@@ -21,8 +21,6 @@ from master.calibrate.depth.fit import (
 from master.calibrate.depth.sweep import Sweep, check_enough
 from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw
 
-MOST_OUT = 0.2  # of all distances; with more out, it is not single ones that are wrong
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthReport:
@@ -68,7 +66,8 @@ def fit_depth(sweep: Sweep, before: Mapping[str, DepthLaw]) -> DepthReport:
         FitError: Too many points contradict the others, or too few are left.
     """
     out = outliers(sweep.disparity_px, sweep.distance_m)
-    if out.sum() > MOST_OUT * sweep.size:
+    most_out = 0.2  # of all distances; with more out, it is not single ones that are wrong
+    if out.sum() > most_out * sweep.size:
         raise FitError(
             f"{int(out.sum())} of {sweep.size} distances fit no law that the others follow: {sweep.names(out)};"
             " measure these again, and see that the cameras did not move in between"

@@ -18,9 +18,6 @@ from common.messages import Detections, MarkerDetections
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep
 from master.run.app import Source
 
-STILL_PX = 0.2  # drift over the reading, five times the noise of a quarter's mean; 0.5 % of the depth at 1 m
-SHAKE_PX = 0.5  # standard deviation of single frames, five times the noise of a good centroid
-PATIENCE_S = 10.0
 _QUARTERS = 4
 
 
@@ -92,10 +89,13 @@ class Meter:
         seen = [np.array([values for _, values in kept]) for kept in self._kept]
         drift = max(_drift(values[:, :2]) for values in seen)
         shake = max(float(values[:, :2].std(axis=0).max()) for values in seen)
-        if drift > STILL_PX or shake > SHAKE_PX:
+        # drift over the reading, five times the noise of a quarter's mean; 0.5 % of the depth at 1 m
+        still_px = 0.2
+        shake_px = 0.5  # standard deviation of single frames, five times the noise of a good centroid
+        if drift > still_px or shake > shake_px:
             self.trouble = (
-                f"the target moves: its image drifts by {drift:.2f} px and shakes by {shake:.2f} px; {STILL_PX} and"
-                f" {SHAKE_PX} are allowed"
+                f"the target moves: its image drifts by {drift:.2f} px and shakes by {shake:.2f} px; {still_px} and"
+                f" {shake_px} are allowed"
             )
             return None
         times = [np.array([t for t, _ in kept], np.int64) for kept in self._kept]
@@ -125,7 +125,8 @@ def measure(
     while source.get(0.0) is not None:  # what was seen while it was being put there
         pass
     since_ns = clock.now_ns()
-    while clock.now_ns() - since_ns < PATIENCE_S * 1e9:
+    patience_s = 10.0
+    while clock.now_ns() - since_ns < patience_s * 1e9:
         message = source.get(0.1)
         if not isinstance(message, MarkerDetections) or message.t_ns < since_ns:
             continue

@@ -23,7 +23,6 @@ from master.calibrate.tree_files import load_marker_rig
 from master.fabrik.blob_bias import card_outline, centre_of_blob, round_outline
 
 _LEFT_RIGHT = ("left", "right")
-_NOTED_PX = 0.02  # shift of a centroid worth a line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,7 +213,8 @@ def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
         ]
     )
     shift = float(np.nanmax(np.abs(uv - sweep.uv), initial=0.0))
-    note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > _NOTED_PX else ""
+    noted_px = 0.02  # shift of a centroid worth a line
+    note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > noted_px else ""
     return replace(sweep, uv=uv, disparity_px=uv[0, :, 0] - uv[1, :, 0]), note
 
 

@@ -14,15 +14,8 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
 
-POINTS = 8  # two constants, and enough points to distinguish a wrong one from the others; the paper has 17
 RANGE = 2.5  # farthest over nearest distance; the paper has 5
-IN_EACH_HALF = 2  # points nearer, and farther, than the geometric middle of the range
 FARTHEST_M = 10.0  # beyond it, 75 mm of baseline give less than 4 px: these are centimetres
-SAME_M = 0.0005  # distances that a ruler does not distinguish
-RULER_M = 0.002  # to which a target can be put back to a mark
-DISAGREE_PX = 0.5  # five standard deviations of a disparity from two centroids of 0.07 px
-_WHOLE = 0.85  # area x distance^2 of a target that faces the cameras is constant; a tilt by 30 deg costs 13 %
-_HALF_LENGTH = 0.62  # of the published target (75 x 50 mm), in square roots of its area
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,9 +116,11 @@ def check_enough(sweep: Sweep) -> None:
     Raises:
         FitError: The message states what is missing.
     """
-    if sweep.size < POINTS:
+    # two constants, and enough points to distinguish a wrong one from the others; the paper has 17
+    points = 8
+    if sweep.size < points:
         raise FitError(
-            f"{sweep.size} usable distances, {POINTS} are needed and the published fit has 17: measure from 1.00 m"
+            f"{sweep.size} usable distances, {points} are needed and the published fit has 17: measure from 1.00 m"
             f" to 0.20 m in steps of 0.05 m"
         )
     near, far = float(sweep.distance_m.min()), float(sweep.distance_m.max())
@@ -139,11 +134,12 @@ def check_enough(sweep: Sweep) -> None:
         int((sweep.distance_m < middle).sum()),
         int((sweep.distance_m > middle).sum()),
     )
-    if min(nearer, farther) < IN_EACH_HALF:
+    in_each_half = 2  # points nearer, and farther, than the geometric middle of the range
+    if min(nearer, farther) < in_each_half:
         side, count = ("nearer", nearer) if nearer < farther else ("farther", farther)
         raise FitError(
             f"one-sided: only {count} of {sweep.size} distances is {side} than {middle:.3g} m (the geometric middle"
-            f" of {near:.3g}...{far:.3g} m), {IN_EACH_HALF} are needed: measure more that are {side}"
+            f" of {near:.3g}...{far:.3g} m), {in_each_half} are needed: measure more that are {side}"
         )
 
 
@@ -194,7 +190,10 @@ def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
         return
     typical = np.median(nominal, axis=1, keepdims=True)
     gap = np.minimum(sweep.uv, np.array(size_px) - 1.0 - sweep.uv).min(axis=2)
-    cut = (nominal < _WHOLE * typical) & (gap < _HALF_LENGTH * np.sqrt(typical) / sweep.distance_m)
+    # area x distance^2 of a target that faces the cameras is constant; a tilt by 30 deg costs 13 %
+    whole = 0.85
+    half_length = 0.62  # of the published target (75 x 50 mm), in square roots of its area
+    cut = (nominal < whole * typical) & (gap < half_length * np.sqrt(typical) / sweep.distance_m)
     for index, camera in enumerate(cameras):
         if cut[index].any():
             raise FitError(
@@ -209,19 +208,22 @@ def _merged(sweep: Sweep) -> Sweep:
     Raises:
         FitError: Equal distances whose disparities differ by more than a ruler and noise explain.
     """
-    group = np.concatenate([[0], np.cumsum(np.diff(sweep.distance_m) > SAME_M)]).astype(np.int64)
+    same_m = 0.0005  # distances that a ruler does not distinguish
+    group = np.concatenate([[0], np.cumsum(np.diff(sweep.distance_m) > same_m)]).astype(np.int64)
     parts: list[Sweep] = []
     for g in range(int(group[-1]) + 1 if sweep.size else 0):
         same = sweep.at(group == g)
         spread = float(np.ptp(same.disparity_px))
         x, d = float(same.disparity_px.mean()), float(same.distance_m.mean())
-        if spread > DISAGREE_PX + x * RULER_M / d:
+        ruler_m = 0.002  # to which a target can be put back to a mark
+        disagree_px = 0.5  # five standard deviations of a disparity from two centroids of 0.07 px
+        if spread > disagree_px + x * ruler_m / d:
             listed = ", ".join(
                 f"{p}: {v:.2f} px" for p, v in zip(same.place, same.disparity_px.tolist(), strict=True)
             )
             raise FitError(
                 f"the same distance {d:.4g} m was measured with disparities that disagree ({listed}): more than"
-                f" {1e3 * RULER_M:.0f} mm on the ruler explain; measure it again or leave one out"
+                f" {1e3 * ruler_m:.0f} mm on the ruler explain; measure it again or leave one out"
             )
         parts.append(same if same.size == 1 else _mean(same))
     return _joined(parts) if parts else sweep

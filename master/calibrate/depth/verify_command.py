@@ -27,7 +27,6 @@ from master.calibrate.depth.verify_report import (
 from master.commands.summary import write_summary
 from master.fabrik.depth import tolerable_skew_s
 
-_WANTED = 0.02  # of the depth, as the published rig
 _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
@@ -117,10 +116,11 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[s
     expected = budget(pair.models, distance, noise)
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
     baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
-    apart_ms = 1e3 * tolerable_skew_s(_WANTED, baseline_m, 1.0)
+    wanted = 0.02  # of the depth, as the published rig
+    apart_ms = 1e3 * tolerable_skew_s(wanted, baseline_m, 1.0)
     echo(
         f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
-        f" {100 * _WANTED:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
+        f" {100 * wanted:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
     )
     for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
         echo(line)

@@ -35,10 +35,6 @@ MOTION = (
     "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
     " forearm about all its axes, before the marker cameras"
 )
-_MOST = 200  # strobe cycles: more of the same motion add time, not information
-_FEWEST, _LEAST_S = 60, 5.0
-_LINES_OF_SIGHT = 2  # fingers with a laser point or a tip
-_MARKERS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,28 +156,32 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
     Raises:
         FitError: There are too few of them, or the IMU was silent.
     """
-    if len(hand.t_s) < _FEWEST or len(imu) < _FEWEST:
+    fewest, least_s = 60, 5.0
+    if len(hand.t_s) < fewest or len(imu) < fewest:
         raise FitError(
-            f"markers gave {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {_FEWEST} of"
+            f"markers gave {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {fewest} of"
             f" each are needed: {MOTION}"
         )
     fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
     near = hand.nearest(seen.t_s)
-    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= _MARKERS
-    both = (fingers >= _LINES_OF_SIGHT) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
+    markers = 4
+    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= markers
+    lines_of_sight = 2  # fingers with a laser point or a tip
+    both = (fingers >= lines_of_sight) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
     both &= (seen.t_s > imu.t_s[0]) & (seen.t_s < imu.t_s[-1])
     rows = np.flatnonzero(both)
-    if len(rows) < _FEWEST or np.ptp(seen.t_s[rows]) < _LEAST_S:
+    if len(rows) < fewest or np.ptp(seen.t_s[rows]) < least_s:
         raise FitError(
-            f"marker cameras and wrist device saw the hand together in {len(rows)} cycles, at least {_FEWEST} of"
-            f" {_LEAST_S:.0f} s are needed: {MOTION}"
+            f"marker cameras and wrist device saw the hand together in {len(rows)} cycles, at least {fewest} of"
+            f" {least_s:.0f} s are needed: {MOTION}"
         )
     if imu.gap_s > GAP_S:
         raise FitError(
             f"the IMU was silent for {imu.gap_s:.2f} s: its turns cannot be summed up; record again"
         )
     out = np.zeros(len(seen.t_s), np.bool_)
-    out[rows[np.unique(np.linspace(0, len(rows) - 1, min(_MOST, len(rows))).astype(np.int64))]] = True
+    most = 200  # strobe cycles: more of the same motion add time, not information
+    out[rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]] = True
     return out
 
 

@@ -14,7 +14,7 @@ from master.calibrate.extrinsics.seen import Fit, StrobeCycles
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 from master.calibrate.extrinsics.unknown import Unknown
 
-_COARSE, _COARSE_ROUNDS = 40, (4, 4, 4)  # epochs and steps of a first look
+_COARSE_ROUNDS = (4, 4, 4)  # epochs and steps of a first look
 _ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
 
 
@@ -39,7 +39,8 @@ def fit_extrinsics(
         px_per_m: What a metre at the tips is in the image.
         firsts: First guesses, of which one is right to some 15 degrees, 15 mm and 20 ms.
     """
-    some = np.unique(np.linspace(0, len(cycles.t_s) - 1, _COARSE).astype(np.int64))
+    # epochs and steps of a first look
+    some = np.unique(np.linspace(0, len(cycles.t_s) - 1, 40).astype(np.int64))
     coarse = cycles.of(some)
     best: tuple[float, Unknown] | None = None
     for first in firsts:

@@ -22,7 +22,6 @@ from master.rig.wrist import WristSetup
 
 FINGERS = slice(1, 5)
 SEEN = 4  # numbers of a finger: laser point across and along [m], tip [px]
-_RAYS = 16
 _ROTATION_STEP, _SHIFT_M, _THICK = np.radians(0.2), 2e-4, 0.01  # steps of differences
 _STEPS = np.repeat([_ROTATION_STEP, _SHIFT_M, _ROTATION_STEP, _THICK], (3, 3, 4, 1))
 
@@ -35,7 +34,8 @@ class LinesOfSight:
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        self._intersection, self._tips = LaserIntersection(setup, _RAYS), Fingertips.of(setup.model)
+        rays = 16
+        self._intersection, self._tips = LaserIntersection(setup, rays), Fingertips.of(setup.model)
 
     def flat(self, point_m: Float) -> Float:
         """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""

@@ -12,9 +12,6 @@ from master.calibrate.extrinsics.hands import HandProblem, Hands, Linear
 from master.calibrate.extrinsics.unknown import CAMERA_LATE, UNKNOWN
 from master.estimator.parameters import HandParameters
 
-_DIFFERENCE_STEP = 1e-5
-_NOTHING = 1e-9  # information of what nothing constrains
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
@@ -41,9 +38,10 @@ class Normal:
         """Of the markers, which move with the camera's clock by `speed` (T, M, 3) [m/s]."""
         count, size = linear.gradient.shape
         mixed, shared, pull = np.zeros((count, size, UNKNOWN)), np.zeros((UNKNOWN,) * 2), np.zeros(UNKNOWN)
-        later = replace(problem, points_m=problem.points_m + _DIFFERENCE_STEP * speed)
+        difference_step = 1e-5
+        later = replace(problem, points_m=problem.points_m + difference_step * speed)
         after = later.linearise(hands).gradient  # linear in the points
-        mixed[..., CAMERA_LATE] = (after - linear.gradient) / _DIFFERENCE_STEP
+        mixed[..., CAMERA_LATE] = (after - linear.gradient) / difference_step
         off = problem.place(hands) - problem.points_m
         residual, by_late = ((problem.whiten @ v[..., None])[..., 0] for v in (off, -speed))
         shared[CAMERA_LATE, CAMERA_LATE] = (by_late**2).sum()
@@ -89,7 +87,8 @@ class Normal:
         """
         own = self.own.copy()
         diagonal = np.einsum("tii->ti", own)
-        diagonal[...] = (1.0 + damping) * diagonal + _NOTHING
+        nothing = 1e-9  # information of what nothing constrains
+        diagonal[...] = (1.0 + damping) * diagonal + nothing
         by_shared = np.asarray(np.linalg.solve(own, self.mixed), np.float64)
         own_step = np.asarray(np.linalg.solve(own, self.own_pull[..., None])[..., 0], np.float64)
         information = self.shared + damping * np.diag(np.diag(self.shared))

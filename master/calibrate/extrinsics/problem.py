@@ -54,14 +54,8 @@ from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of
 
-_SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
-_CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
-_PRIOR_SHARE = 1e-2  # of their information: what sensors measure is to count
 _TWIST_RAD = np.radians(1.0)
 _WRIST_RAD = np.radians(15.0)
-_PER_S = 4.0  # independent epochs
-_FARTHEST = 8.0  # of a finger that the laser should meet and does not
-_TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
 _EYE = np.eye(3)
 
 
@@ -109,11 +103,14 @@ class Problem:
             np.zeros((count, len(names), 3)),
             np.zeros((count, len(names), 3, 3)),
         )
-        tip_px = np.hypot(np.nan_to_num(cycles.tip_sigma_px), _TIP_M * px_per_m)
-        laser_m = np.hypot(np.nan_to_num(cycles.laser_sigma_m), _SURFACE_M)
+        # skin of another shape than the cones; a tip is seen anywhere on its pulp
+        surface_m, tip_m = 8e-4, 1e-3
+        tip_px = np.hypot(np.nan_to_num(cycles.tip_sigma_px), tip_m * px_per_m)
+        laser_m = np.hypot(np.nan_to_num(cycles.laser_sigma_m), surface_m)
         self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
         last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
-        self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
+        per_s = 4.0  # independent epochs
+        self._share = min(per_s * (last_s - first_s) / count, 1.0)
         self._wrist_sigma = np.array([_WRIST_RAD, _WRIST_RAD, _TWIST_RAD])
         self._prior_sigma = prior_sigma()
 
@@ -140,7 +137,8 @@ class Problem:
         orientations = self._mended.at(at - unknown.imu_late_s)
         self._known = orientations.known & (markers.seen.sum(axis=1) > 0)
         seen = markers.seen & self._known[:, None]
-        cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
+        cap_m = 5e-4  # where caps sit, beyond the noise of the cameras
+        cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + cap_m**2 * _EYE
         whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
         place = self._hands.place(hands)
         far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
@@ -187,7 +185,8 @@ class Problem:
         damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
         for _ in range(rounds):
             normal, gain = self.normal(unknown, hands), 0.0
-            for _ in range(_TRIALS):
+            trials, settled = 6, 0.03  # of a step; the gain that is none
+            for _ in range(trials):
                 trial = self._stepped(unknown, hands, *normal.step(damping))
                 trial_cost = self.cost(*trial)
                 if trial_cost < cost:
@@ -197,7 +196,7 @@ class Problem:
                 break
             (unknown, hands), gain, cost, damping = trial, cost - trial_cost, trial_cost, 0.2 * damping
             taken += 1
-            if gain < _SETTLED:
+            if gain < settled:
                 break
         return unknown, hands, taken
 
@@ -275,7 +274,8 @@ class Problem:
         """
         off = (shown - self._data) / self.sigma
         missed = np.isnan(shown) & np.isfinite(self._data)
-        return np.where(missed, _FARTHEST, np.nan_to_num(off))
+        farthest = 8.0  # of a finger that the laser should meet and does not
+        return np.where(missed, farthest, np.nan_to_num(off))
 
     def cost(self, unknown: Unknown, hands: Hands) -> float:
         """Return the sum of squares with outliers down-weighted."""
@@ -379,8 +379,8 @@ class Problem:
 
 def _loosest(posture_prior: PosturePrior) -> PosturePrior:
     """Those of the free hand, the last hypothesis, with a share of their information."""
+    prior_share = 1e-2  # of their information: what sensors measure is to count
     normal, pull, constant = (
-        _PRIOR_SHARE * part[-1:]
-        for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant)
+        prior_share * part[-1:] for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant)
     )
     return PosturePrior(normal, pull, constant, posture_prior.log_density[-1:])

@@ -7,8 +7,7 @@ from common.errors import FitError
 from master.calibrate.extrinsics.seen import Fit
 from master.calibrate.extrinsics.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
 
-_ROTATION_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
-_MOST_RMS, _MOST_OUTLIERS = 1.8, 0.35
+_ROTATION_RAD = np.radians(4.0)  # standard deviations, at most
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
@@ -39,7 +38,8 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
     Raises:
         FitError: With what to do.
     """
-    if fit.rms > _MOST_RMS or fit.outlier_share > _MOST_OUTLIERS:
+    most_rms, most_outliers = 1.8, 0.35
+    if fit.rms > most_rms or fit.outlier_share > most_outliers:
         raise FitError(
             f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
             f" {100 * fit.outlier_share:.0f} % outliers. Is the hand file that of this hand and side, the laser plane"
@@ -55,12 +55,13 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
             f"its turn is known to {rotation:.1f} deg only: turn the forearm about another axis as well,"
             " and bend the wrist"
         )
-    if 1e-3 * sigma["shift_sigma_mm"] > _SHIFT_M:
+    shift_m, clock_s = 4e-3, 8e-3  # standard deviations, at most
+    if 1e-3 * sigma["shift_sigma_mm"] > shift_m:
         wanting.append(
             f"its place is known to {sigma['shift_sigma_mm']:.1f} mm only: bend every finger before the device, with"
             " its marker in sight of the cameras"
         )
-    if 1e-3 * clock > _CLOCK_S:
+    if 1e-3 * clock > clock_s:
         wanting.append(f"its clocks are known to {clock:.1f} ms only: move fingers and forearm faster")
     if wanting:
         raise FitError("; ".join(wanting))

@@ -21,10 +21,6 @@ from common.geometry.transforms import (
 from common.hand.model import WRIST, HandModel
 from common.messages import HandPose, ImuSample
 
-_NEAR_S = 0.08  # of an epoch: fingers move smoothly for twice as long
-_SUPPORT = 10  # frames to either side
-_TERMS, _NEIGHBOURS = 4, 2  # of a cubic; frames to each side that it needs
-_POOR_M = 0.03  # a cap of which so little is seen that its place is off by as much as this
 GAP_S = 0.06  # between samples of an IMU
 _EYE = np.eye(3)
 
@@ -75,7 +71,8 @@ class HandTrack:
         """
         known = [pose for pose in poses if pose.valid[WRIST] and np.isfinite(pose.angles_rad).all()]
         cov = np.array([pose.markers_cov_m2 for pose in known])
-        poor = ~(np.einsum("tmii->tm", cov) < _POOR_M**2)
+        poor_m = 0.03  # a cap of which so little is seen that its place is off by as much as this
+        poor = ~(np.einsum("tmii->tm", cov) < poor_m**2)
         points = np.where(poor[..., None], np.nan, np.array([pose.markers_raw_m for pose in known]))
         T = np.tile(np.eye(4), (len(known), 1, 1))
         integrated = np.array([pose.orientation_wxyz[WRIST] for pose in known]).reshape(-1, 4)
@@ -104,23 +101,26 @@ class HandTrack:
         often taken at the same share of the time between two frames.
         """
         near = self.nearest(t_s)
-        rows = np.clip(near[:, None] + np.arange(-_SUPPORT, _SUPPORT + 1), 0, len(self.t_s) - 1)
-        off = (self.t_s[rows] - t_s[:, None]) / _NEAR_S  # (T, K)
+        support = 10  # frames to either side
+        rows = np.clip(near[:, None] + np.arange(-support, support + 1), 0, len(self.t_s) - 1)
+        near_s = 0.08  # of an epoch: fingers move smoothly for twice as long
+        off = (self.t_s[rows] - t_s[:, None]) / near_s  # (T, K)
         points, cov = self.points_m[rows], self.cov_m2[rows]  # (T, K, M, 3), (T, K, M, 3, 3)
         within = (np.abs(off) < 1.0) & np.diff(rows, axis=1, prepend=-1).astype(np.bool_)
         seen = within[..., None] & np.isfinite(points[..., 0]) & np.isfinite(cov[..., 0, 0])
         weight = np.where(
             seen, 1.0 / np.einsum("tkmii->tkm", np.where(seen[..., None, None], cov, _EYE)), 0.0
         )
-        power = off[..., None] ** np.arange(_TERMS)
+        terms, neighbours = 4, 2  # of a cubic; frames to each side that it needs
+        power = off[..., None] ** np.arange(terms)
         normal = np.einsum("tkm,tki,tkj->tmij", weight, power, power)
         pull = np.einsum("tkm,tki,tkmd->tmid", weight, power, np.where(seen[..., None], points, 0.0))
         before, after = ((seen & side[..., None]).sum(axis=1) for side in (off <= 0.0, off >= 0.0))
-        valid = (before >= _NEIGHBOURS) & (after >= _NEIGHBOURS) & np.isfinite(self.cov_m2[near][..., 0, 0])
-        solvable = np.where(valid[..., None, None], normal, np.eye(_TERMS))
+        valid = (before >= neighbours) & (after >= neighbours) & np.isfinite(self.cov_m2[near][..., 0, 0])
+        solvable = np.where(valid[..., None, None], normal, np.eye(terms))
         taylor = np.asarray(np.linalg.solve(solvable, pull), np.float64)
         taylor[~valid] = np.nan
-        speed, acceleration = taylor[:, :, 1] / _NEAR_S, 2.0 * taylor[:, :, 2] / _NEAR_S**2
+        speed, acceleration = taylor[:, :, 1] / near_s, 2.0 * taylor[:, :, 2] / near_s**2
         return Markers(taylor[:, :, 0], speed, acceleration, self.cov_m2[near])
 
 

@@ -13,10 +13,7 @@ UNKNOWN = 34
 CAMERA_IMU, SHIFT, FOREARM_IMU, RIG_WORLD, ZERO = (slice(3 * k, 3 * k + 3) for k in range(5))
 CAMERA_LATE, IMU_LATE = 15, 16
 THICK, REACH, GAIN = slice(17, 21), slice(21, 25), slice(25, 34)
-ANY_RAD, ANY_M, ANY_S = 1.0, 0.03, 0.1  # standard deviations of what nothing is known of
 _ZERO_RAD_S = np.radians(2.5)  # of the zero of a gyroscope when it is switched on (`common.imu_doubt`)
-_GAIN = 0.015  # of its axes, and of how they lean to each other (ICM-20948, DS-000189, table 1)
-_REACH_M = 2e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +77,10 @@ class Unknown:
 
 def prior_sigma() -> Float:
     """Return the prior standard deviations (UNKNOWN,)."""
-    sigma = np.full(UNKNOWN, ANY_RAD)
-    sigma[SHIFT], sigma[ZERO], sigma[[CAMERA_LATE, IMU_LATE]] = ANY_M, _ZERO_RAD_S, ANY_S
-    sigma[THICK], sigma[REACH], sigma[GAIN] = SPREAD, _REACH_M, _GAIN
+    any_rad, any_m, any_s = 1.0, 0.03, 0.1  # standard deviations of what nothing is known of
+    sigma = np.full(UNKNOWN, any_rad)
+    sigma[SHIFT], sigma[ZERO], sigma[[CAMERA_LATE, IMU_LATE]] = any_m, _ZERO_RAD_S, any_s
+    gain = 0.015  # of its axes, and of how they lean to each other (ICM-20948, DS-000189, table 1)
+    reach_m = 2e-3
+    sigma[THICK], sigma[REACH], sigma[GAIN] = SPREAD, reach_m, gain
     return sigma

@@ -9,8 +9,6 @@ from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.wrist_joint import wrist_angles_of
 
-_DIFFERENCE_STEP = 1e-5
-
 
 def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
     """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
@@ -24,6 +22,7 @@ def bends_by_rotation(R_forearm_palm: Float) -> Float:
     """
     here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
-        rotated = rotation_vector_to_matrix(_DIFFERENCE_STEP * np.eye(3)[k]) @ R_forearm_palm
-        out[..., k] = (wrist_rotation_angles(rotated) - here) / _DIFFERENCE_STEP
+        difference_step = 1e-5
+        rotated = rotation_vector_to_matrix(difference_step * np.eye(3)[k]) @ R_forearm_palm
+        out[..., k] = (wrist_rotation_angles(rotated) - here) / difference_step
     return out

@@ -19,12 +19,6 @@ from common.hand.routine import MOVES, ROUTINE_S, STEPS, posture_at
 from master.calibrate.hand.observed import Observed
 
 GRID_S = 0.1
-_FAR_M = 0.08  # farther off than this carries no more information
-_TEMPO = 3  # the user's fastest, times the routine's
-_STEP_COST = 1e-5  # [m^2] of leaving the routine's tempo
-_STILL_S, _STILL_M = 0.4, 4e-3
-_TRIED = 4  # stretches of stillness
-_DIP_PER_PIP = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +60,8 @@ def align(observed: Observed, model: HandModel) -> Alignment:
 def posture_angles(script_s: float) -> Float:
     """Angles (5, 4) [rad] that the routine asks for."""
     posture = np.radians(posture_at(script_s))
-    return np.column_stack([posture, _DIP_PER_PIP * posture[:, 2]])
+    dip_per_pip = 0.75
+    return np.column_stack([posture, dip_per_pip * posture[:, 2]])
 
 
 def flat_scale(observed: Observed, model: HandModel) -> float:
@@ -163,12 +158,13 @@ def _still(points: Float) -> list[Float]:
 
     All that is seen rests there; four tips at least.
     """
-    length = round(_STILL_S / GRID_S)
+    still_s, still_m = 0.4, 4e-3
+    length = round(still_s / GRID_S)
     out: list[Float] = []
     for start in range(0, len(points) - length, 2):
         window = points[start : start + length]
         seen = np.asarray(np.isfinite(window[..., 0]).all(axis=0), np.bool_)
-        if seen[:5].sum() >= 4 and np.ptp(window[:, seen], axis=0).max() < _STILL_M:
+        if seen[:5].sum() >= 4 and np.ptp(window[:, seen], axis=0).max() < still_m:
             out.append(np.where(seen[:, None], window.mean(axis=0), np.nan))
     if not out:
         raise FitError(
@@ -186,7 +182,8 @@ def _flat_poses(points: Float, flat: Float) -> list[Float]:
         pose = fit_rigid(window[seen], flat[seen])
         off = window[seen] - transform(pose, flat[seen])
         poses.append((float((off**2).mean()), number, pose))
-    return [pose for _, _, pose in sorted(poses, key=lambda entry: entry[:2])[:_TRIED]]
+    tried = 4  # stretches of stillness
+    return [pose for _, _, pose in sorted(poses, key=lambda entry: entry[:2])[:tried]]
 
 
 def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: Float) -> Alignment:
@@ -197,15 +194,18 @@ def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: 
     asked = transform(pose, template)
     square = ((points[:, None] - asked[None]) ** 2).sum(axis=-1)  # (N, S, M)
     seen = np.isfinite(square)
-    near = np.where(seen, np.minimum(square, _FAR_M**2), 0.0)
+    far_m = 0.08  # farther off than this carries no more information
+    near = np.where(seen, np.minimum(square, far_m**2), 0.0)
     cost = near.sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
     count = len(script)
     total = np.where(np.arange(count) == 0, cost[0], np.inf)
     came = np.zeros((len(time_s), count), np.int64)
     for i in range(1, len(time_s)):
-        ways = np.full((_TEMPO + 1, count), np.inf)
-        for k in range(_TEMPO + 1):
-            ways[k, k:] = total[: count - k] + _STEP_COST * abs(k - 1)
+        tempo = 3  # the user's fastest, times the routine's
+        ways = np.full((tempo + 1, count), np.inf)
+        for k in range(tempo + 1):
+            step_cost = 1e-5  # [m^2] of leaving the routine's tempo
+            ways[k, k:] = total[: count - k] + step_cost * abs(k - 1)
         came[i] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[i]
     way = np.empty(len(time_s), np.int64)

@@ -23,8 +23,6 @@ from master.calibrate.hand.save import measured_profile, quick_profile, report_j
 from master.calibrate.tree_files import load_marker_rig, write_hand
 from master.commands.summary import write_summary
 
-_RATIO_SD = 0.03  # of one that was measured, with a goniometer or in a picture
-
 
 def hand_command(options: Namespace) -> None:
     """Make a hand file.
@@ -75,7 +73,8 @@ def hand_command(options: Namespace) -> None:
             if options.poses is None
             else read_observed(options.poses, names, model)
         )
-        ratio = None if options.dip_per_pip is None else (options.dip_per_pip, _RATIO_SD)
+        ratio_sd = 0.03  # of one that was measured, with a goniometer or in a picture
+        ratio = None if options.dip_per_pip is None else (options.dip_per_pip, ratio_sd)
         length_m = None if options.length_mm is None else 1e-3 * options.length_mm
         found = measure_hand(observed, template, length_m, ratio, _progress)
         for line in report_lines(found):

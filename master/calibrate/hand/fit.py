@@ -13,8 +13,6 @@ from common.errors import FitError
 from master.calibrate.hand.problem import HandRoutineProblem
 from master.calibrate.hand.shape import Shape
 
-_STEPS = 40
-_TOLERANCE = 0.05  # of half chi square, against thousands
 _REFUSED = 12
 
 
@@ -54,7 +52,8 @@ def fit_shape(
     state, settled = problem.guess(), False
     normal, cost = problem.normal(state)
     damping, taken, refused = 1e-3, 0, 0
-    while taken < _STEPS and refused < _REFUSED:
+    steps = 40
+    while taken < steps and refused < _REFUSED:
         coefficients, constants, _ = normal.solve(damping)
         tried = problem.stepped(state, coefficients, constants)
         next_normal, next_cost = problem.normal(tried)
@@ -62,14 +61,15 @@ def fit_shape(
             gain, state, normal, cost = cost - next_cost, tried, next_normal, next_cost
             damping, taken, refused = max(damping / 5.0, 1e-9), taken + 1, 0
             progress(min(taken / 15.0, 0.99))
-            settled = gain < _TOLERANCE
+            tolerance = 0.05  # of half chi square, against thousands
+            settled = gain < tolerance
             if settled:
                 break
         else:
             damping, refused = damping * 8.0, refused + 1
     if not settled and refused < _REFUSED:
         raise FitError(
-            f"the fit does not settle in {_STEPS} steps: the palm did not rest, or it is not this routine or hand;"
+            f"the fit does not settle in {steps} steps: the palm did not rest, or it is not this routine or hand;"
             " record it again, or begin with --length-mm"
         )
     residual = problem.residuals(state)

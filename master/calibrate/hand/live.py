@@ -9,8 +9,6 @@ from master.calibrate.hand.observed import Observed, marker_rows
 from master.calibrate.hand.session import guide
 from master.run.master_bus import join_bus
 
-_DEPTH = 256  # poses that may wait while a line is printed
-
 
 def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed:
     """Lead the user through the routine.
@@ -28,7 +26,8 @@ def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed
     tips = marker_rows(names, model)[:5]
     link = join_bus(bus)
     try:
-        poses = link.subscribe("hand", depth=_DEPTH)
+        depth = 256  # poses that may wait while a line is printed
+        poses = link.subscribe("hand", depth=depth)
 
         def receive(timeout_s: float) -> HandPose | None:
             message = poses.get(timeout_s)

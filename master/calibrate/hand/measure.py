@@ -27,16 +27,9 @@ from master.calibrate.hand.shape import PER_FINGER, Shape
 
 WITHIN_M = 1e-3
 CERTAIN = 2.576  # standard deviations of 99 %
-PRIOR_SHARE = 0.5  # of the sd before: more comes from the priors
 BONES = ("proximal", "middle", "distal")
 THUMB_BONES = ("metacarpal", "proximal", "distal")
 _GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
-_SHORTEST_M, _LONGEST_M = 0.1, 0.25
-_OTHER_SIDE = 0.6  # the mirrored hand fits with this share of the distance: it is the other one
-_UNLIKE_M = 0.025
-_RESTLESS = 1.2  # times the wandering that is assumed of a palm that rests
-_WRIST_TO_CREASE = 1.0246  # the wrist joint of generated profiles lies behind the crease
-_FREE_WITH = 3  # markers on the back that measure the palm's pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +55,8 @@ class Length:
     @property
     def measured(self) -> bool:
         """Return true if the markers determine the length."""
-        return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= PRIOR_SHARE * self.before_m
+        prior_share = 0.5  # of the sd before: more comes from the priors
+        return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= prior_share * self.before_m
 
     @property
     def name(self) -> str:
@@ -148,6 +142,7 @@ def problem_of(
     knots = Knots.over(observed.t_s, GRID_S)
     names = observed.names
     seen_back = np.isfinite(observed.points_m[:, 5:, 0]).sum(axis=1)
+    free_with = 3  # markers on the back that measure the palm's pose
     return HandRoutineProblem(
         model=model,
         cap_m=np.array([model.mount(name).offset_m for name in names[:5]]),
@@ -157,7 +152,7 @@ def problem_of(
         knots=knots,
         targets=RoutineTargets.of(alignment.at(knots.time_s)),
         start=alignment.T_rig_palm,
-        palm_free=bool(np.quantile(seen_back, 0.1) >= _FREE_WITH),
+        palm_free=bool(np.quantile(seen_back, 0.1) >= free_with),
         priors=priors,
     )
 
@@ -200,7 +195,8 @@ def _scaled(observed: Observed, template: HandProfile, hand_length_m: float | No
     model = HandModel.of(template)
     own = hand_length_of(model)
     length = own * flat_scale(observed, model) if hand_length_m is None else hand_length_m
-    if not _SHORTEST_M <= length <= _LONGEST_M:
+    shortest_m, longest_m = 0.1, 0.25
+    if not shortest_m <= length <= longest_m:
         raise FitError(
             f"the flat hand would be {1e3 * length:.0f} mm long: these are not the five tips of a hand; check the"
             " markers' colours and the rig's calibration"
@@ -212,18 +208,21 @@ def hand_length_of(model: HandModel) -> float:
     """Wrist crease to the end of the middle finger [m]."""
     tip = TIPS[2]
     whole = np.linalg.norm(model.rest_position_m[tip] - model.rest_position_m[WRIST]) + model.radius_m[tip]
-    return float(whole) / _WRIST_TO_CREASE
+    wrist_to_crease = 1.0246  # the wrist joint of generated profiles lies behind the crease
+    return float(whole) / wrist_to_crease
 
 
 def _check_side(observed: Observed, template: HandProfile, alignment: Alignment) -> None:
     mirrored = _scaled(observed, mirrored_profile(template), None)
     other = align(observed, mirrored).cost_m
-    if other < _OTHER_SIDE * alignment.cost_m:
+    other_side = 0.6  # the mirrored hand fits with this share of the distance: it is the other one
+    if other < other_side * alignment.cost_m:
         raise FitError(
             f"this is a {mirrored.profile.side} hand: mirrored, the routine fits to {1e3 * other:.0f} mm, as a"
             f" {template.side} one to {1e3 * alignment.cost_m:.0f} mm; give --side {mirrored.profile.side}"
         )
-    if alignment.cost_m > _UNLIKE_M:
+    unlike_m = 0.025
+    if alignment.cost_m > unlike_m:
         raise FitError(
             f"the markers are {1e3 * alignment.cost_m:.0f} mm off the routine (rms): the palm did not rest, or"
             " the steps were others; lay the hand down and follow the steps"
@@ -238,7 +237,8 @@ def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
     priors, step_s = problem.priors, np.sqrt(problem.knots.spacing_s)
     expected_rms = np.repeat([priors.palm_rad_s, priors.palm_m_s], 3) * step_s
     wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / expected_rms
-    if wander.max() > _RESTLESS:
+    restless = 1.2  # times the wandering that is assumed of a palm that rests
+    if wander.max() > restless:
         rotation, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(
             f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(rotation):.0f} degrees;"

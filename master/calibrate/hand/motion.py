@@ -32,9 +32,6 @@ from master.mocap.joint_motion import JointMotion
 from master.mocap.read import require
 from master.mocap.track import known
 
-_LEAST_FRAMES = 60
-_OUTLIER, _FLOOR_M = 6.0, 2e-3  # of a bone's spread about its median, and at least
-_LOOSE_M = 3e-3  # a bone that changes more has no joint centres at its ends
 _NEEDED = tuple(JOINTS[joint] for joint in (WRIST, *CHAINS.ravel().tolist()))
 _BONES = (("metacarpal", "proximal", "distal"), ("proximal", "intermediate", "distal"))
 
@@ -79,10 +76,11 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     joints = joint_track(motion).position_m
     palm = find_palm(joints, motion.side, motion.source)
     good = _good(palm)
-    if good.sum() < _LEAST_FRAMES:
+    least_frames = 60
+    if good.sum() < least_frames:
         raise FitError(
             f"{motion.source}: {int(good.sum())} of {len(good)} frames show the whole hand with bones that keep their"
-            f" length; {_LEAST_FRAMES} are needed"
+            f" length; {least_frames} are needed"
         )
     chains = palm.chains_m[good]
     bones = np.linalg.norm(np.diff(chains, axis=2), axis=3)
@@ -121,7 +119,8 @@ def _good(palm: Palm) -> Bool:
         return whole
     middle = np.median(lengths[whole], axis=0)
     spread = np.median(np.abs(lengths[whole] - middle), axis=0)
-    typical = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
+    outlier, floor_m = 6.0, 2e-3  # of a bone's spread about its median, and at least
+    typical = np.abs(lengths - middle) < np.maximum(outlier * spread, floor_m)
     return whole & np.asarray(typical.all(axis=(1, 2)), np.bool_)
 
 
@@ -186,7 +185,8 @@ def motion_lines(hand: MotionHand) -> list[str]:
     for finger, label in enumerate(FINGERS):
         for k, bone in enumerate(_BONES[min(finger, 1)]):
             mean, sigma = 1e3 * hand.bone_m[finger, k], 1e3 * hand.bone_sigma_m[finger, k]
-            loose = "  changes with the pose: no joint centres" if sigma > 1e3 * _LOOSE_M else ""
+            loose_m = 3e-3  # a bone that changes more has no joint centres at its ends
+            loose = "  changes with the pose: no joint centres" if sigma > 1e3 * loose_m else ""
             lines.append(f"{label + ' ' + bone:30}{mean:8.1f}{sigma:8.2f}{loose}")
     if found.dip is not None and found.mcp is not None:
         lines.append(

@@ -19,16 +19,11 @@ from common.arrays import Float, Int
 from common.calibration import Couplings
 from common.calibration.hand_presets import preset_couplings
 
-MOVED_S = 20.0  # of movement, at least
 _MOVES_RAD_S = np.radians(10.0)
-_STEP_S = 0.1  # longer, two frames are no step
 _BENT_RAD = np.radians(15.0)  # the PIP, where it determines a ratio
 _RANGE_RAD = np.radians(20.0)  # of the PIP from the 5th to the 95th hundredth, at least
 _MADE_RAD = np.radians(0.5)
 _NO_COUPLING_RAD = np.radians(25.0)
-_HUBER = 1.345
-_OUTLIER = 4.0
-_LEAST_SHARE = 0.25  # of a variance: less is noise
 _ROUNDS = 20
 
 
@@ -76,9 +71,11 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
     angles = angles_rad[:, 1:, 1:]
     step_s = 1e-9 * np.diff(t_ns)
     rate = np.abs(np.diff(angles[:, :, 1], axis=0)).max(axis=1) / step_s
-    moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < _STEP_S)].sum())
+    # longer, two frames are no step
+    moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < 0.1)].sum())
     low, high = np.percentile(angles[:, :, 1], [5.0, 95.0])
-    if moved_s < MOVED_S or high - low < _RANGE_RAD:
+    # of movement, at least
+    if moved_s < 20.0 or high - low < _RANGE_RAD:
         why = f"fingers move for {moved_s:.0f} s, and {np.degrees(high - low):.0f}° at the PIP"
         return MotionCouplings(
             moved_s, None, None, None, (f"couplings are the default: {why}; 20 s and 20° are needed",)
@@ -131,9 +128,12 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
         slope = float((weight * x * y).sum() / (weight * x * x).sum())
         off = np.asarray(np.abs(y - slope * x), np.float64)
         spread = max(1.4826 * float(np.median(off)), 1e-6)
-        weight = np.minimum(1.0, _HUBER * spread / np.maximum(off, 1e-12))
-    typical = off < _OUTLIER * spread
+        huber = 1.345
+        weight = np.minimum(1.0, huber * spread / np.maximum(off, 1e-12))
+    outlier = 4.0
+    typical = off < outlier * spread
     spread = float(np.sqrt((off[typical] ** 2).mean()))
     noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
     left = spread * spread - noise * noise
-    return Ratio(slope, float(np.sqrt(left)) if left > _LEAST_SHARE * spread * spread else 0.0, noise)
+    least_share = 0.25  # of a variance: less is noise
+    return Ratio(slope, float(np.sqrt(left)) if left > least_share * spread * spread else 0.0, noise)

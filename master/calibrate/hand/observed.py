@@ -15,9 +15,6 @@ from common.hand.model import JOINTS, TIPS, HandModel
 from common.hand.routine import ROUTINE_S
 from common.recording.npz import read_npz
 
-FEWEST_HZ = 15.0
-_SHORTEST = 0.6  # of the routine
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
@@ -112,13 +109,15 @@ def read_observed(path: Path, names: Sequence[str], model: HandModel) -> Observe
 
 def _check_length(t_s: Float) -> None:
     span = float(t_s[-1] - t_s[0]) if len(t_s) else 0.0
-    if span < _SHORTEST * ROUTINE_S:
+    shortest = 0.6  # of the routine
+    if span < shortest * ROUTINE_S:
         raise FitError(
             f"markers are seen over {span:.1f} s, the routine takes {ROUTINE_S:.0f} s: do all of it, and record from"
             " its beginning to its end"
         )
-    if len(t_s) / span < FEWEST_HZ:
+    fewest_hz = 15.0
+    if len(t_s) / span < fewest_hz:
         raise FitError(
-            f"markers are seen {len(t_s) / span:.1f} times a second, {FEWEST_HZ:.0f} are needed: the cameras lose the"
+            f"markers are seen {len(t_s) / span:.1f} times a second, {fewest_hz:.0f} are needed: the cameras lose the"
             " hand most of the time, or run too slowly"
         )

@@ -22,11 +22,7 @@ from master.mocap.track import known
 
 PALM_JOINTS = (WRIST, *CHAINS[:, 0].tolist(), *METACARPALS)
 _SIDES: tuple[Side, Side] = ("right", "left")
-_LEAST_JOINTS = 4
 _ROUNDS = 5
-_OUTLIER = 4.0  # of the median distance of a frame's palm from the shape
-_FLOOR_M = 5e-3  # real palms arch by a millimetre or two
-_SURE = 0.5  # of the mean axis about which fingers bend, along +x
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +56,8 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     """
     mine = list(PALM_JOINTS)
     there = [joint for joint in mine if known(joints_m[:, joint]).mean() > 0.5]
-    if WRIST not in there or len(there) < _LEAST_JOINTS:
+    least_joints = 4
+    if WRIST not in there or len(there) < least_joints:
         raise FitError(f"{where}: wrist and three knuckles, or more, must be seen in half of the frames")
     body = joints_m[:, there]
     whole = np.asarray(known(body).all(axis=1), np.bool_)
@@ -69,7 +66,9 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     shape, T_file_shape, distance = _mean_shape(body[whole])
     outlier = np.zeros(len(joints_m), np.bool_)
     outlier[~whole] = True
-    outlier[np.flatnonzero(whole)[distance > max(_OUTLIER * float(np.median(distance)), _FLOOR_M)]] = True
+    # of the median distance of a frame's palm from the shape
+    floor_m = 5e-3  # real palms arch by a millimetre or two
+    outlier[np.flatnonzero(whole)[distance > max(4.0 * float(np.median(distance)), floor_m)]] = True
     in_shape = np.full_like(joints_m, np.nan)
     transposed = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
     moved = joints_m[whole] - T_file_shape[:, None, :3, 3]
@@ -124,7 +123,8 @@ def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
     normal = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=(0, 1, 2))
     length = float(np.linalg.norm(normal))
     along = {side: float(normal @ R[:, 0]) / max(length, 1e-12) for side, R in fits.items()}
-    right: list[Side] = [side for side in _SIDES if along[side] > _SURE]
+    sure = 0.5  # of the mean axis about which fingers bend, along +x
+    right: list[Side] = [side for side in _SIDES if along[side] > sure]
     if len(right) != 1:
         raise FitError(
             f"{where}: fingers bend about an axis that is {along['right']:+.2f} that of a right hand and"

@@ -12,8 +12,6 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.hand.routine import move_at, posture_at
 
-_COARSE_S = 0.1
-
 
 @dataclass(frozen=True, slots=True)
 class Priors:
@@ -82,7 +80,8 @@ class RoutineTargets:
 
         What may be moving by then counts as moving, since times are known roughly.
         """
-        around = [[move_at(t + d) for d in (-_COARSE_S, 0.0, _COARSE_S)] for t in script_s.tolist()]
+        coarse_s = 0.1
+        around = [[move_at(t + d) for d in (-coarse_s, 0.0, coarse_s)] for t in script_s.tolist()]
         return cls(
             np.radians([posture_at(t) for t in script_s.tolist()]),
             np.array([np.any([move.moving for move in moves], axis=0) for moves in around]),

@@ -20,8 +20,7 @@ from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, R
 
 CHANNELS = 26
 _PALM, _ANGLES = 6, 20
-_PIP, _DIP = 2, 3
-_OUTLIER = 3.0  # whitened length from which a marker counts less (Huber)
+_DIP = 3
 _SLACK_RAD = float(np.radians(10.0))  # hands bend farther than the published limits
 
 
@@ -196,8 +195,9 @@ class HandRoutineProblem:
         angles[..., :3] = np.where(moving, b.moving_rad_s, b.held_rad_s)
         means[..., :3] = self.targets.posture_rad[:-1]
         sigmas[..., :3] = np.where(moving, b.moving_level_rad, b.level_rad)
-        means[..., _PIP] = np.where(straight, b.straight_rad[0], means[..., _PIP])
-        sigmas[..., _PIP] = np.where(straight, b.straight_rad[1], sigmas[..., _PIP])
+        pip = 2
+        means[..., pip] = np.where(straight, b.straight_rad[0], means[..., pip])
+        sigmas[..., pip] = np.where(straight, b.straight_rad[1], sigmas[..., pip])
         dip = np.array([b.thumb_dip_rad, *[b.dip_rad] * 4])
         angles[..., _DIP], sigmas[..., _DIP] = dip * np.sqrt(2.0 / b.slow_s), dip
         return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
@@ -224,7 +224,8 @@ class HandRoutineProblem:
 
 def weigh(whitened: Float) -> Float:
     """Huber's weights (...) of whitened differences (..., 3)."""
-    return np.minimum(1.0, _OUTLIER / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
+    outlier = 3.0  # whitened length from which a marker counts less (Huber)
+    return np.minimum(1.0, outlier / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
 
 
 def _rotation_between(rotation: Float, other: Float) -> Float:

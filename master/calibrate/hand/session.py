@@ -16,13 +16,6 @@ from common.errors import FitError
 from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
 
-SEEN = 0.6  # of a step's poses each tip must be in
-_LATE_S = 0.4  # users begin after they have read
-_TRIES = 3
-_WAIT_S = 0.05
-_COUNT_DOWN_S = 3
-_GAP_NS = 20_000_000
-
 Receive = Callable[[float], HandPose | None]
 
 
@@ -42,7 +35,8 @@ class Track:
 
     def keep(self, poses: Sequence[HandPose]) -> None:
         """Add the poses of one step."""
-        shift = (self.t_ns[-1] + _GAP_NS - poses[0].t_ns) if self.t_ns else 0
+        gap_ns = 20_000_000
+        shift = (self.t_ns[-1] + gap_ns - poses[0].t_ns) if self.t_ns else 0
         for pose in poses:
             if self.t_ns and pose.t_ns + shift <= self.t_ns[-1]:
                 continue  # a pose that came twice
@@ -72,13 +66,16 @@ def guide(
     """
     track = Track()
     notify("lay the back of the hand on the table, palm to the cameras; it stays there until the end")
-    for count in range(_COUNT_DOWN_S, 0, -1):
+    count_down_s = 3
+    for count in range(count_down_s, 0, -1):
         notify(f"{count} ...")
         _during(receive, clock, 1.0)
     for number, step in enumerate(STEPS):
-        for _ in range(_TRIES):
+        tries = 3
+        for _ in range(tries):
             notify(f"{number + 1} of {len(STEPS)}: {step.instruction} ({step.seconds:.0f} s)")
-            poses = _during(receive, clock, step.seconds + _LATE_S)
+            late_s = 0.4  # users begin after they have read
+            poses = _during(receive, clock, step.seconds + late_s)
             lacking = unseen(step, number, poses, tips, names)
             if not lacking:
                 track.keep(poses)
@@ -87,7 +84,7 @@ def guide(
             _during(receive, clock, 1.0)
         else:
             raise FitError(
-                f"{step.name}: not seen in {_TRIES} tries; turn the hand or a camera, and begin again"
+                f"{step.name}: not seen in {tries} tries; turn the hand or a camera, and begin again"
             )
     notify("done")
     return track
@@ -102,7 +99,8 @@ def unseen(
     moving = np.any([move.moving.any(axis=1) for move in MOVES if move.step == number], axis=0)
     wanted = [f for f in range(5) if moving[f] or not moving.any()]
     seen = np.isfinite([pose.markers_raw_m[list(tips), 0] for pose in poses]).mean(axis=0)
-    poor = [f"{names[tips[f]]} in {100 * seen[f]:.0f} %" for f in wanted if seen[f] < SEEN]
+    # of a step's poses each tip must be in
+    poor = [f"{names[tips[f]]} in {100 * seen[f]:.0f} %" for f in wanted if seen[f] < 0.6]
     return f"{step.name}: markers are seen too little: {', '.join(poor)}" if poor else ""
 
 
@@ -111,7 +109,8 @@ def _during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
     until = clock.now_ns() + round(1e9 * seconds)
     poses: list[HandPose] = []
     while clock.now_ns() < until:
-        pose = receive(_WAIT_S)
+        wait_s = 0.05
+        pose = receive(wait_s)
         if pose is not None:
             poses.append(pose)
     return poses

@@ -21,11 +21,7 @@ from common.errors import FitError
 from common.geometry.transforms import fit_rigid, rotation_vector_to_matrix, skew, transform
 from master.calibrate.object.seen import Seen
 
-_MOST = 1500  # epochs: more of the same motion adds time, not information
 _ROUNDS = 40
-_SETTLED_M = 1e-7
-_SOFT_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
-OUTLIER = 0.1  # weight below which a bead at an epoch counts as an outlier
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +49,8 @@ class Bundle:
     @property
     def outlier(self) -> Bool:
         """Return the observations (T, B) that the body does not explain."""
-        return self.seen.known & (self.weight < OUTLIER)
+        # weight below which a bead at an epoch counts as an outlier
+        return self.seen.known & (self.weight < 0.1)
 
 
 def usable(seen: Seen) -> Bool:
@@ -75,8 +72,9 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         FitError: A bead is never seen together with two others whose places are known.
     """
     chosen = np.flatnonzero(usable(seen)) if rows is None else rows
-    if len(chosen) > _MOST:
-        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _MOST).astype(np.int64))]
+    most = 1500  # epochs: more of the same motion adds time, not information
+    if len(chosen) > most:
+        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, most).astype(np.int64))]
     own = Seen(seen.names, seen.t_s[chosen], seen.points_m[chosen], seen.cov_m2[chosen])
     beads, T = first_body(own)
     info = np.where(own.known[..., None, None], _inverse(own.cov_m2), 0.0)
@@ -87,13 +85,15 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         off = _off(beads, T, points)
         chi = np.einsum("tbi,tbij,tbj->tb", off, info, off)
         scale_2 = _scale_2(chi, own.known)
-        weight = np.where(own.known, (1.0 + chi / (_SOFT_2 * scale_2)) ** -2.0, 0.0)
+        soft_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
+        weight = np.where(own.known, (1.0 + chi / (soft_2 * scale_2)) ** -2.0, 0.0)
         step, poses, cov = _solved(beads, T, off, weight[..., None, None] * info)
         beads = beads + step
         rotation = rotation_vector_to_matrix(poses[:, :3])
         T = T.copy()
         T[:, :3, :3], T[:, :3, 3] = rotation @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
-        if float(np.abs(step).max()) < _SETTLED_M:
+        settled_m = 1e-7
+        if float(np.abs(step).max()) < settled_m:
             break
     off = _off(beads, T, points)
     left = np.where(own.known[..., None], off, np.nan)

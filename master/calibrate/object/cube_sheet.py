@@ -24,7 +24,6 @@ from common.geometry.tag_family import GRIDS, tag_image
 from common.geometry.transforms import rigid
 
 _A4_MM = (210.0, 297.0)
-_EDGE_MM, _RULER_MM = 8.0, 100.0
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))  # outward, object frame: the first tags; the last is the top
 
 
@@ -58,7 +57,8 @@ class TagBox:
             raise CalibrationError(
                 f"--first {self.first}: {self.family} has tags 0 to {grid.tags - 1}, five are needed"
             )
-        if not self._across_mm() <= _A4_MM[0] - 2.0 * _EDGE_MM:
+        edge_mm = 8.0
+        if not self._across_mm() <= _A4_MM[0] - 2.0 * edge_mm:
             raise CalibrationError(f"--side-mm {1e3 * self.side_m:g}: the net does not fit on A4: 64 does")
 
     def profile(self) -> ObjectProfile:
@@ -136,7 +136,8 @@ def print_box(path: Path, box: TagBox) -> None:
             Rectangle((left - 0.01, low - 0.01), size + 0.02, size + 0.02, facecolor="black", linewidth=0)
         )
     foot = -1.5 * side - 18.0
-    axes.add_patch(Rectangle((-_RULER_MM / 2, foot), _RULER_MM, 0.4, facecolor="black", linewidth=0))
+    ruler_mm = 100.0
+    axes.add_patch(Rectangle((-ruler_mm / 2, foot), ruler_mm, 0.4, facecolor="black", linewidth=0))
     numbers = f"{box.family} {box.first} to {box.first + 4}"
     text = f"100 mm: measure it. Box of {side:g} mm, {numbers}, edge {1e3 * box.edge_m:g} mm"
     axes.text(0.0, foot - 6.0, text, ha="center", size=9)

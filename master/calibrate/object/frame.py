@@ -11,7 +11,6 @@ from common.errors import FitError
 from common.geometry.transforms import fit_rigid, rigid, transform
 
 LINE_M = 5e-3  # from the line through the first two beads; nearer, they do not determine how it is turned about that
-_LIKE_M = 0.015  # by which beads may lie elsewhere than in the file that the frame is taken from
 OWN = (
     "origin in the middle of the beads, x from the first to the second, y to the side of the one farthest from that"
     " line"
@@ -62,7 +61,8 @@ def frame_of(
     off = np.linalg.norm(transform(T, beads_m[shared]) - there, axis=1)
     misses = {names[row]: float(miss) for row, miss in zip(shared, off, strict=True)}
     worst = max(misses, key=lambda name: misses[name])
-    if misses[worst] > _LIKE_M:
+    like_m = 0.015  # by which beads may lie elsewhere than in the file that the frame is taken from
+    if misses[worst] > like_m:
         raise FitError(
             f"{where}: {worst} lies {1e3 * misses[worst]:.0f} mm from where the file has it: its frame cannot be"
             " kept. Are the names in the order of the beads? Else give it a frame of its own: another name, no --like"

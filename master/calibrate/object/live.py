@@ -9,8 +9,6 @@ from master.calibrate.object.seen import Seen
 from master.calibrate.object.session import guide
 from master.run.master_bus import join_bus
 
-_DEPTH = 512  # poses that may wait while a line is printed
-
 
 def observe_live(
     bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
@@ -31,7 +29,8 @@ def observe_live(
     """
     link = join_bus(bus)
     try:
-        poses = link.subscribe("hand", depth=_DEPTH)
+        depth = 512  # poses that may wait while a line is printed
+        poses = link.subscribe("hand", depth=depth)
 
         def receive(timeout_s: float) -> HandPose | None:
             message = poses.get(timeout_s)

@@ -20,20 +20,13 @@ MOTION = (
     "hold the object before the cameras for fifteen seconds, hands behind it, all beads in sight of two cameras: turn"
     " it slowly about all its axes, and carry it to all sides"
 )
-FEWEST, ENOUGH = 60, 240  # epochs at which all beads are known
-FEWEST_LOOKS, ENOUGH_LOOKS = 4, 15
+ENOUGH = 240  # epochs at which all beads are known
+ENOUGH_LOOKS = 15
 _LOOK_RAD = np.radians(
     10.0
 )  # turned by so much, a bead shows cameras another side: what misleads them is another
-_LOOK_M = 0.04  # and so does one that is elsewhere
-_LOOKS = 24  # what is off in the same way all the time averages out over no more
-_WINDOW_S = 0.25
 # By which a distance between beads may change, from the tenth to the ninetieth percentile of quarters of a second.
 _RIGID_M = 2e-3
-_RIGID_SIGMAS = 0.5  # most of a sigma changes from frame to frame, or is a suspicion that does not come true
-_SURE, _IN_WINDOW, _WINDOWS = 4.0, 5, 8
-_MOST_OUTLIERS = 0.3
-_SIGMA_M = 1e-3  # standard deviation of a bead, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,16 +79,20 @@ def measure_object(seen: Seen) -> Measurement:
     # What misleads cameras about a bead is the same while it shows the same side: looks count, and not epochs.
     size = bundle.cov_m2.reshape(len(seen.names), 3, len(seen.names), 3)
     variance = np.array([np.linalg.eigvalsh(size[b, :, b])[-1] for b in range(len(seen.names))])
-    sigma = np.sqrt(variance * max(1.0, len(bundle.T) / min(looks, _LOOKS)))
+    # what is off in the same way all the time averages out over no more
+    sigma = np.sqrt(variance * max(1.0, len(bundle.T) / min(looks, 24)))
     found = Measurement(bundle, own, looks, sigma)
     outlier_share = found.outlier_share
     worst = int(np.argmax(outlier_share))
-    if outlier_share[worst] > _MOST_OUTLIERS:
+    most_outliers = 0.3
+    if outlier_share[worst] > most_outliers:
         raise FitError(
             f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of its views are elsewhere than the other"
             " beads show: is its colour calibrated, is nothing else of that colour seen, are the cameras calibrated?"
         )
-    if looks < FEWEST_LOOKS or float(sigma.max()) > _SIGMA_M:
+    fewest_looks = 4
+    sigma_m = 1e-3  # standard deviation of a bead, at most
+    if looks < fewest_looks or float(sigma.max()) > sigma_m:
         raise FitError(
             f"it was seen in {looks} ways of turning and places, the beads are known to"
             f" {1e3 * float(sigma.max()):.1f} mm: {MOTION}"
@@ -110,7 +107,8 @@ def refuse_insufficient(seen: Seen) -> None:
         FitError: With the bead that is seen least.
     """
     together = int((seen.known.all(axis=1) if len(seen.names) == 3 else usable(seen)).sum())
-    if together >= FEWEST:
+    fewest = 60  # epochs at which all beads are known
+    if together >= fewest:
         return
     if not seen.known.any():
         raise FitError(f"no bead is seen by two cameras at once: {MOTION}")
@@ -119,7 +117,7 @@ def refuse_insufficient(seen: Seen) -> None:
     )
     how = "all beads" if len(seen.names) == 3 else "three beads or more"
     raise FitError(
-        f"{how} are seen by two cameras at {together} of {len(seen.t_s)} epochs, at least {FEWEST} are needed"
+        f"{how} are seen by two cameras at {together} of {len(seen.t_s)} epochs, at least {fewest} are needed"
         f" ({each}): {MOTION}"
     )
 
@@ -169,7 +167,8 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
 
     Without pairs that were hardly seen.
     """
-    window: Int = (seen.t_s / _WINDOW_S).astype(np.int64)
+    window_s = 0.25
+    window: Int = (seen.t_s / window_s).astype(np.int64)
     out = dict[tuple[int, int], tuple[float, float]]()
     for a, b in combinations(range(len(seen.names)), 2):
         way = seen.points_m[:, a] - seen.points_m[:, b]
@@ -181,16 +180,19 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
             continue
         # What is half hidden is less sure, and elsewhere than it seems.
         typical = float(np.percentile(variance[known], 25.0))
-        known &= variance <= _SURE * typical
+        sure, in_window, windows = 4.0, 5, 8
+        known &= variance <= sure * typical
         medians = [
             np.median(distance[known & (window == w)])
             for w in np.unique(window[known])
-            if (known & (window == w)).sum() >= _IN_WINDOW
+            if (known & (window == w)).sum() >= in_window
         ]
-        if len(medians) < _WINDOWS:
+        if len(medians) < windows:
             continue
         low, high = np.percentile(medians, (10.0, 90.0))
-        out[a, b] = float(high - low), _RIGID_M + _RIGID_SIGMAS * float(np.sqrt(typical))
+        # most of a sigma changes from frame to frame, or is a suspicion that does not come true
+        rigid_sigmas = 0.5
+        out[a, b] = float(high - low), _RIGID_M + rigid_sigmas * float(np.sqrt(typical))
     return out
 
 
@@ -205,6 +207,7 @@ def looks_of(T: Float) -> int:
             matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3]), axis=-1
         )
         way = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
-        if not ((rotation < _LOOK_RAD) & (way < _LOOK_M)).any():
+        look_m = 0.04  # and so does one that is elsewhere
+        if not ((rotation < _LOOK_RAD) & (way < look_m)).any():
             kept = np.concatenate([kept, pose[None]])
     return len(kept)

@@ -15,10 +15,6 @@ from master.calibrate.object.bundle import first_body, usable
 from master.calibrate.object.measure import ENOUGH, ENOUGH_LOOKS, MOTION, looks_of
 from master.calibrate.object.seen import Seen, seen_in
 
-PRINT_NS = 1_000_000_000
-_WAIT_S = 0.05
-_SHOWN = 200  # epochs from which ways of turning are counted while it goes on
-
 Receive = Callable[[float], HandPose | None]
 
 
@@ -48,11 +44,13 @@ def guide(
     notify(MOTION)
     begin_ns = printed_ns = clock.now_ns()
     while clock.now_ns() - begin_ns < longest_s * 1e9:
-        pose = receive(_WAIT_S)
+        wait_s = 0.05
+        pose = receive(wait_s)
         if pose is not None:
             poses.append(pose)
         now_ns = clock.now_ns()
-        if now_ns - printed_ns < PRINT_NS:
+        print_ns = 1_000_000_000
+        if now_ns - printed_ns < print_ns:
             continue
         printed_ns = now_ns
         if not poses:
@@ -73,7 +71,8 @@ def progress(seen: Seen) -> tuple[str, bool]:
     whole = int(seen.known.all(axis=1).sum())
     looks = 0
     if len(rows):
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SHOWN).astype(np.int64))]
+        shown = 200  # epochs from which ways of turning are counted while it goes on
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, shown).astype(np.int64))]
         try:
             some = Seen(seen.names, seen.t_s[rows], seen.points_m[rows], seen.cov_m2[rows])
             looks = looks_of(first_body(some)[1])

@@ -18,11 +18,8 @@ from common.messages import MarkerDetections
 from master.monitor.timing import ResidualTiming
 from master.monitor.timing_fit import TimeOffset
 
-SIGMA_AT_MOST_NS = 1e6
 """Less sure than this an offset is not written: 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)."""
 SIGNIFICANT = 3.0
-_PASSES = 3
-_KEPT_BLOCKS = 3600  # an hour of motion
 _ADVICE = (
     "record ten seconds of an open hand that all cameras see, swung to and fro about twice a second, up and down as "
     "well as sideways, half a metre from the cameras, with the fingers kept still"
@@ -71,7 +68,8 @@ def measure_times(
         CalibrationError: There is too little motion, or too little of it is seen by both cameras.
     """
     found = _pass(models, frame_rate_hz, messages)
-    for _ in range(_PASSES - 1):
+    passes = 3
+    for _ in range(passes - 1):
         before = {camera: offset.offset_ns for camera, offset in found.items()}
         rest = _pass(models, frame_rate_hz, shifted(messages, before))
         found = {
@@ -79,7 +77,8 @@ def measure_times(
             for camera, of in rest.items()
         }
     for camera in tuple(models)[1:]:
-        if camera not in found or found[camera].sigma_ns > SIGMA_AT_MOST_NS:
+        sigma_at_most_ns = 1e6
+        if camera not in found or found[camera].sigma_ns > sigma_at_most_ns:
             raise CalibrationError(_refusal(next(iter(models)), camera, found.get(camera), messages))
     return tuple(CameraTime(camera, offset) for camera, offset in found.items())
 
@@ -90,7 +89,8 @@ def _pass(
     messages: Sequence[MarkerDetections],
 ) -> dict[str, TimeOffset]:
     """Return the time offsets of the cameras for which they can be estimated."""
-    machine = ResidualTiming(models, frame_rate_hz, kept_blocks=_KEPT_BLOCKS, rate_hz=np.inf)
+    kept_blocks = 3600  # an hour of motion
+    machine = ResidualTiming(models, frame_rate_hz, kept_blocks=kept_blocks, rate_hz=np.inf)
     for message in messages:
         machine.push(message)
     machine.flush()

@@ -12,10 +12,8 @@ from common.geometry.transforms import matrix_to_rotation_vector
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 LEAST_S, LEAST_ROTATION_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
-LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
+LEAST_PACE_RAD_S = np.radians(20.0)
 _ENDS = (0.03, 0.97)  # quantiles: an outlier pose is no motion
-_PACE_S = 0.2
-_BEGUN_S = 1.0  # before that there is no motion to speak of
 _ADVICE = {
     "seconds": f"go on until cameras and tracker have seen it together for {LEAST_S:.0f} s",
     "rotation": "turn it about its {axes} axis as well, a quarter turn and back",
@@ -47,7 +45,8 @@ class Coverage:
     @property
     def missing(self) -> tuple[str, ...]:
         """What to do besides, for a person; nothing: it is enough."""
-        if self.shared_s < _BEGUN_S:
+        begun_s = 1.0  # before that there is no motion to speak of
+        if self.shared_s < begun_s:
             return (_ADVICE["seconds"],)
         wanting: list[str] = []
         poor = [
@@ -59,7 +58,8 @@ class Coverage:
             wanting.append(_ADVICE["rotation"].format(axes=" and its ".join(poor)))
         if max(self.way_m) < LEAST_WAY_M:
             wanting.append(_ADVICE["way"])
-        if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < LEAST_PACE_M_S:
+        least_pace_m_s = 0.05
+        if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < least_pace_m_s:
             wanting.append(_ADVICE["pace"])
         if self.shared_s < LEAST_S:
             wanting.append(_ADVICE["seconds"])
@@ -115,13 +115,14 @@ def _span(values: Float) -> tuple[float, float, float]:
 
 
 def _pace(track: PoseTrack, t_s: Float) -> tuple[float, float]:
-    first, begun, known = track.at(t_s - 0.5 * _PACE_S)
-    last, ended, also = track.at(t_s + 0.5 * _PACE_S)
+    pace_s = 0.2
+    first, begun, known = track.at(t_s - 0.5 * pace_s)
+    last, ended, also = track.at(t_s + 0.5 * pace_s)
     both = known & also
     if not both.any():
         return 0.0, 0.0
-    rotated = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / _PACE_S
-    moved = (ended[both] - begun[both]) / _PACE_S
+    rotated = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / pace_s
+    moved = (ended[both] - begun[both]) / pace_s
     return _rms(rotated), _rms(moved)
 
 

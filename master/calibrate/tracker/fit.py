@@ -28,16 +28,12 @@ from common.geometry.transforms import (
 from master.calibrate.tracker.start import Placed, predicted
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
-MOST = 900  # epochs
-BLOCKS = 12
-TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
-DEFAULT_SIGMA_M, DEFAULT_SIGMA_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
+TRACKER_RAD = np.radians(0.15)
+DEFAULT_SIGMA_RAD = np.radians(1.5)  # of an object's pose without covariance
 OUTLIER = (
     4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
 )
-_HALF = 5.348  # median of chi square with six degrees of freedom
-_STEPS, _ROUNDS = 6, 4
-_DT_S = 4e-3
+_ROUNDS = 4
 _UNKNOWNS = 13
 _PRIOR = (
     np.array([1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [0.5]) ** -2
@@ -92,18 +88,21 @@ class _Problem:
         self._tracker = tracker
         self.t_s, self.R, self.p_m = seen.t_s[rows], seen.R[rows], seen.p_m[rows]
         self.middle_m = self.p_m.mean(axis=0)
-        default_cov = np.diag(np.repeat([DEFAULT_SIGMA_M, DEFAULT_SIGMA_RAD], 3) ** 2)
+        default_sigma_m = 3e-3  # of an object's pose without covariance
+        default_cov = np.diag(np.repeat([default_sigma_m, DEFAULT_SIGMA_RAD], 3) ** 2)
         with_cov = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
-        jitter = np.diag(np.repeat([TRACKER_M, TRACKER_RAD], 3) ** 2)
+        tracker_m = 1e-3
+        jitter = np.diag(np.repeat([tracker_m, TRACKER_RAD], 3) ** 2)
         cov = np.where(with_cov, seen.cov[rows], default_cov) + jitter
         self.weight: Float = np.asarray(np.linalg.inv(cov), np.float64)
 
     def lines(self, placed: Placed) -> _Lines:
         at = self.t_s - placed.late_s
         R, p = self._predicted(placed, at)
-        before, after = (self._predicted(placed, at + dt) for dt in (-_DT_S, _DT_S))
-        v = (after[1] - before[1]) / (2.0 * _DT_S)
-        w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * _DT_S)
+        dt_s = 4e-3
+        before, after = (self._predicted(placed, at + dt) for dt in (-dt_s, dt_s))
+        v = (after[1] - before[1]) / (2.0 * dt_s)
+        w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * dt_s)
         off = np.concatenate([self.p_m - p, matrix_to_rotation_vector(self.R @ R.swapaxes(1, 2))], axis=1)
         jacobian = np.zeros((len(at), 6, _UNKNOWNS))
         jacobian[:, :3, 0:3] = -skew(p - self.middle_m)
@@ -131,10 +130,11 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         tracker: The device, by its system.
         first: Right to some centimetres, degrees and ten milliseconds.
     """
-    coarse = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
+    most = 900  # epochs
+    coarse = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, most))
     better, _ = _refined(coarse, first)
     # Again, because the lag decides which epochs are known.
-    problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, MOST))
+    problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, most))
     placed, scale = _refined(problem, better)
     lines = problem.lines(placed)
     sizes = _sizes(problem.weight, lines.off) / scale
@@ -187,8 +187,10 @@ def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
     scale = 1.0
     for _ in range(_ROUNDS):
         sizes = _sizes(problem.weight, problem.lines(placed).off)
-        scale = max(float(np.sqrt(np.median(sizes**2) / _HALF)), 1e-3)
-        for _ in range(_STEPS):
+        half = 5.348  # median of chi square with six degrees of freedom
+        scale = max(float(np.sqrt(np.median(sizes**2) / half)), 1e-3)
+        steps = 6
+        for _ in range(steps):
             lines = problem.lines(placed)
             counts = _counts(_sizes(problem.weight, lines.off) / scale)
             normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
@@ -224,8 +226,9 @@ def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
 def _blocks(t_s: Float) -> list[Bool]:
     """Return one mask (N,) for each block of time: the epochs in it."""
     share = (t_s - t_s[0]) / (t_s[-1] - t_s[0] + 1e-9)
-    number = (BLOCKS * share).astype(np.int64)
-    return [number == k for k in range(BLOCKS) if (number == k).any()]
+    blocks = 12
+    number = (blocks * share).astype(np.int64)
+    return [number == k for k in range(blocks) if (number == k).any()]
 
 
 def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:

@@ -8,8 +8,6 @@ from common.messages import ObjectPose, TrackerPose
 from master.calibrate.tracker.session import Session, guide
 from master.run.master_bus import join_bus
 
-_DEPTH = 1024  # poses that may wait while a line is printed
-
 
 def observe_live(
     bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
@@ -28,8 +26,9 @@ def observe_live(
     """
     link = join_bus(bus)
     try:
-        objects = link.subscribe("object", profile.name, _DEPTH)
-        devices = link.subscribe("device", profile.tracker or profile.name, _DEPTH)
+        depth = 1024  # poses that may wait while a line is printed
+        objects = link.subscribe("object", profile.name, depth)
+        devices = link.subscribe("device", profile.tracker or profile.name, depth)
 
         def receive(timeout_s: float) -> ObjectPose | TrackerPose | None:
             message = objects.get(0.0) or devices.get(timeout_s)

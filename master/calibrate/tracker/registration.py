@@ -31,13 +31,12 @@ MOTION = (
     "hold the object with the tracker on it before the cameras for twenty seconds: turn it about all its axes, a"
     " quarter turn and back, and carry it to all sides"
 )
-_FEWEST = 60
-_SIGMA_M, _SIGMA_RAD, _LATE_S = 3e-3, np.radians(1.0), 5e-3  # standard deviations, at most
-_LEFT_M, _LEFT_RAD, _MOST_OUTLIERS = 0.012, np.radians(5.0), 0.4
+_SIGMA_RAD = np.radians(1.0)  # standard deviations, at most
+_LEFT_RAD = np.radians(5.0)
 # What is off in the same way all the time, a tag that sits a little aside, no leaving out of a part shows: of what is
 # left it counts as if it averaged out over so many looks only.
 _LOOKS = 24
-_REACH_M, _ROTATION_RAD = 0.12, np.radians(50.0)  # of the poses at which the result must be known
+_ROTATION_RAD = np.radians(50.0)  # of the poses at which the result must be known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,14 +70,15 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
         raise FitError(f"{'the cameras' if not objects else 'the tracker'} reported nothing: {MOTION}")
     zero_ns = min(objects[0].t_ns, tracked[0].t_ns)
     seen, device = object_track(objects, zero_ns), tracker_track(tracked, zero_ns)
-    if len(seen) < _FEWEST or len(device) < _FEWEST:
+    fewest = 60
+    if len(seen) < fewest or len(device) < fewest:
         raise FitError(
-            f"the cameras gave {len(seen)} poses, the tracker {len(device)}; at least {_FEWEST} of each are needed:"
+            f"the cameras gave {len(seen)} poses, the tracker {len(device)}; at least {fewest} of each are needed:"
             f" {MOTION}"
         )
     late_s = first_lag(seen, device)
     first = None if late_s is None else first_places(seen, device, late_s)
-    if first is None or len(shared_epochs(seen, device, first.late_s, _FEWEST)) < _FEWEST:
+    if first is None or len(shared_epochs(seen, device, first.late_s, fewest)) < fewest:
         raise FitError(f"cameras and tracker hardly saw the object at the same time: {MOTION}")
     coverage = coverage_of(seen, device, first.late_s)
     fit = fit_registration(seen, device, first)
@@ -121,7 +121,8 @@ def _reach(fit: Fit) -> tuple[Float, Float]:
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     mean = fit.R[len(fit.R) // 2]
     rotated = np.concatenate([mean[None], rotation_vector_to_matrix(_ROTATION_RAD * ways) @ mean])
-    places = fit.middle_m + _REACH_M * np.concatenate([np.zeros((1, 3)), ways])
+    reach_m = 0.12  # of the poses at which the result must be known
+    places = fit.middle_m + reach_m * np.concatenate([np.zeros((1, 3)), ways])
     return np.repeat(rotated, len(places), axis=0), np.tile(places, (len(rotated), 1))
 
 
@@ -132,7 +133,9 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         FitError: With what to do.
     """
     left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["rotation_deg"])
-    if figures["outlier_share"] > _MOST_OUTLIERS or left_m > _LEFT_M or left_rad > _LEFT_RAD:
+    # left m
+    most_outliers = 0.4
+    if figures["outlier_share"] > most_outliers or left_m > 0.012 or left_rad > _LEFT_RAD:
         raise FitError(
             f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
             f" and {figures['rotation_deg']:.1f} deg"
@@ -140,15 +143,16 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []
+    sigma_m, late_s = 3e-3, 5e-3  # standard deviations, at most
     if (
-        1e-3 * figures["position_sigma_mm"] > _SIGMA_M
+        1e-3 * figures["position_sigma_mm"] > sigma_m
         or np.radians(figures["rotation_sigma_deg"]) > _SIGMA_RAD
     ):
         wanting.append(
             f"poses would be known to {figures['position_sigma_mm']:.1f} mm,"
             f" {figures['rotation_sigma_deg']:.1f} deg only"
         )
-    if 1e-3 * figures["late_sigma_ms"] > _LATE_S:
+    if 1e-3 * figures["late_sigma_ms"] > late_s:
         wanting.append(f"the clocks are known to {figures['late_sigma_ms']:.1f} ms only: move it faster")
     if wanting:
         raise FitError("; ".join([*wanting, *coverage.missing]) + f". {MOTION[0].upper()}{MOTION[1:]}")

@@ -17,11 +17,7 @@ from master.calibrate.tracker.registration import MOTION
 from master.calibrate.tracker.start import first_lag
 from master.calibrate.tracker.tracks import object_track, tracker_track
 
-PRINT_NS = 1_000_000_000
 SILENT_S = 3.0
-ENOUGH_S = 15.0  # of both, when all turns are there: more of it makes the result surer
-_LAG_AFTER_S = 5.0
-_WAIT_S = 0.02
 
 Receive = Callable[[float], ObjectPose | TrackerPose | None]
 
@@ -57,7 +53,8 @@ class Session:
         if len(seen) < 2 or len(device) < 2:
             return None
         found = coverage_of(seen, device, self._lag_s or 0.0)
-        if self._lag_s is None and found.shared_s > _LAG_AFTER_S:
+        lag_after_s = 5.0
+        if self._lag_s is None and found.shared_s > lag_after_s:
             self._lag_s = first_lag(seen, device)
         return found
 
@@ -92,11 +89,13 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
     begin_ns = printed_ns = clock.now_ns()
     enough = False
     while not enough and clock.now_ns() - begin_ns < longest_s * 1e9:
-        message = receive(_WAIT_S)
+        wait_s = 0.02
+        message = receive(wait_s)
         if message is not None:
             session.push(message)
         now_ns = clock.now_ns()
-        if now_ns - printed_ns < PRINT_NS:
+        print_ns = 1_000_000_000
+        if now_ns - printed_ns < print_ns:
             continue
         printed_ns = now_ns
         coverage, silent = session.coverage(), ""
@@ -105,7 +104,8 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
         if coverage is None:
             notify(silent or "waiting for cameras and tracker")
             continue
-        enough = not coverage.missing and coverage.shared_s >= ENOUGH_S
+        enough_s = 15.0  # of both, when all turns are there: more of it makes the result surer
+        enough = not coverage.missing and coverage.shared_s >= enough_s
         hint = silent or (
             coverage.missing[0] if coverage.missing else "go on like this" if not enough else "done"
         )

@@ -18,11 +18,8 @@ from common.arrays import Bool, Float
 from common.geometry.transforms import matrix_to_rotation_vector, rigid
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
-MOST_LAG_S = 0.5
-_GRID_S, _CHORD_S = 0.01, 0.2
-_LEAST_OVERLAP = 100  # of the grid: one second
-_EPOCHS, _DRAWS, _DRAWN = 240, 120, 6
-_NEAR_M, _NEAR_RAD = 0.03, np.radians(6.0)
+_DRAWN = 6
+_NEAR_RAD = np.radians(6.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,10 +42,12 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
 
     To some milliseconds; None: they hardly overlap.
     """
-    begin = min(seen.t_s[0], tracker.t_s[0]) - MOST_LAG_S
-    grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + MOST_LAG_S, _GRID_S)
+    most_lag_s = 0.5
+    begin = min(seen.t_s[0], tracker.t_s[0]) - most_lag_s
+    grid_s = 0.01
+    grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + most_lag_s, grid_s)
     ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
-    steps = round(MOST_LAG_S / _GRID_S)
+    steps = round(most_lag_s / grid_s)
     costs: list[float] = []
     for lag in range(-steps, steps + 1):
         moved = np.full_like(theirs, np.nan)
@@ -58,7 +57,8 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
             moved[:lag] = theirs[-lag:]
         off = np.abs(ours - moved)
         off = off[np.isfinite(off)]
-        costs.append(float(np.mean(np.minimum(off, 0.3))) if len(off) >= _LEAST_OVERLAP else np.inf)
+        least_overlap = 100  # of the grid: one second
+        costs.append(float(np.mean(np.minimum(off, 0.3))) if len(off) >= least_overlap else np.inf)
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         return None
@@ -67,7 +67,7 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
         before, here, after = costs[best - 1 : best + 2]
         curvature = before - 2.0 * here + after
         fine = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
-    return (best - steps + fine) * _GRID_S
+    return (best - steps + fine) * grid_s
 
 
 def _rotated(track: PoseTrack, t_s: Float) -> Float:
@@ -75,8 +75,9 @@ def _rotated(track: PoseTrack, t_s: Float) -> Float:
 
     NaN where that is not known.
     """
-    first, _, known = track.at(t_s - 0.5 * _CHORD_S)
-    last, _, also = track.at(t_s + 0.5 * _CHORD_S)
+    chord_s = 0.2
+    first, _, known = track.at(t_s - 0.5 * chord_s)
+    last, _, also = track.at(t_s + 0.5 * chord_s)
     angle = np.linalg.norm(matrix_to_rotation_vector(first.swapaxes(1, 2) @ last), axis=1)
     return np.where(known & also, angle, np.nan)
 
@@ -92,14 +93,15 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
         late_s: How much later its poses hold than their time stamps [s].
         seed: Of the draws.
     """
-    rows = shared_epochs(seen, tracker, late_s, _EPOCHS)
+    epochs, draws = 240, 120
+    rows = shared_epochs(seen, tracker, late_s, epochs)
     if len(rows) < 2 * _DRAWN:
         return None
     RA, pA = seen.R[rows], seen.p_m[rows]
     RB, pB, _ = tracker.at(seen.t_s[rows] - late_s)
     rng = np.random.default_rng(seed)
     best: Bool | None = None
-    for _ in range(_DRAWS):
+    for _ in range(draws):
         drawn = rng.choice(len(rows), _DRAWN, replace=False)
         agree = _agree(*closed_form(RA[drawn], pA[drawn], RB[drawn], pB[drawn]), RA, pA, RB, pB)
         if best is None or agree.sum() > best.sum():
@@ -119,7 +121,8 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
 def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
     rotation, place = predicted(X, Y, RB, pB)
     off = np.linalg.norm(matrix_to_rotation_vector(RA @ rotation.swapaxes(1, 2)), axis=1)
-    return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < _NEAR_M)
+    near_m = 0.03
+    return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < near_m)
 
 
 def predicted(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:

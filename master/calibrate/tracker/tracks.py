@@ -16,7 +16,6 @@ from common.geometry.transforms import (
 )
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 
-GAP_S = 0.06  # between poses: farther apart, what was between them is not known
 _NOT_ITS_OWN = (ObjectSource.TRACKER, ObjectSource.HELD, ObjectSource.NONE)
 
 
@@ -56,7 +55,8 @@ class PoseTrack:
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         span = self.t_s[after] - self.t_s[after - 1]
         share = (t_s - self.t_s[after - 1]) / span
-        return after, np.clip(share, 0.0, 1.0), (share >= 0.0) & (share <= 1.0) & (span <= GAP_S)
+        gap_s = 0.06  # between poses: farther apart, what was between them is not known
+        return after, np.clip(share, 0.0, 1.0), (share >= 0.0) & (share <= 1.0) & (span <= gap_s)
 
 
 def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:

@@ -17,14 +17,6 @@ from master.calibrate.cameras.detect import find_board
 from master.calibrate.cameras.first_guess import place_board
 from master.calibrate.wrist.lit_views import LitView
 
-_CORNER_SIGMA_PX = (
-    0.05  # of the detector on rendered boards: what few corners that happen to agree do not get below
-)
-_MOVED_PX = (
-    1.0  # between the frames of a strobe cycle; half of it is what a constant speed leaves unexplained
-)
-_MOST_RMS_PX = 1.0  # beyond it, it is another board or another lens
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
@@ -74,7 +66,9 @@ def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
         raise FitError("no board found: show all of it with its white margin, sharp and not too bright")
     # The ambient frame comes before the laser's and the LED's after it: their mean is where the board was between.
     moved = float(np.nanmedian(np.linalg.norm(seen[0] - seen[-1], axis=1)))
-    if not moved <= _MOVED_PX:
+    # between the frames of a strobe cycle; half of it is what a constant speed leaves unexplained
+    moved_px = 1.0
+    if not moved <= moved_px:
         raise FitError(f"the board moved by {moved:.1f} px between the frames: hold it still")
     return place_corners(np.mean(seen, axis=0), board, optics)
 
@@ -88,7 +82,8 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
     known = np.isfinite(corners_px[:, 0])
     drawn = board_corners(board)[known]
     T, rms = place_board(drawn, corners_px[known], lens_of_model(optics))
-    if not rms <= _MOST_RMS_PX:
+    most_rms_px = 1.0  # beyond it, it is another board or another lens
+    if not rms <= most_rms_px:
         raise FitError(
             f"corners are off by {rms:.2f} px: the size of the board, its flatness or the intrinsics are wrong"
         )
@@ -98,7 +93,9 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
         -1, 6
     )
     dof = 2.0 * len(drawn) - 6.0
-    sigma = max(rms * np.sqrt(len(drawn) / dof), _CORNER_SIGMA_PX)
+    # of the detector on rendered boards: what few corners that happen to agree do not get below
+    corner_sigma_px = 0.05
+    sigma = max(rms * np.sqrt(len(drawn) / dof), corner_sigma_px)
     return BoardPose(T, centre, sigma**2 * np.linalg.inv(jacobian.T @ jacobian), rms)
 
 

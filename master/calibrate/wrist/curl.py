@@ -14,12 +14,6 @@ from common.hand.model import FINGERS
 from master.estimator.finger_lines import principal_line
 
 MIN_POINTS = 20  # two thirds of a second of strobe cycles
-MIN_MOTION_M = (
-    0.015  # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
-)
-_OUTLIER_M = 3e-3  # from the line: it is a little bent, and the finger goes aside by a millimetre
-_ALONE_M = 3e-3  # beyond all but one per cent of the points along the line
-_PAIRS = 300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +60,15 @@ def _curl(finger: str, laser_m: Float) -> FingerCurl:
     points = seen[_together(seen)]
     axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
     moved = float(np.ptp(points @ axis))
-    if len(points) < MIN_POINTS or moved < MIN_MOTION_M:
+    # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
+    min_motion_m = 0.015
+    if len(points) < MIN_POINTS or moved < min_motion_m:
         return FingerCurl(
             finger,
             points,
             len(seen),
             None,
-            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * MIN_MOTION_M:.0f} are needed: bend it to a fist",
+            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * min_motion_m:.0f} are needed: bend it to a fist",
         )
     try:
         return FingerCurl(finger, points, len(seen), principal_line(points))
@@ -86,7 +82,8 @@ def _together(points: Float) -> Bool:
     The points of another finger do not.
     """
     rng = np.random.default_rng(0)
-    a, b = points[rng.integers(0, len(points), (2, _PAIRS))]
+    pairs = 300
+    a, b = points[rng.integers(0, len(points), (2, pairs))]
     way = b - a
     length = np.linalg.norm(way, axis=1)
     # Neighbours constrain no direction.
@@ -96,8 +93,10 @@ def _together(points: Float) -> Bool:
     a, way = a[far], way[far] / length[far, None]
     arm = points[:, None] - a
     off = np.linalg.norm(arm - np.vecdot(arm, way)[..., None] * way, axis=2)
-    near = off < _OUTLIER_M
-    best = int(np.argmax(near.sum(axis=0) - 0.1 * np.minimum(off, _OUTLIER_M).sum(axis=0) / _OUTLIER_M))
+    outlier_m = 3e-3  # from the line: it is a little bent, and the finger goes aside by a millimetre
+    near = off < outlier_m
+    best = int(np.argmax(near.sum(axis=0) - 0.1 * np.minimum(off, outlier_m).sum(axis=0) / outlier_m))
     along = (points - a[best]) @ way[best]
     low, high = np.quantile(along[near[:, best]], [0.01, 0.99])
-    return near[:, best] & (along > low - _ALONE_M) & (along < high + _ALONE_M)
+    alone_m = 3e-3  # beyond all but one per cent of the points along the line
+    return near[:, best] & (along > low - alone_m) & (along < high + alone_m)

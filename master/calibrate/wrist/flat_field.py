@@ -29,19 +29,11 @@ from common.geometry.transforms import transform
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.board_pose import BoardPose
 
-_SATURATED = 250
-_DARKEST = 8.0  # levels above ambient: below, noise and the byte's steps are several per cent
 _STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
 _WITHIN = np.array([-0.22, 0.0, 0.22])  # of a square from its middle: clear of blurred borders
 _DEGREE = 6
-_CORRECTION_SIGMA = 0.15  # of a coefficient of the correction, where the tangent is 1
-_SAMPLE_SIGMA = 0.02  # of paper; errors of one view's samples are not independent, so more than of one alone
 _GRID = (24, 32)
-_FOLDS = 5
 _CELLS = (3, 3)
-_ENOUGH_CELL = 6  # samples
-_WORST_RMS = 0.05
-_HUBER = 2.5
 _PLACES = (
     ("top left", "top", "top right"),
     ("left", "middle", "right"),
@@ -107,12 +99,14 @@ def white_samples(
     inside = ((uv >= 2) & (uv <= np.array([width, height]) - 3.0)).all(axis=1)
     points, uv = points[inside], uv[inside]
     level = _at(_smooth(led) - _smooth(ambient), uv)
-    too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= _SATURATED
+    saturated = 250
+    too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= saturated
     way = points[:, None] - led_m
     square = (way**2).sum(axis=2)
     cosine = (way @ placed.T_camera_board[:3, 2]) / np.sqrt(square)
     expected = (np.maximum(cosine, 0.0) / square).mean(axis=1)
-    good = ~too_bright & (level >= _DARKEST) & (cosine.min(axis=1) >= _STEEPEST)
+    darkest = 8.0  # levels above ambient: below, noise and the byte's steps are several per cent
+    good = ~too_bright & (level >= darkest) & (cosine.min(axis=1) >= _STEEPEST)
     if not good.any():
         if len(level) and too_bright.mean() > 0.5:
             raise FitError("its white squares are saturated: hold the board farther away")
@@ -172,15 +166,16 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
         FitError: A part of the image without white paper (named), too few views, or light that follows no such law.
     """
     views = int(samples.view.max(initial=-1)) + 1
-    if views < _FOLDS:
-        raise FitError(f"{views} views with white squares; at least {_FOLDS} are needed (better 20)")
+    folds = 5
+    if views < folds:
+        raise FitError(f"{views} views with white squares; at least {folds} are needed (better 20)")
     _refuse_uncovered(samples, (optics.width_px, optics.height_px))
     v, u = (np.indices(_GRID) + 0.5) * np.array([optics.height_px, optics.width_px])[:, None, None]
     pixels = np.stack([u / _GRID[1], v / _GRID[0]], axis=-1).reshape(-1, 2)
     grid = optics.undistort(pixels - 0.5)
     held_out = np.full(len(samples.light), np.nan)
-    for fold in range(_FOLDS):
-        out = samples.view % _FOLDS == fold
+    for fold in range(folds):
+        out = samples.view % folds == fold
         fitted = _polynomial(_law(samples.xy[~out], samples.light[~out]), grid)
         held_out[out] = samples.light[out] / (terms_of(samples.xy[out], _DEGREE) @ fitted) - 1.0
     coefficients = _polynomial(_law(samples.xy, samples.light), grid)
@@ -191,10 +186,11 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
         _spread(held_out),
         residual,
     )
-    if fit.cross_validated_rms > _WORST_RMS:
+    worst_rms = 0.05
+    if fit.cross_validated_rms > worst_rms:
         raise FitError(
             f"the light of the white squares deviates {100 * fit.cross_validated_rms:.1f} % from any flat field (limit"
-            f" {100 * _WORST_RMS:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
+            f" {100 * worst_rms:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
         )
     return fit
 
@@ -205,8 +201,11 @@ def _law(xy: Float, light: Float) -> Float:
     Outlying samples are down-weighted (Huber).
     """
     terms, wanted = _law_terms(xy), np.log(light)
+    correction_sigma = 0.15  # of a coefficient of the correction, where the tangent is 1
+    # of paper; errors of one view's samples are not independent, so more than of one alone
+    sample_sigma = 0.02
     prior_information = np.diag(
-        np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)]
+        np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (sample_sigma / correction_sigma) ** 2)]
     )
     weight = np.ones(len(light))
     found = np.zeros(terms.shape[1])
@@ -214,7 +213,8 @@ def _law(xy: Float, light: Float) -> Float:
         normal = terms.T @ (weight[:, None] * terms) + prior_information
         found = np.asarray(np.linalg.solve(normal, terms.T @ (weight * wanted)), np.float64)
         off = np.abs(terms @ found - wanted)
-        weight = 1.0 / np.maximum(off / (_HUBER * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
+        huber = 2.5
+        weight = 1.0 / np.maximum(off / (huber * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
     return found
 
 
@@ -247,7 +247,8 @@ def _refuse_uncovered(samples: WhiteSamples, size_px: tuple[int, int]) -> None:
     j = np.clip((samples.uv[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
     count = np.zeros(_CELLS, dtype=np.int64)
     np.add.at(count, (j, i), 1)
-    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < _ENOUGH_CELL]
+    enough_cell = 6  # samples
+    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < enough_cell]
     if missing:
         raise FitError(
             f"no white squares at the {', '.join(missing)} of the image: a flat field is needed there too;"

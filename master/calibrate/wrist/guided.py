@@ -20,12 +20,7 @@ MOTION = (
     " close it to a fist, and open it again; each bend in three seconds or more"
 )
 FLAT = -1
-_OPEN, _BENT = 0.85, 0.5  # shares of a finger's way: 4 degrees of a straight finger are a tenth of it
-_MOVED_M = 0.015  # of the laser point of a finger that bent
 _FEWEST = 5  # strobe cycles of a bend
-_FINGERS = 3  # that must be seen
-_PER_BEND, _PER_FLAT = 16, 6
-_EDGE = 0.02  # share of outliers beyond the ends of a way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +45,8 @@ def guided(along_m: Float) -> Guided:
         FitError: Fewer than three fingers bent, or the hand bent fewer than two times between openings.
     """
     open_share = openness(along_m)
-    flat = open_share > _OPEN
+    # shares of a finger's way: 4 degrees of a straight finger are a tenth of it
+    flat = open_share > 0.85
     bends = _bends(open_share, flat)
     if len(bends) < 2 or not flat.any():
         raise FitError(
@@ -59,7 +55,8 @@ def guided(along_m: Float) -> Guided:
     chosen = [_flattest(np.flatnonzero(flat), open_share)]
     number = [np.full(len(chosen[0]), FLAT)]
     for k, rows in enumerate(bends):
-        rows = _evenly(rows, open_share, max(_PER_BEND * 2 // len(bends), _FEWEST))
+        per_bend = 16
+        rows = _evenly(rows, open_share, max(per_bend * 2 // len(bends), _FEWEST))
         chosen.append(rows)
         number.append(np.full(len(rows), k))
     return Guided(np.concatenate(chosen), np.concatenate(number))
@@ -77,14 +74,17 @@ def openness(along_m: Float) -> Float:
     for f in range(4):
         seen = along_m[np.isfinite(along_m[:, f]), f]
         if len(seen) >= 2 * _FEWEST:
-            low[f], high[f] = np.quantile(seen, [_EDGE, 1.0 - _EDGE])
-    moved = high - low > _MOVED_M
-    if moved.sum() < _FINGERS:
+            edge = 0.02  # share of outliers beyond the ends of a way
+            low[f], high[f] = np.quantile(seen, [edge, 1.0 - edge])
+    moved_m = 0.015  # of the laser point of a finger that bent
+    moved = high - low > moved_m
+    fingers = 3  # that must be seen
+    if moved.sum() < fingers:
         raise FitError(
-            f"{moved.sum()} fingers bend before the laser, at least {_FINGERS} are needed: {MOTION}"
+            f"{moved.sum()} fingers bend before the laser, at least {fingers} are needed: {MOTION}"
         )
     share = (along_m[:, moved] - low[moved]) / (high - low)[moved]
-    share[np.isfinite(share).sum(axis=1) < _FINGERS - 1] = np.nan
+    share[np.isfinite(share).sum(axis=1) < fingers - 1] = np.nan
     out = np.full(len(share), np.nan)
     seen = np.isfinite(share).any(axis=1)
     out[seen] = np.nanmedian(share[seen], axis=1)
@@ -101,7 +101,8 @@ def _bends(open_share: Float, flat: Bool) -> list[Int]:
     edges = np.flatnonzero(np.diff(np.r_[True, flat[known], True]))
     for first, stop in edges.reshape(-1, 2):
         rows = known[first:stop]
-        if len(rows) >= _FEWEST and open_share[rows].min() < _BENT:
+        bent = 0.5  # shares of a finger's way: 4 degrees of a straight finger are a tenth of it
+        if len(rows) >= _FEWEST and open_share[rows].min() < bent:
             bends.append(rows)
     return bends
 
@@ -112,7 +113,8 @@ def _flattest(rows: Int, open_share: Float) -> Int:
     A hand stays flat for longer than it passes by.
     """
     half = rows[np.argsort(open_share[rows])][len(rows) // 2 :]
-    return np.unique(half[np.linspace(0.0, len(half) - 1.0, _PER_FLAT).astype(np.int64)])
+    per_flat = 6
+    return np.unique(half[np.linspace(0.0, len(half) - 1.0, per_flat).astype(np.int64)])
 
 
 def _evenly(rows: Int, open_share: Float, count: int) -> Int:

@@ -23,19 +23,9 @@ from master.calibrate.wrist.board_pose import BoardPose
 
 Grey = npt.NDArray[np.float32]
 
-_TEXEL_PX = 0.6
-_MOST_TEXELS = 900  # per side
-_REACH_PX = 8.0  # of a profile to both sides
-_STEP_PX = 0.25
-_WINDOW_PX = 1.6  # standard deviation of the window: a little wider than the line ...
-_WINDOW = 1.2  # ... that is, than the half of it that is brighter than its half
-_BORDER_PX = 3.0  # kept from the borders of squares ...
-_BORDER = 0.3  # ... but never more of a square than this
 _NOISE_TIMES = 6.0
-_PAIRS = 300
 _MIN_PROFILES = 12
 _TOO_SHORT = "the laser line is seen on less than a square of the board: let it cross the board's middle"
-_LINE_FLOOR_PX = 0.015  # of a line's place: speckle and paper that no number of profiles averages out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +79,9 @@ def _laid_flat(
     """
     rows, columns = grid_shape(board)
     side = board.square_m
-    texel = max(_TEXEL_PX * pixel_m, max(columns + 1, rows + 1) * side / _MOST_TEXELS)
+    texel_px = 0.6
+    most_texels = 900  # per side
+    texel = max(texel_px * pixel_m, max(columns + 1, rows + 1) * side / most_texels)
     x, y = np.meshgrid(np.arange(-side, columns * side, texel), np.arange(-side, rows * side, texel))
     uv = optics.project(transform(T, np.stack([x, y, np.zeros_like(x)], axis=-1)))
     values = _sampled(difference, uv)
@@ -112,7 +104,8 @@ def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> 
     if len(places) > 2000:
         few = rng.choice(len(places), 2000, replace=False)
         places, weights = places[few], weights[few]
-    a, b = places[rng.integers(0, len(places), (2, _PAIRS))]
+    pairs = 300
+    a, b = places[rng.integers(0, len(places), (2, pairs))]
     way = b - a
     length = np.linalg.norm(way, axis=1)
     a, way, length = a[length > 0], way[length > 0], length[length > 0]
@@ -162,20 +155,26 @@ def _profiles(
     inside = ((base > -side) & (base < np.array([columns, rows]) * side)).all(axis=1)
     # Distance from the nearest border of squares, in both directions of the board.
     from_border = np.abs(base / side - np.rint(base / side)).min(axis=1) * side
-    clear = from_border > min(_BORDER_PX * pixel_m, _BORDER * side)
+    border_px = 3.0  # kept from the borders of squares ...
+    border = 0.3  # ... but never more of a square than this
+    clear = from_border > min(border_px * pixel_m, border * side)
     s, base = s[inside & clear], base[inside & clear]
     if len(s) < _MIN_PROFILES:  # such as a line along the border of two rows
         raise FitError(_TOO_SHORT)
-    d = np.arange(-_REACH_PX, _REACH_PX + 0.5 * _STEP_PX, _STEP_PX)
+    reach_px = 8.0  # of a profile to both sides
+    step_px = 0.25
+    d = np.arange(-reach_px, reach_px + 0.5 * step_px, step_px)
     places = base[:, None] + (d[:, None] * pixel_m) * across
     flat = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=-1)
     profile = _sampled(difference, optics.project(transform(placed.T_camera_board, flat)))
     whole = np.isfinite(profile).all(axis=1)
     s, profile = s[whole], profile[whole]
-    light = profile - np.median(profile[:, np.abs(d) > 0.6 * _REACH_PX], axis=1)[:, None]
+    light = profile - np.median(profile[:, np.abs(d) > 0.6 * reach_px], axis=1)[:, None]
     # Wider than what is brighter than half of it: on the flat top of a saturated line a narrow one would rest anywhere.
-    half = 0.5 * _STEP_PX * (light > 0.5 * light.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
-    window = np.maximum(_WINDOW_PX, _WINDOW * half)[:, None]
+    half = 0.5 * step_px * (light > 0.5 * light.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
+    window_px = 1.6  # standard deviation of the window: a little wider than the line ...
+    # ... that is, than the half of it that is brighter than its half
+    window = np.maximum(window_px, 1.2 * half)[:, None]
     centre = np.zeros(len(s))
     for _ in range(8):
         weight = light * np.exp(-0.5 * ((d - centre[:, None]) / window) ** 2)
@@ -183,8 +182,8 @@ def _profiles(
         centre = np.where(total > 0, (weight * d).sum(axis=1) / np.where(total > 0, total, 1.0), np.nan)
     height = light[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]
     # A line stands out from what is beside it; an even light, as that of the LEDs, does not.
-    flank = np.abs(light[:, np.abs(d) > 0.6 * _REACH_PX]).max(axis=1, initial=0.0)
-    good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
+    flank = np.abs(light[:, np.abs(d) > 0.6 * reach_px]).max(axis=1, initial=0.0)
+    good = (np.abs(centre) < 0.5 * reach_px) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
         raise FitError(_TOO_SHORT)
@@ -202,7 +201,8 @@ def _profiles(
     xy = point + s[kept, None] * along + (centre[kept, None] * pixel_m) * across
     points = transform(placed.T_camera_board, np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
     tilted = along + slope * pixel_m * across
-    sigma = float(np.hypot(rms / np.sqrt(kept.sum()), _LINE_FLOOR_PX))
+    line_floor_px = 0.015  # of a line's place: speckle and paper that no number of profiles averages out
+    sigma = float(np.hypot(rms / np.sqrt(kept.sum()), line_floor_px))
     return _Centred(point + level * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
 
 

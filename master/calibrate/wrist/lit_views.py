@@ -16,11 +16,8 @@ from common.errors import PictureError, RecordingError
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
 from common.recording.pictures import decode_file, read_picture
 
-MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
-_MOST_NAMED = 6  # views named with a reason
-_APART = 2  # rows: frames of one strobe cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +64,8 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
             f"{folder}: no frame lit by the {needed} with an ambient one beside it: a recording states in frames.csv"
             f" what lit each frame; images are named VIEW_ambient.png, VIEW_{needed}.png"
         )
-    chosen = np.unique(np.linspace(0, len(whole) - 1, min(MOST_VIEWS, len(whole))).round().astype(int))
+    most_views = 60  # more of the same motion adds time, not knowledge
+    chosen = np.unique(np.linspace(0, len(whole) - 1, min(most_views, len(whole))).round().astype(int))
     return tuple(whole[int(i)] for i in chosen)
 
 
@@ -84,8 +82,9 @@ def _recorded(folder: Path, camera: str) -> list[LitView]:
         if row.illumination is not Illumination.AMBIENT:
             continue
         cycle: dict[Illumination, FrameRow] = {row.illumination: row}
-        for near in rows[i + 1 : i + 1 + _APART]:
-            if near.illumination is Illumination.AMBIENT or near.seq - row.seq > _APART:
+        apart = 2  # rows: frames of one strobe cycle
+        for near in rows[i + 1 : i + 1 + apart]:
+            if near.illumination is Illumination.AMBIENT or near.seq - row.seq > apart:
                 break
             cycle.setdefault(near.illumination, near)
         views.append(
@@ -114,8 +113,9 @@ def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
         views.setdefault(reason, []).append(name)
     lines: list[str] = []
     for reason, names in views.items():
-        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-        lines.append(f"view{'s'[: len(names) > 1]} {', '.join(names[:_MOST_NAMED])}{more}: {reason}")
+        most_named = 6  # views named with a reason
+        more = f" and {len(names) - most_named} more" if len(names) > most_named else ""
+        lines.append(f"view{'s'[: len(names) > 1]} {', '.join(names[:most_named])}{more}: {reason}")
     return lines
 
 

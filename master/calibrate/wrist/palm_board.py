@@ -24,9 +24,8 @@ from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.board_pose import BoardPose
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
-_MOVED_M = 0.003  # between views: the hand shifted in the device
 _MOVED_RAD = np.radians(2.0)
-_ROTATION_LIMIT_RAD, _SHIFT_LIMIT_M = np.radians(1.0), 1e-3  # how sure the pose must be
+_ROTATION_LIMIT_RAD = np.radians(1.0)  # how sure the pose must be
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,8 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
     at = np.array([(pose @ middle)[:3] for pose in poses])
     spread = float(np.linalg.norm(rotation_vectors - np.median(rotation_vectors, axis=0), axis=1).max())
     shifted = float(np.linalg.norm(at - np.median(at, axis=0), axis=1).max())
-    if spread > _MOVED_RAD or shifted > _MOVED_M:
+    moved_m = 0.003  # between views: the hand shifted in the device
+    if spread > _MOVED_RAD or shifted > moved_m:
         raise FitError(
             f"the board moved by {1e3 * shifted:.1f} mm and {np.degrees(spread):.1f} deg between the views: hold the"
             " hand still in the device, and fix the board to it"
@@ -97,10 +97,11 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
     rotation_sigma, shift_sigma = (
         float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:])
     )
-    if rotation_sigma > _ROTATION_LIMIT_RAD or shift_sigma > _SHIFT_LIMIT_M:
+    shift_limit_m = 1e-3  # how sure the pose must be
+    if rotation_sigma > _ROTATION_LIMIT_RAD or shift_sigma > shift_limit_m:
         raise FitError(
             f"the board's pose is known to {np.degrees(rotation_sigma):.1f} deg and {1e3 * shift_sigma:.1f} mm only"
-            f" (limits {np.degrees(_ROTATION_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board,"
+            f" (limits {np.degrees(_ROTATION_LIMIT_RAD):.0f} deg, {1e3 * shift_limit_m:.0f} mm): take a larger board,"
             " sharp and well lit"
         )
     return PalmFit(

@@ -22,13 +22,8 @@ from common.geometry.transforms import cross
 from master.calibrate.wrist.board_pose import BoardPose
 from master.calibrate.wrist.line import BoardLine
 
-MIN_VIEWS = 3
 NORMAL_LIMIT_RAD = np.radians(0.1)
-OFFSET_LIMIT_M = 1e-4
-_MOST_PAIRS = 300
 _WRONG_CHI2 = 22.0  # of two degrees of freedom: one in 60 000
-_WRONG_M = 1.5e-4  # a view that is less off than this is not wrong, however sure it claims to be
-_MODEL_M = 1e-5  # what lens and paper add to every view that neither covariance knows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +68,8 @@ class ViewLine:
         board = np.broadcast_to(facing, d.shape)
         by_pose = share[:, None] * np.concatenate([cross(d, board), board], axis=1)
         own = self.sigma_px * self.ends_m[:, 2] / self.focal_px
-        return by_pose @ self.placed.covariance @ by_pose.T + np.diag(own**2 + _MODEL_M**2)
+        model_m = 1e-5  # what lens and paper add to every view that neither covariance knows
+        return by_pose @ self.placed.covariance @ by_pose.T + np.diag(own**2 + model_m**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,9 +111,10 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
         FitError: Too few views, too few agree, or their lines constrain no plane, or too weakly; the text states what
             to do.
     """
-    if len(views) < MIN_VIEWS:
+    min_views = 3
+    if len(views) < min_views:
         raise FitError(
-            f"the line is seen on the board in {len(views)} views, at least {MIN_VIEWS} are needed (better 10), each"
+            f"the line is seen on the board in {len(views)} views, at least {min_views} are needed (better 10), each"
             " with the board at another distance and tilt"
         )
     normal, offset = _consensus(views)
@@ -127,7 +124,7 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
         if (good == used).all():
             break
         used = good
-        if used.sum() < max(MIN_VIEWS, (len(views) + 1) // 2):
+        if used.sum() < max(min_views, (len(views) + 1) // 2):
             raise FitError(
                 f"only {int(used.sum())} of {len(views)} views agree on one plane: is the laser fixed to the camera,"
                 " and the board flat? Views with the line on something else than the board must be taken anew"
@@ -148,8 +145,9 @@ def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
     Through two of the lines; most of the others agree with it.
     """
     pairs: list[tuple[int, int]] = list(combinations(range(len(views)), 2))
-    if len(pairs) > _MOST_PAIRS:
-        chosen = np.random.default_rng(0).choice(len(pairs), _MOST_PAIRS, replace=False)
+    most_pairs = 300
+    if len(pairs) > most_pairs:
+        chosen = np.random.default_rng(0).choice(len(pairs), most_pairs, replace=False)
         pairs = [pairs[int(i)] for i in chosen]
     best, cost = (np.array([0.0, 1.0, 0.0]), 0.0), np.inf
     for i, j in pairs:
@@ -183,7 +181,8 @@ def _agreeing(views: Sequence[ViewLine], normal: Float, offset: float) -> Bool:
     off = np.array([_off(view, normal, offset) for view in views])
     # The covariances may be small by a common factor: a wrong view is one whose residual is larger than most.
     times = max(1.0, float(np.median(chi2)) / 1.386)
-    return (chi2 < _WRONG_CHI2 * times) | (off < _WRONG_M)
+    wrong_m = 1.5e-4  # a view that is less off than this is not wrong, however sure it claims to be
+    return (chi2 < _WRONG_CHI2 * times) | (off < wrong_m)
 
 
 def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float) -> float:
@@ -235,14 +234,15 @@ def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
     Raises:
         FitError: All points on one line, or too uncertain.
     """
-    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= OFFSET_LIMIT_M:
+    offset_limit_m = 1e-4
+    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= offset_limit_m:
         return
     wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     if wide[1] < max(5.0 * fit.rms_m, 0.1 * wide[0]):
         raise FitError(_collinear(wide[1]))
     raise FitError(
         f"the plane is known to {np.degrees(fit.normal_sigma_rad):.2f} deg and {1e3 * fit.offset_sigma_m:.2f} mm only"
-        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * OFFSET_LIMIT_M:.1f} mm): show the board in more"
+        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * offset_limit_m:.1f} mm): show the board in more"
         " views, nearer and farther, so large that it fills a third of the image"
     )
 

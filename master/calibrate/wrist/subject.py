@@ -29,16 +29,7 @@ TOOL = "calibrate wrist subject"
 _NAMES = FINGERS[1:]
 _GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
 _RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
-_LENGTH, _MEASURED = (
-    0.04,
-    0.012,
-)  # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
 _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
-_MOST_RMS = 1.5  # standard deviations: angles are free, so what is left is small
-_UNLIKELY = 3.0  # standard deviations
-_MOST_PRIOR_RMS = (
-    1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion constrains
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,9 +133,11 @@ def _length_sigma(hand: HandProfile) -> Float:
     Less where markers measured them.
     """
     how = [hand.provenance.get(name) for name in _NAMES]
+    # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
+    length, measured = 0.04, 0.012
     return np.array(
         [
-            _MEASURED if one and one.tool == "calibrate hand" and len(one.residual) > 1 else _LENGTH
+            measured if one and one.tool == "calibrate hand" and len(one.residual) > 1 else length
             for one in how
         ]
     )
@@ -179,11 +172,15 @@ def _check_likely(fit: Fit) -> None:
     """
     pull = np.abs(fit.x) / fit.prior_sigma
     worst = int(pull.argmax())
+    most_rms = 1.5  # standard deviations: angles are free, so what is left is small
+    unlikely = 3.0  # standard deviations
+    # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion constrains
+    most_prior_rms = 1.5
     if (
-        fit.rms > _MOST_RMS
-        or pull[worst] > _UNLIKELY
-        or fit.prior_rms > _MOST_PRIOR_RMS
-        or fit.unlike > _UNLIKELY
+        fit.rms > most_rms
+        or pull[worst] > unlikely
+        or fit.prior_rms > most_prior_rms
+        or fit.unlike > unlikely
     ):
         raise FitError(
             f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"

@@ -24,25 +24,17 @@ from master.calibrate.wrist.guided import FLAT
 from master.calibrate.wrist.subject_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, SubjectModel
 
 _LASER_SIGMA_M = 8e-4  # of skin of another shape than the cones
-_TIP_SIGMA_M = 2e-3  # what is seen as the tip of a finger is anywhere on its pulp
 _FLAT_RAD = np.radians(4.0)  # how flat people hold a hand
 _STRAIGHT_RAD = np.radians(5.0)  # how straight they keep a finger that bends at its knuckle
-_RATIO_SPREAD = 0.15  # MCP of a fist against the natural ratio
 _ASIDE_RAD = np.radians(
     17.0
 )  # 5 of a finger, who keeps to it all the time: its strobe cycles together count as one
 _ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
-_KNUCKLE_M = 3e-3  # against a hand of this size, per axis
-_INDEPENDENT = 4.0  # strobe cycles of a bend
 _OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is downweighted
-_FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _GUESS_SIGMA = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
-_ROUGHEST = 3.0
 _GRID_RAD = np.radians(np.arange(0.0, 97.0, 4.0))
 _PAST_RAD = np.radians(84.0)  # PIP beyond which the last phalanx may fold into the light
 _ROUNDS = (4, 4, 12)  # steps, from one guess of angles to the next
-_TRIALS, _SETTLED = 6, 0.02  # of a step; the gain that is none
-_CLEARLY = 2.0  # ratio of costs
 _KNUCKLES, _FIST = 0, 1
 
 
@@ -108,7 +100,8 @@ def prior_sigma(pose: Float, length: Float) -> Float:
 
     With the palm's pose (6,) [rad, m] and the lengths of fingers (4,).
     """
-    return np.r_[pose, np.full(12, _KNUCKLE_M), np.full(4, SPREAD), length]
+    knuckle_m = 3e-3  # against a hand of this size, per axis
+    return np.r_[pose, np.full(12, knuckle_m), np.full(4, SPREAD), length]
 
 
 def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> Fit:
@@ -147,11 +140,13 @@ class _Problem:
     def __init__(self, model: SubjectModel, seen: ImageObservations, sigma: Float) -> None:
         self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
         self._data = np.concatenate([seen.laser_m, seen.tip_uv], axis=-1)
-        tip_px = np.hypot(np.nan_to_num(seen.tip_sigma_px), _TIP_SIGMA_M * model.px_per_m)
+        tip_sigma_m = 2e-3  # what is seen as the tip of a finger is anywhere on its pulp
+        tip_px = np.hypot(np.nan_to_num(seen.tip_sigma_px), tip_sigma_m * model.px_per_m)
         laser = np.full_like(tip_px, _LASER_SIGMA_M)
         self._sigma = np.stack([laser, laser, tip_px, tip_px], axis=-1)
         count = np.array([(seen.bend == bend).sum() for bend in seen.bend])
-        self._share = np.minimum(_INDEPENDENT / count, 1.0)  # (T,) what a strobe cycle counts
+        independent = 4.0  # strobe cycles of a bend
+        self._share = np.minimum(independent / count, 1.0)  # (T,) what a strobe cycle counts
 
     def guessed(self, x: Float) -> "_Guess":
         """Guess the angles from joint couplings alone.
@@ -165,8 +160,9 @@ class _Problem:
         # Abductions, of which nothing is known yet, move points and tips across.
         along = (self._data[:, None, None, :, 1::2] - shown[..., 1::2]) / _GUESS_SIGMA
         unseen = np.isnan(self._data[:, None, None, :, 1::2])
-        far = np.where(unseen, 0.0, np.nan_to_num(np.abs(along), nan=_ROUGHEST))
-        cost: Float = (np.minimum(far, _ROUGHEST) ** 2).sum(axis=-1)  # (T, 2, G, 4)
+        roughest = 3.0
+        far = np.where(unseen, 0.0, np.nan_to_num(np.abs(along), nan=roughest))
+        cost: Float = (np.minimum(far, roughest) ** 2).sum(axis=-1)  # (T, 2, G, 4)
         least = cost.min(axis=2).sum(axis=2)
         bends = np.unique(self._bend[self._bend != FLAT])
         fists = bends[fists_of(np.array([least[self._bend == bend].sum(axis=0) for bend in bends]))]
@@ -174,7 +170,7 @@ class _Problem:
         own_cost = cost[np.arange(len(fist)), fist.astype(np.int64)]  # (T, G, 4); a fist is number _FIST
         node: Int = own_cost.argmin(axis=1)
         angles = grid[fist.astype(np.int64)[:, None], node, np.arange(4)]
-        used: Bool = (own_cost.min(axis=1) < _ROUGHEST**2) & ~(angles[..., PIP] > _PAST_RAD)
+        used: Bool = (own_cost.min(axis=1) < roughest**2) & ~(angles[..., PIP] > _PAST_RAD)
         flat = self._bend == FLAT
         angles[flat], used[flat] = 0.0, True
         return _Guess(angles, fist, used)
@@ -186,7 +182,8 @@ class _Problem:
         for _ in range(rounds):
             normal = self._normal(x, guess)
             covariance = np.asarray(np.linalg.inv(normal.reduced(0.0)[0]), np.float64)
-            for _ in range(_TRIALS):
+            trials, settled = 6, 0.02  # of a step; the gain that is none
+            for _ in range(trials):
                 step, change = normal.step(damping)
                 stepped = _Guess(guess.angles + change, guess.fist, guess.used)
                 trial = self._cost(x + step, stepped)
@@ -196,7 +193,7 @@ class _Problem:
             else:
                 break
             x, guess, gain, cost, damping = x + step, stepped, cost - trial, trial, 0.2 * damping
-            if gain < _SETTLED:
+            if gain < settled:
                 break
         return x, guess, covariance
 
@@ -221,7 +218,8 @@ class _Problem:
         """
         shown = self._model(x, angles)
         off = (self._data - shown) / self._sigma
-        return np.where(np.isnan(shown) & np.isfinite(self._data), _FARTHEST, off)
+        farthest = 8.0  # of a finger that the laser should meet and does not
+        return np.where(np.isnan(shown) & np.isfinite(self._data), farthest, off)
 
     def _prior_rows(self, guess: _Guess) -> tuple[Float, Float]:
         """Return the residuals (T, 4, 3) of the posture priors and their derivatives.
@@ -232,7 +230,8 @@ class _Problem:
         ratio = np.broadcast_to(self._model.mcp_per_pip, angles.shape[:2])
         by = np.zeros((*angles.shape[:2], LOCAL, LOCAL))
         by[..., ABDUCTION, ABDUCTION] = 1.0 / _ASIDE_RAD
-        mcp = np.hypot(_FLAT_RAD, _RATIO_SPREAD * ratio * np.maximum(angles[..., PIP], 0.0))
+        ratio_spread = 0.15  # MCP of a fist against the natural ratio
+        mcp = np.hypot(_FLAT_RAD, ratio_spread * ratio * np.maximum(angles[..., PIP], 0.0))
         by[fist, :, MCP, MCP], by[fist, :, MCP, PIP] = 1.0 / mcp[fist], -ratio[fist] / mcp[fist]
         by[fist, :, PIP, PIP] = 1.0 / _ANY_RAD
         by[~fist, :, MCP, MCP] = np.where(flat[~fist], 1.0 / _FLAT_RAD, 1.0 / _ANY_RAD)[:, None]
@@ -319,7 +318,8 @@ def fists_of(cost: Float) -> Bool:
     A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.
     """
     better: Float = np.log((cost[:, _KNUCKLES] + 1.0) / (cost[:, _FIST] + 1.0))
-    clear = np.abs(better) > np.log(_CLEARLY)
+    clearly = 2.0  # ratio of costs
+    clear = np.abs(better) > np.log(clearly)
     if clear.any() and (better[clear] > 0.0).all():
         return clear
     if clear.any() and (better[clear] < 0.0).all():

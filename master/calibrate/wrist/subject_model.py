@@ -28,8 +28,7 @@ from master.rig.wrist import WristSetup
 FINGERS = slice(1, 5)
 UNKNOWN, LOCAL = 26, 3
 ABDUCTION, MCP, PIP = range(LOCAL)
-_RAYS, _NUDGE = 32, 1e-5
-_ROTATION_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central differences
+_ROTATION_STEP = np.radians(0.5)  # of central differences
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +61,8 @@ class SubjectModel:
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        self._intersection, self._tips = LaserIntersection(setup, _RAYS), Fingertips.of(setup.model)
+        rays = 32
+        self._intersection, self._tips = LaserIntersection(setup, rays), Fingertips.of(setup.model)
         self._root = setup.model.rest_position_m[CHAINS[:, 0]]
         synergy = FlexionSynergy.of(setup.model)
         distance = np.linalg.norm(transform(setup.T_camera_palm, self._root[FINGERS].mean(axis=0)))
@@ -91,9 +91,10 @@ class SubjectModel:
     def knuckle_derivatives(self, x: Float) -> Float:
         """How the knuckles move with what is unknown, (4, 3, 26)."""
         out = np.empty((4, 3, UNKNOWN))
-        for k, step in enumerate(_NUDGE * np.eye(UNKNOWN)):
+        nudge = 1e-5
+        for k, step in enumerate(nudge * np.eye(UNKNOWN)):
             ahead, behind = (self.knuckles(Unknown.of(x + sign * step)) for sign in (1.0, -1.0))
-            out[..., k] = (ahead - behind) / (2.0 * _NUDGE)
+            out[..., k] = (ahead - behind) / (2.0 * nudge)
         return out
 
     def __call__(self, x: Float, angles: Float) -> Float:
@@ -112,7 +113,8 @@ class SubjectModel:
 
         (T, 4, 4, 26) by the unknowns, (T, 4, 4, 3) by the angles; 0 where not known.
         """
-        steps = np.r_[np.full(3, _ROTATION_STEP), np.full(3, _SHIFT_STEP), np.full(2, _SHARE_STEP)]
+        shift_step, share_step = 5e-4, 0.02  # of central differences
+        steps = np.r_[np.full(3, _ROTATION_STEP), np.full(3, shift_step), np.full(2, share_step)]
         ways = np.zeros((8, UNKNOWN))
         ways[:6, :6] = np.eye(6)
         ways[6, 18:22] = ways[7, 22:26] = 1.0

@@ -9,8 +9,6 @@ from common.messages import CheckItem, Checklist
 from master.console.labels import readable
 from master.console.state import ConsoleState
 
-_UPDATE_S = 0.5
-
 
 def build(state: ConsoleState) -> None:
     """Fill the page."""
@@ -28,7 +26,8 @@ def build(state: ConsoleState) -> None:
             _fill(checklist, now if isinstance(now, str) else "")
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 0.5
+    ui.timer(update_s, update)
 
 
 def _fill(checklist: Checklist | None, why: str) -> None:

@@ -16,7 +16,6 @@ from common.messages import Gesture
 from master.console.labels import gesture_line, readable
 from master.console.state import ConsoleState
 
-_UPDATE_S = 0.2
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _RECORD_TEMPLATE = "teach a pose"
 
@@ -44,7 +43,8 @@ def _now(state: ConsoleState) -> None:
         )
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 0.2
+    ui.timer(update_s, update)
 
 
 def hand_html(hand: str, now: dict[str, Gesture]) -> str:

@@ -11,7 +11,6 @@ from nicegui import ui
 from master.console.history import SPAN_S, History
 from master.console.state import ConsoleState
 
-_UPDATE_S = 1.0
 _GREY = "#7d8590"  # readable on light and on dark
 _COLOURS = ("#2f81f7", "#e3702f", "#2da44e", "#bf4b8a", "#9a6700", "#0e9aa7", "#8250df", "#cf222e")
 
@@ -55,7 +54,8 @@ def build(state: ConsoleState) -> None:
             words.set_text(latest_words(names, state.history))
 
     update()
-    ui.timer(_UPDATE_S, update)
+    update_s = 1.0
+    ui.timer(update_s, update)
 
 
 def names_of(plot: Plot, history: History) -> list[str]:

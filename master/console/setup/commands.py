@@ -31,9 +31,6 @@ VIEWS = {
     "hand-routine": "the routine that measures a hand",
     "object": "a hand and an object",
 }
-_NEVER_S = 36_000.0  # a hand that begins to move so much later is held still
-_SOON_S = 3.0  # until slaves have joined
-_APART_MS = 5.0  # cameras that nobody synchronises are taken one after the other
 _CLOCK = "--scene-epoch-ns"
 
 
@@ -163,7 +160,8 @@ class Commands:
             device = f":{camera.device}" if camera.device else ""
             return ["--camera", f"v4l2{device}", *shlex.split(camera.options)]
         index = [one.name for one in self.plan.cameras].index(camera.name)
-        late_ms = (time.monotonic_ns() - epoch_ns) * 1e-6 + _APART_MS * index
+        apart_ms = 5.0  # cameras that nobody synchronises are taken one after the other
+        late_ms = (time.monotonic_ns() - epoch_ns) * 1e-6 + apart_ms * index
         world = ["--truth", str(Path(self.plan.truth).resolve()), "--truth-rig", self.plan.world]
         scene = ["--scene", "standard" if view == "still" else view, _CLOCK, str(epoch_ns)]
         return ["--camera", "synthetic", *world, *scene, "--start-offset-ms", f"{late_ms:.3f}"]
@@ -183,7 +181,9 @@ def epoch_of(view: str) -> int:
 
     A hand that is held still never begins.
     """
-    later_s = _NEVER_S if view == "still" else _SOON_S
+    never_s = 36_000.0  # a hand that begins to move so much later is held still
+    soon_s = 3.0  # until slaves have joined
+    later_s = never_s if view == "still" else soon_s
     return time.monotonic_ns() + round(1e9 * later_s)
 
 

@@ -17,14 +17,12 @@ from master.console.local import LocalProcess, LocalProcesses
 from master.console.setup.files import replace_file
 from master.console.setup.progress import fault, progress
 
-_POLL_S = 0.1
 _KINDS = {
     "cameras": CameraCalibration,
     "rigs": RigCalibration,
     "hands": HandProfile,
     "objects": ObjectProfile,
 }
-_LINES = 400
 
 
 class JobState(StrEnum):
@@ -82,7 +80,8 @@ class Job:
         self.state, self.error, self.stage = JobState.RUNNING, "", ""
         self.keyboard = False
         self.used: tuple[Path, ...] = ()
-        self.lines: deque[str] = deque(maxlen=_LINES)
+        lines = 400
+        self.lines: deque[str] = deque(maxlen=lines)
         self._stages, self._local, self._environment, self._ended = tuple(stages), local, environment, ended
         self._stop = threading.Event()
         self._now: dict[str, LocalProcess] = {}
@@ -200,7 +199,8 @@ class Job:
         }
         while any(one.ended() is None for one in self._now.values()):
             failed = any(one.ended() not in (None, 0) for one in self._now.values())
-            if failed or self._stop.wait(_POLL_S):
+            poll_s = 0.1
+            if failed or self._stop.wait(poll_s):
                 break
         codes = {name: self._end(name, one) for name, one in self._now.items()}
         for one in self._now.values():

@@ -8,8 +8,6 @@ from nicegui import ui
 from master.console.setup.job import Job, JobState
 from master.console.setup.parts import Desk, png_url
 
-_POLL_S = 0.4
-_SHOWN = 60
 _HEAD = {
     JobState.RUNNING: "running",
     JobState.DONE: "done",
@@ -57,7 +55,8 @@ def job_view(
         bar.props(f"{'' if share is not None or not running else 'indeterminate'}", remove="indeterminate")
         bar.set_value(0.0 if share is None else share)
         last.set_text(text[-1] if running and text else "")
-        lines.set_text("\n".join(text[-_SHOWN:]))
+        # shown
+        lines.set_text("\n".join(text[-60:]))
         lines.set_visibility(bool(text))
         if (id(now), now.state) != shown:
             shown = (id(now), now.state)
@@ -68,7 +67,8 @@ def job_view(
                     _result(desk, now, used, words)
 
     follow()
-    ui.timer(_POLL_S, follow)
+    poll_s = 0.4
+    ui.timer(poll_s, follow)
 
 
 def _buttons(desk: Desk, row: ui.row, job: Job, *, early: bool) -> None:

@@ -20,9 +20,6 @@ from master.run.ingest import Ingest
 from master.run.master_bus import host_bus
 from master.run.stopping import stop_on_signals
 
-_START_S = 5.0
-_POLL_S = 0.2
-
 
 def meet(words: Sequence[str]) -> None:
     """Give the start to the slaves of a rig and print who is there, until Ctrl-C."""
@@ -36,12 +33,14 @@ def meet(words: Sequence[str]) -> None:
     with ExitStack() as stack:
         link = host_bus(options.bus, cameras)
         stack.callback(link.close)
+        start_s = 5.0
         ingest = Ingest(
-            cameras, link_key(os.environ, options.key_file), SystemClock(), *ends, options.bus, _START_S
+            cameras, link_key(os.environ, options.key_file), SystemClock(), *ends, options.bus, start_s
         )
         stack.callback(ingest.close)
         previous: frozenset[str] | None = None
-        while not stop.wait(_POLL_S):
+        poll_s = 0.2
+        while not stop.wait(poll_s):
             while ingest.get(0.0) is not None:
                 pass  # nothing is tracked
             if (here := ingest.connected) != previous:

@@ -23,7 +23,6 @@ from master.console.setup.session import Session, session_of, wizard_named
 from master.console.setup.steps import Done, Step
 from master.console.state import ConsoleState
 
-_POLL_S = 1.0
 PANELS: dict[str, Callable[[Desk], None]] = {
     "cameras": panel_cameras.build,
     "rig": panel_rig.build,
@@ -58,7 +57,8 @@ def build(state: ConsoleState) -> None:
     steps = _Steps(session, nav, panel, desk)
     desk.go = steps.go
     steps.go(session.here or steps.first())
-    ui.timer(_POLL_S, steps.update)
+    poll_s = 1.0
+    ui.timer(poll_s, steps.update)
 
 
 class _Steps:

@@ -14,8 +14,6 @@ from common.recording.picture_size import jpeg_size
 from master.console.setup.colour_sampling import keep_colours, pick, pixel_of, ranges_of
 from master.console.setup.parts import Desk, heading, jpeg_url
 
-_PICTURE_S = 0.2
-_STEP_PX, _FINE_PX = 8.0, 1.0
 _KEYS = {"ArrowLeft": (-1, 0), "ArrowRight": (1, 0), "ArrowUp": (0, -1), "ArrowDown": (0, 1)}
 
 
@@ -114,7 +112,8 @@ class _ColourChoice:
         with ui.row():
             ui.button("Save colours", on_click=self._save).props('icon="save"')
             ui.button("Next: track", on_click=lambda: self._desk.go("track")).props("flat")
-        ui.timer(_PICTURE_S, self._show)
+        picture_s = 0.2
+        ui.timer(picture_s, self._show)
         self._show_state()
 
     async def _click(self, event: events.MouseEventArguments) -> None:
@@ -128,7 +127,8 @@ class _ColourChoice:
         if key == "Enter":
             await self._pick()
         elif key in _KEYS:
-            step = _FINE_PX if event.args.get("shiftKey") else _STEP_PX
+            step_px, fine_px = 8.0, 1.0
+            step = fine_px if event.args.get("shiftKey") else step_px
             u, v = self._choice.at or (size[0] / 2, size[1] / 2)
             du, dv = _KEYS[key]
             self._choice.at = (

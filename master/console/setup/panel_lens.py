@@ -16,9 +16,6 @@ from master.console.setup.parts import Desk, heading, previews
 from master.console.setup.session import LENS
 from master.console.setup.wizards import WIZARDS
 
-GOOD_PX, POOR_PX = 0.6, 1.2  # of all corners, root mean square
-_SQUARES_SHARE = 0.01
-
 
 def build(desk: Desk) -> None:
     """Fill the panel."""
@@ -71,11 +68,13 @@ def judged(numbers: dict[str, object]) -> str:
     off = [abs(pair["edge_sd_mm"]) / max(abs(pair["edge_mean_mm"]), 1e-9) for pair in pairs]
     poor = [name for name, lens in _lenses(numbers).items() if lens]
     text = f"Corners fit to {rms:.2f} px; squares come out alike to {100 * max(off, default=0.0):.1f} %. "
-    if rms > POOR_PX or max(off, default=0.0) > 5 * _SQUARES_SHARE:
+    good_px, poor_px = 0.6, 1.2  # of all corners, root mean square
+    squares_share = 0.01
+    if rms > poor_px or max(off, default=0.0) > 5 * squares_share:
         return (
             text + "Repeat it: the board moved, is not flat, or its squares are of another size than stated."
         )
-    if rms > GOOD_PX or max(off, default=0.0) > 2 * _SQUARES_SHARE:
+    if rms > good_px or max(off, default=0.0) > 2 * squares_share:
         return text + "Fair: usable; more views, held stiller, would make it better."
     more = f" It would gain most by more views for {', '.join(poor)}: in corners and tilted." if poor else ""
     return text + "Good: use it." + more

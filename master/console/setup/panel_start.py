@@ -8,8 +8,6 @@ from nicegui import ui
 from master.console.setup.commands import VIEWS
 from master.console.setup.parts import Desk, command_line, heading, previews
 
-_POLL_S = 0.5
-
 
 def build(desk: Desk) -> None:
     """Fill the panel."""
@@ -64,4 +62,5 @@ def build(desk: Desk) -> None:
         wrong.set_text("\n".join(session.failures()))
 
     look()
-    ui.timer(_POLL_S, look)
+    poll_s = 0.5
+    ui.timer(poll_s, look)

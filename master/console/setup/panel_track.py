@@ -6,8 +6,6 @@ from nicegui import ui
 from common.messages import HandPose
 from master.console.setup.parts import Desk, heading
 
-_POLL_S = 0.5
-
 
 def build(desk: Desk) -> None:
     """Fill the panel."""
@@ -57,7 +55,8 @@ def build(desk: Desk) -> None:
                     ui.label(line).classes("setup-text")
 
     look()
-    ui.timer(_POLL_S, look)
+    poll_s = 0.5
+    ui.timer(poll_s, look)
 
 
 def _state(desk: Desk, posing: bool) -> str:

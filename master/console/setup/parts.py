@@ -14,7 +14,6 @@ from common.errors import PhalanxError
 from master.console.setup.session import Session
 
 T = TypeVar("T")
-_PICTURE_S = 0.2
 _EMPTY = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw=="
 
 
@@ -87,7 +86,8 @@ def previews(desk: Desk) -> None:
             there = name in state.alive
             text.set_text(f"{name}: {'live' if picture else 'there' if there else 'waiting for it'}")
 
-    ui.timer(_PICTURE_S, update)
+    picture_s = 0.2
+    ui.timer(picture_s, update)
 
 
 def _preview(name: str) -> tuple[ui.image, ui.label]:

@@ -16,8 +16,7 @@ from common.messages import ResultMessage
 from master.outputs.sink import Sink
 
 DEPTH = 64  # messages; what a receiver was too slow for is old by then
-FIRST_RETRY_S, LAST_RETRY_S = 1.0, 10.0
-_JOIN_S = 3.0  # an output that hangs is left to the end of the process
+FIRST_RETRY_S = 1.0
 
 
 class Counters:
@@ -95,7 +94,8 @@ class OutputLine:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join(_JOIN_S)
+        join_s = 3.0  # an output that hangs is left to the end of the process
+        self._thread.join(join_s)
         if self._thread.is_alive():
             self._notify(f"{self._name}: hangs and was left behind")
 
@@ -125,7 +125,8 @@ class OutputLine:
         """Wait until the next retry."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing, self._wait_s)
-        self._wait_s = min(2.0 * self._wait_s, LAST_RETRY_S)
+        last_retry_s = 10.0
+        self._wait_s = min(2.0 * self._wait_s, last_retry_s)
 
     def _send(self) -> None:
         """Hand on what waits, or wait for more."""

@@ -24,9 +24,7 @@ from master.outputs.network.times import Times
 
 FINGER_ANGLES = ("abduction", "flexion", "pip", "dip")
 THUMB_ANGLES = ("cmc-abduction", "cmc-flexion", "mcp", "ip")
-_BUFFERED = 60  # hundreds of samples, for an inlet that is slow
 _LOG = logging.getLogger(__name__)
-_COMPARE_NS = 1_000_000_000  # how often LSL's clock is compared with ours
 
 
 def channels() -> tuple[tuple[str, str, str], ...]:
@@ -81,7 +79,8 @@ class LslSink:
         outlet = self._outlets.get(message.hand)
         if outlet is None:
             outlet = self._outlets[message.hand] = self._opened(message.hand)
-        if now_ns() - self._clock[0] > _COMPARE_NS:
+        compare_ns = 1_000_000_000  # how often LSL's clock is compared with ours
+        if now_ns() - self._clock[0] > compare_ns:
             self._clock = self._compared()
         stamp_s = 1e-9 * self._times.local_ns(message.t_ns) + self._clock[1]
         outlet.push_sample(sample_of(message).tolist(), stamp_s)
@@ -112,7 +111,8 @@ class LslSink:
             ).append_child_value("unit", unit)
         before = sockets()
         try:
-            outlet = self._library.StreamOutlet(info, 0, _BUFFERED)
+            buffered = 60  # hundreds of samples, for an inlet that is slow
+            outlet = self._library.StreamOutlet(info, 0, buffered)
         except RuntimeError as error:
             raise PhalanxError(
                 f"{self._name}-{hand}: {error}; are ports {PORTS[0]} to {PORTS[-1]} free?"

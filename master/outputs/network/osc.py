@@ -20,7 +20,6 @@ from master.outputs.network.udp import UdpSender
 
 POSE = "fffffffi"  # x y z, quaternion x y z w, tracked
 _XYZW = [1, 2, 3, 0]
-_MOST_BLANKS = 256  # kinds of messages that are remembered: names come from the bus
 
 
 class OscSink:
@@ -126,7 +125,8 @@ class OscSink:
     def _blank(self, key: Hashable, make: Callable[[], Sequence[Blank]]) -> BlankBundle:
         known = self._blanks.get(key)
         if known is None:
-            if len(self._blanks) >= _MOST_BLANKS:
+            most_blanks = 256  # kinds of messages that are remembered: names come from the bus
+            if len(self._blanks) >= most_blanks:
                 self._blanks.clear()
             known = self._blanks[key] = BlankBundle(make())
         return known

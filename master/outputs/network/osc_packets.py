@@ -19,7 +19,6 @@ from common.arrays import Bool, Int
 Words = npt.NDArray[np.uint32]
 
 _BIG = np.dtype(">u4")
-_UNIX_TO_NTP_S = 2_208_988_800  # 1900 to 1970
 _HEADER = 4  # words: "#bundle" and the time tag
 
 
@@ -78,7 +77,8 @@ class BlankBundle:
         """
         words = self._words.copy()
         seconds, rest = divmod(wall_ns, 1_000_000_000)
-        words[2], words[3] = (seconds + _UNIX_TO_NTP_S) % 2**32, (rest << 32) // 1_000_000_000
+        unix_to_ntp_s = 2_208_988_800  # 1900 to 1970
+        words[2], words[3] = (seconds + unix_to_ntp_s) % 2**32, (rest << 32) // 1_000_000_000
         words[self._slots] = numbers
         if present is None or present.all():
             return words.tobytes()

@@ -15,7 +15,6 @@ from common.errors import BusError
 from master.outputs.network.ros2_names import Node, Topic, attachment, gid_of
 
 _LOG = logging.getLogger(__name__)
-_TIMEOUT_MS = 1000
 _RETRY = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2}
 
 
@@ -33,11 +32,12 @@ class RosPublishers:
         Raises:
             BusError: The endpoint is malformed.
         """
+        timeout_ms = 1000
         settings: dict[str, object] = {
             "mode": "client",
             "connect": {
                 "endpoints": [router],
-                "timeout_ms": _TIMEOUT_MS,
+                "timeout_ms": timeout_ms,
                 "exit_on_failure": True,
                 "retry": _RETRY,
             },

@@ -29,7 +29,6 @@ _THUMB_ANGLES = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
 ANGLES = tuple(
     f"{finger}_{angle}" for finger in FINGERS for angle in (_THUMB_ANGLES if finger == "thumb" else _ANGLES)
 )
-_LAST_NS = 2**31 * 1_000_000_000 - 1  # ROS's seconds have 32 bits
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _TYPES: dict[str, Any] = dict(
     _STORE.types
@@ -130,7 +129,8 @@ def _states(pose: HandPose, header: object) -> object:
 
 
 def _header(wall_ns: int) -> object:
-    seconds, rest = divmod(min(max(wall_ns, 0), _LAST_NS), 1_000_000_000)
+    last_ns = 2**31 * 1_000_000_000 - 1  # ROS's seconds have 32 bits
+    seconds, rest = divmod(min(max(wall_ns, 0), last_ns), 1_000_000_000)
     stamp = _TYPES["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
     return _TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME)
 

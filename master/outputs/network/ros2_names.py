@@ -17,7 +17,6 @@ ADMIN = "@ros2_lv"
 # Reliable, volatile, keep the last ten; what rmw takes for granted is left out of the text: reliability, durability,
 # history, and times of deadline, lifespan and liveliness.
 QOS = "::,10:,:,:,,"
-GID_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,8 @@ def attachment(number: int, t_ns: int, gid: bytes) -> bytes:
 
     Its number, when it was sent [ns since 1970], and the publisher's gid.
     """
-    return struct.pack("<qqB", number, t_ns, GID_BYTES) + gid
+    gid_bytes = 16
+    return struct.pack("<qqB", number, t_ns, gid_bytes) + gid
 
 
 def ros_name(name: str) -> str:

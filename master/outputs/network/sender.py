@@ -29,8 +29,6 @@ from master.outputs.network.times import MasterTimes
 
 NAME = "outputs"
 STREAMS = ("hand", "object", "contact", "gesture")
-_DEPTH = 512  # of each stream; it is emptied at once
-_POLL_S = 0.02
 
 
 class Switch(Struct, frozen=True, forbid_unknown_fields=True):
@@ -248,7 +246,8 @@ def run_sender(
         BusError: The bus is closed.
         PhalanxError: `only` names an output that there is not.
     """
-    subscribers = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
+    depth = 512  # of each stream; it is emptied at once
+    subscribers = [bus.subscribe(stream, depth=depth) for stream in STREAMS]
     sender = Sender(settings, only, notify)
     housekeeping = Housekeeping(sender, bus, path, subscribers)
 
@@ -293,7 +292,8 @@ def _drain(subscribers: list[Subscription], sender: Sender) -> None:
     If there are none, wait for a hand, since the other messages come with hands.
     """
     hands, *others = subscribers
-    message = hands.get(_POLL_S)
+    poll_s = 0.02
+    message = hands.get(poll_s)
     while message is not None:
         _push(sender, message)
         message = hands.get(0.0)

@@ -19,11 +19,6 @@ from typing import Protocol
 from common.clock import now_ns
 from common.link.clock_offset import OffsetEstimator
 
-_AHEAD_NS, _LATE_NS = 200_000_000, 5_000_000_000  # of a live message against now; beyond it is a recording's
-_WALL_NS = (
-    1_000_000_000  # so often the wall clock is asked: it is set now and then, and slewed by its time service
-)
-
 
 class Times(Protocol):
     """Turns the time of a message into that of another clock."""
@@ -82,15 +77,18 @@ class MasterTimes:
         if estimate is not None and abs(estimate.offset_ns) > estimate.bound_ns:
             t_ns = estimate.to_local(t_ns)
         now = self._now_ns()
-        if -_AHEAD_NS <= now - t_ns <= _LATE_NS:
+        # of a live message against now; beyond it is a recording's
+        ahead_ns, late_ns = 200_000_000, 5_000_000_000
+        if -ahead_ns <= now - t_ns <= late_ns:
             return t_ns
-        if not -_AHEAD_NS <= now - (t_ns + self._played_ns) <= _LATE_NS:
+        if not -ahead_ns <= now - (t_ns + self._played_ns) <= late_ns:
             self._played_ns = now - t_ns
         return t_ns + self._played_ns
 
     def wall_ns(self, t_ns: int) -> int:
         """Nanoseconds since 1970 (see `Times`)."""
-        if abs(self._now_ns() - self._wall[0]) > _WALL_NS:
+        # so often the wall clock is asked: it is set now and then, and slewed by its time service
+        if abs(self._now_ns() - self._wall[0]) > 1_000_000_000:
             self._wall = self._compared()
         return self.local_ns(t_ns) + self._wall[1]
 

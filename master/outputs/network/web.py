@@ -26,7 +26,6 @@ from master.outputs.web.listening import (
 from master.outputs.web.server import RequestFilter, WebServer
 
 KEY_FILE = "web.key"
-_KEY_BYTES = 10  # 80 bits: who guesses has to ask us each time
 
 
 def request_filter_of(settings: WebOutput, environment: Mapping[str, str]) -> RequestFilter:
@@ -38,10 +37,11 @@ def request_filter_of(settings: WebOutput, environment: Mapping[str, str]) -> Re
     if is_loopback(settings.host):
         return RequestFilter()
     folder = private_folder(environment)
+    key_bytes = 10  # 80 bits: who guesses has to ask us each time
     if not (folder / KEY_FILE).exists():
-        write_private(folder / KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())
+        write_private(folder / KEY_FILE, secrets.token_hex(key_bytes).encode())
     key = read_private(folder / KEY_FILE).decode("ascii", "replace").strip()
-    if len(key) < 2 * _KEY_BYTES or not key.isalnum():
+    if len(key) < 2 * key_bytes or not key.isalnum():
         raise PhalanxError(f"{folder / KEY_FILE}: not a key; delete it, and a new one is made")
     tls = None if is_open(environment) else page_certificate(folder, settings.host).context
     return RequestFilter(key, tls)

@@ -31,9 +31,7 @@ from common.errors import PhalanxError
 
 LIFE = timedelta(days=397)  # browsers refuse a longer life
 _RENEW_BEFORE = timedelta(days=14)
-_MOST_BYTES = 65536
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
-_SIOCGIFADDR = 0x8915  # netdevice(7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +106,8 @@ def read_private(path: Path) -> bytes:
     try:
         mode = path.stat().st_mode
         with path.open("rb") as file:
-            data = file.read(_MOST_BYTES)
+            most_bytes = 65536
+            data = file.read(most_bytes)
     except OSError as error:
         raise PhalanxError(f"{path}: cannot be read: {error.strerror}") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
@@ -165,7 +164,8 @@ def _addresses() -> list[str]:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             for _, name in socket.if_nameindex():
                 with suppress(OSError):  # it has none
-                    address = ioctl(probe.fileno(), _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                    siocgifaddr = 0x8915  # netdevice(7)
+                    address = ioctl(probe.fileno(), siocgifaddr, struct.pack("256s", name.encode()[:15]))
                     found.append(socket.inet_ntoa(address[20:24]))
     else:
         with suppress(OSError):

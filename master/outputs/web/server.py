@@ -33,14 +33,10 @@ from master.outputs.web import static_dir, three_js_path
 
 PATH: Final = "/hands"
 CLIENTS = 16
-ECHO_BYTES = 256  # the longest text of a client; one that begins with "ping" comes back, the rest is ignored
 SEND_BUFFER_BYTES = 32 * 1024  # about five poses: what lies in the system's buffer is old when it is read
-PING_S, SILENT_S = 10.0, 20.0
 OPEN_S = (
     5.0  # for who connects to state what is wanted; so long an unknown sender of nothing keeps a connection
 )
-_JOIN_S = 3.0
-_COOKIE_S = 30 * 24 * 3600
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -160,7 +156,8 @@ class WebServer:
         if self._loop.is_closed():
             return
         self._loop.call_soon_threadsafe(self._stopping.set)
-        self._thread.join(_JOIN_S)
+        join_s = 3.0
+        self._thread.join(join_s)
         if not self._thread.is_alive():
             self._socket.close()
             self._loop.close()
@@ -171,6 +168,9 @@ class WebServer:
     async def _serve(self) -> None:
         quiet = logging.getLogger(f"{__name__}.connections")
         quiet.setLevel(logging.CRITICAL)  # junk from a port scan is no news
+        # the longest text of a client; one that begins with "ping" comes back, the rest is ignored
+        echo_bytes = 256
+        ping_s, silent_s = 10.0, 20.0
         async with serve(
             self._client,
             sock=self._socket,
@@ -179,10 +179,10 @@ class WebServer:
             open_timeout=OPEN_S,
             process_request=self._answer,
             compression=None,  # it costs more than it saves on the machine itself
-            max_size=ECHO_BYTES,
+            max_size=echo_bytes,
             write_limit=SEND_BUFFER_BYTES,
-            ping_interval=PING_S,
-            ping_timeout=SILENT_S,
+            ping_interval=ping_s,
+            ping_timeout=silent_s,
             close_timeout=1.0,
             server_header=None,
             logger=quiet,
@@ -254,7 +254,8 @@ class WebServer:
 
     def _cookie(self, key: str) -> str:
         secure = "; Secure" if self._request_filter.tls is not None else ""
-        return f"{self._name()}={key}; Path=/; Max-Age={_COOKIE_S}; HttpOnly; SameSite=Strict{secure}"
+        cookie_s = 30 * 24 * 3600
+        return f"{self._name()}={key}; Path=/; Max-Age={cookie_s}; HttpOnly; SameSite=Strict{secure}"
 
 
 async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:

@@ -9,7 +9,6 @@ from common.terminal import echo
 from master.commands.summary import write_summary
 from master.recording.lines import ProgressLine, bar
 
-_EVERY_NS = 100_000_000
 _MOTION = ("bvh", "gltf")
 
 
@@ -106,7 +105,8 @@ class _Progress:
 
         Where no terminal shows the bar in place it is omitted: files are written in seconds.
         """
-        if sys.stderr.isatty() and now_ns() - self._shown_ns > _EVERY_NS:
+        every_ns = 100_000_000
+        if sys.stderr.isatty() and now_ns() - self._shown_ns > every_ns:
             self._shown_ns = now_ns()
             self._line.show(f"{bar(done / max(total, 1))} {what}, {done} of {total}")
 

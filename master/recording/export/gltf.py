@@ -48,8 +48,6 @@ from master.recording.export.hand_mesh import Skin, skin_of
 from master.recording.export.motion import Motion, local
 from master.recording.export.skeleton import CHILDREN, PARENT, Skeleton, back, name_of, rotate, times
 
-_STILL = 1e-6  # of a quaternion
-_HOLD_S = 1e-3  # before the end of a gap the hand still stands where it was
 _COLOUR = [0.80, 0.62, 0.52, 1.0]
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _TYPES = {"f": FLOAT, "I": UNSIGNED_INT, "B": UNSIGNED_BYTE}
@@ -135,7 +133,8 @@ def with_holds(motion: Motion) -> Motion:
     t_ns = motion.t_ns[rows].copy()
     second = np.append(False, rows[1:] == rows[:-1])
     after = motion.t_ns[np.minimum(rows + 1, len(motion) - 1)]
-    t_ns[second] = after[second] - round(_HOLD_S * 1e9)
+    hold_s = 1e-3  # before the end of a gap the hand still stands where it was
+    t_ns[second] = after[second] - round(hold_s * 1e9)
     return Motion(
         t_ns, motion.position_m[rows], motion.orientation_wxyz[rows], motion.held[rows], motion.gap_ns
     )
@@ -224,7 +223,8 @@ def _animation(data: _Data, own: Motion, skeleton: Skeleton) -> tuple[int, ...]:
             if joint != WRIST:
                 free.append(joint)
         from_rest = 1.0 - np.abs(own.orientation_wxyz[:, joint] @ q[joint])
-        if joint == WRIST or float(from_rest.max()) > _STILL**2:
+        still = 1e-6  # of a quaternion
+        if joint == WRIST or float(from_rest.max()) > still**2:
             _channel(data, clip, keys, joint, "rotation", _xyzw(own.orientation_wxyz[:, joint]))
     data.gltf.animations.append(clip)
     return tuple(free)

@@ -20,8 +20,6 @@ from master.recording.export.skeleton import Skeleton
 
 _ROUND = 140  # points of a sphere
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
-_FLAT = 0.62  # a wrist is flat: of its radius, two such spheres side by side
-_BALL = 0.55  # how far up the metacarpals the ball of the thumb reaches
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,8 +103,9 @@ def _wrist(skeleton: Skeleton) -> list[_Ball]:
     They are as wide as the wrist's radius states, and flat.
     """
     radius = float(skeleton.radius_m[WRIST])
-    aside = np.array([(1.0 - _FLAT) * radius, 0.0, 0.0])
-    return [_Ball(skeleton.position_m[WRIST] + side * aside, _FLAT * radius, WRIST) for side in (-1.0, 1.0)]
+    flat = 0.62  # a wrist is flat: of its radius, two such spheres side by side
+    aside = np.array([(1.0 - flat) * radius, 0.0, 0.0])
+    return [_Ball(skeleton.position_m[WRIST] + side * aside, flat * radius, WRIST) for side in (-1.0, 1.0)]
 
 
 def _ball(skeleton: Skeleton, at: int, joint: int) -> _Ball:
@@ -114,8 +113,9 @@ def _ball(skeleton: Skeleton, at: int, joint: int) -> _Ball:
 
 
 def _between(skeleton: Skeleton, a: int, b: int, joint: int) -> _Ball:
-    centre = (1.0 - _BALL) * skeleton.position_m[a] + _BALL * skeleton.position_m[b]
-    radius = (1.0 - _BALL) * skeleton.radius_m[a] + _BALL * skeleton.radius_m[b]
+    ball = 0.55  # how far up the metacarpals the ball of the thumb reaches
+    centre = (1.0 - ball) * skeleton.position_m[a] + ball * skeleton.position_m[b]
+    radius = (1.0 - ball) * skeleton.radius_m[a] + ball * skeleton.radius_m[b]
     return _Ball(centre, float(radius), joint)
 
 

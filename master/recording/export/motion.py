@@ -23,15 +23,9 @@ from common.hand.model import WRIST
 from master.outputs.poses import Poses
 from master.recording.export.skeleton import ORDER, PARENT, Skeleton, back, rotate, times
 
-GAP_S = 0.25  # without a pose: longer than that nobody knows how the hand went
-_GAP_POSES = 3.0  # of a source that is as slow as that all the time
 # A frame takes 7 kB while it is made, so one late pose must not cost what it likes. There may be a break of ten minutes
 # at 60 Hz, and 16 frames for each pose (of poses at 15 Hz, 240 frames/s).
 FREE_FRAMES, FRAMES_OF_POSE = 36_000, 16
-MOST_FRAMES = 1_000_000  # 4.6 hours at 60 Hz
-_DENSE, _MOST_HZ = 10.0, 1000.0  # per cent of the steps
-_UNIT = 0.5  # a quaternion shorter than that is none
-_STRAIGHT = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +64,8 @@ class Motion:
         """
         if len(self) < 2:
             return 60.0
-        rate = min(1e9 / float(np.percentile(np.diff(self.t_ns), _DENSE)), _MOST_HZ)
+        dense, most_hz = 10.0, 1000.0  # per cent of the steps
+        rate = min(1e9 / float(np.percentile(np.diff(self.t_ns), dense)), most_hz)
         return round(rate) if rate > 0.5 and abs(rate / round(rate) - 1.0) < 0.01 else rate
 
 
@@ -98,7 +93,9 @@ def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
         composed = times(orientation[:, parent], q)
         orientation[:, joint] = np.where(good[:, None], orientation[:, joint], composed)
     typical_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
-    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * typical_ns)))
+    gap_s = 0.25  # without a pose: longer than that nobody knows how the hand went
+    gap_poses = 3.0  # of a source that is as slow as that all the time
+    return Motion(t_ns, position, orientation, ~usable, int(max(gap_s * 1e9, gap_poses * typical_ns)))
 
 
 def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
@@ -116,7 +113,8 @@ def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
     order = order[np.append(np.diff(t_ns[order]) > 0, True)]
     t_ns, position, orientation, valid = (column[order] for column in (t_ns, position, orientation, valid))
     length = np.sqrt(np.vecdot(orientation, orientation))
-    usable = valid & np.isfinite(position).all(axis=2) & (length > _UNIT)  # NaN is not longer than anything
+    unit = 0.5  # a quaternion shorter than that is none
+    usable = valid & np.isfinite(position).all(axis=2) & (length > unit)  # NaN is not longer than anything
     position = np.where(usable[..., None], position, 0.0)
     orientation = np.where(usable[..., None], orientation, [1.0, 0.0, 0.0, 0.0])
     return t_ns, position, orientation / np.where(usable, length, 1.0)[..., None], usable
@@ -193,7 +191,8 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
         RecordingError: That would be more frames than fit in memory.
     """
     count = 1 + int((motion.t_ns[-1] - motion.t_ns[0]) * 1e-9 * rate_hz + 1e-6)
-    most = min(FREE_FRAMES + FRAMES_OF_POSE * len(motion), MOST_FRAMES)
+    most_frames = 1_000_000  # 4.6 hours at 60 Hz
+    most = min(FREE_FRAMES + FRAMES_OF_POSE * len(motion), most_frames)
     if count > most:
         raise RecordingError(
             f"{count} frames at {rate_hz:g} Hz, at most {most} of {len(motion)} poses: export one part, with --from and"
@@ -227,7 +226,8 @@ def slerp(first: Float, second: Float, share: Float) -> Float:
     cosine = np.vecdot(first, second)
     second = np.where(cosine[..., None] < 0.0, -second, second)
     angle = np.arccos(np.minimum(np.abs(cosine), 1.0))
-    near = angle < _STRAIGHT
+    straight = 1e-7
+    near = angle < straight
     sine = np.where(near, 1.0, np.sin(angle))
     a = np.where(near, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
     b = np.where(near, share, np.sin(share * angle) / sine)

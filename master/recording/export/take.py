@@ -38,7 +38,6 @@ from master.recording.files import recorded_rigs, unpack
 
 _Kind = TypeVar("_Kind", HandPose, ObjectPose, Contact, Gesture, MarkerDetections, WristDetections)
 _BATCH = 1024
-_LATE_NS = 5_000_000_000
 
 
 class Take(Protocol):
@@ -274,8 +273,9 @@ class MessageTake:
     def _read(self, stream: str, kind: type[_Kind]) -> Iterator[_Kind]:
         """The messages of a stream whose own time is in the window."""
         first, last = self._window.span_ns(self.begin_t_ns)
+        late_ns = 5_000_000_000
         # A message comes after its time, by no more than this in a run that is worth anything.
-        until = None if last is None else last + _LATE_NS
+        until = None if last is None else last + late_ns
         for one in self._recording.read([stream], first, until):
             message = one.message
             if not isinstance(message, kind):

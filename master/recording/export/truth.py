@@ -22,7 +22,6 @@ from master.outputs.poses import Poses
 from master.recording.export.take import Take, open_take
 from master.recording.export.window import Window
 
-_ENOUGH = 0.1  # of the valid joints: if more are TRACKED, frame and clock are fitted by these alone
 _SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is stated
 
 
@@ -148,7 +147,8 @@ def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) ->
     """
     valid = poses.valid & known(poses.position_m)
     sure = valid & poses.tracked
-    used = sure if sure.sum() > _ENOUGH * valid.sum() else valid
+    enough = 0.1  # of the valid joints: if more are TRACKED, frame and clock are fitted by these alone
+    used = sure if sure.sum() > enough * valid.sum() else valid
     joints = np.where(used[..., None], poses.position_m, np.nan)
     both = [name for name in JOINTS if name in motion.names]
     marked = [name for name in marker_names if name in motion.names]
