@@ -131,8 +131,9 @@ def lead_s(processes: int, load: float) -> float:
 
     It depends on the number of processes and on the `load` of others that want to run.
     """
-    # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
-    # one in which cameras already look at the hand, which does not move yet, so that the light is known and a hand found.
+    # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else
+    # runs, and one in which cameras already look at the hand, which does not move yet, so that the light is known
+    # and a hand found.
     # Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
     ready_core_s, least_s, most_s = 2.0, 4.0, 20.0
     ready = ready_core_s * (processes + load) / (os.cpu_count() or 1)

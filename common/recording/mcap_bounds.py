@@ -7,22 +7,30 @@ one pass over a file unpacks, by the size of the file: a writer of ours leaves 1
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from common.errors import RecordingError
 
-# Unpacked: a writer closes a chunk with the message that takes it past its target. Ours is 512 KiB, that of the tools
-# for MCAP that cut and convert files up to 4 MiB; a message has less than 1 MiB.
-CHUNK_BYTES = (4 << 20) + (1 << 20)
-CHUNK_RECORDS = CHUNK_BYTES // 70  # 74,898: a message of ours takes 70 bytes or more
-CHANNEL_BYTES = 4096
-CHANNELS = 1024
-ATTACHMENT_BYTES = 4 << 20  # of one file of calibration
-ATTACHED_BYTES = 64 << 20  # of all
-ATTACHMENTS = 256
-METADATA_BYTES = 16 << 10  # of one; the names of 32 cameras and of their folders take 6 KiB
-METADATA = 16
-SUMMARY_BYTES = 64 << 20  # a day of chunks takes 26 MiB
-AROUND_BYTES = 1024  # of a record, beside its content; and all that a header may have
+
+class McapBounds(NamedTuple):
+    """Most bytes and entries of each part of a recording."""
+
+    # Unpacked: a writer closes a chunk with the message that takes it past its target. Ours is 512 KiB, that of the
+    # tools for MCAP that cut and convert files up to 4 MiB; a message has less than 1 MiB.
+    chunk_bytes: int = (4 << 20) + (1 << 20)
+    channel_bytes: int = 4096
+    channels: int = 1024
+    attachment_bytes: int = 4 << 20  # of one file of calibration
+    attached_bytes: int = 64 << 20  # of all
+    attachments: int = 256
+    metadata_bytes: int = 16 << 10  # of one; the names of 32 cameras and of their folders take 6 KiB
+    metadata: int = 16
+    summary_bytes: int = 64 << 20  # a day of chunks takes 26 MiB
+    around_bytes: int = 1024  # of a record, beside its content; and all that a header may have
+
+
+BOUNDS = McapBounds()
+CHUNK_RECORDS = BOUNDS.chunk_bytes // 70  # 74,898: a message of ours takes 70 bytes or more
 
 BEYOND = "more than a file of this size can hold"
 

@@ -17,14 +17,7 @@ from mcap.records import Channel, Chunk
 
 from common.errors import RecordingError
 from common.messages.parts import MAX_TIME_NS
-from common.recording.mcap_bounds import (
-    BEYOND,
-    CHANNEL_BYTES,
-    CHANNELS,
-    CHUNK_BYTES,
-    CHUNK_RECORDS,
-    WorkBudget,
-)
+from common.recording.mcap_bounds import BEYOND, BOUNDS, CHUNK_RECORDS, WorkBudget
 
 HEAD = struct.Struct("<BQ")  # of every record: what it is, and the length of what follows
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, MemoryError, OverflowError, RuntimeError)
@@ -74,8 +67,8 @@ def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
         raise RecordingError(f"compression {chunk.compression[:16]!r}: must be zstd or none")
     packed, claimed = chunk.compression == "zstd", chunk.uncompressed_size
     size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
-    if max(size, claimed) > CHUNK_BYTES:
-        raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {CHUNK_BYTES}")
+    if max(size, claimed) > BOUNDS.chunk_bytes:
+        raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {BOUNDS.chunk_bytes}")
     if size not in (
         claimed,
         -1,
@@ -107,8 +100,8 @@ def _traversed(content: bytes, budget: WorkBudget) -> OpenedChunk:
             elif opcode == Opcode.CHANNEL:
                 number = int.from_bytes(content[at : at + min(length, 2)], "little")
                 opened.channels.setdefault(number, content[at : at + length])
-                if len(opened.channels) > CHANNELS:
-                    raise RecordingError(f"more than {CHANNELS} channels")
+                if len(opened.channels) > BOUNDS.channels:
+                    raise RecordingError(f"more than {BOUNDS.channels} channels")
             at += length
     finally:
         budget.take_records(count)  # also of a chunk that is refused: it was work
@@ -130,8 +123,8 @@ def read_channel(data: bytes) -> Channel:
     Raises:
         RecordingError: It is too long or broken.
     """
-    if len(data) > CHANNEL_BYTES:
-        raise RecordingError(f"a channel of {len(data)} bytes, at most {CHANNEL_BYTES}")
+    if len(data) > BOUNDS.channel_bytes:
+        raise RecordingError(f"a channel of {len(data)} bytes, at most {BOUNDS.channel_bytes}")
     try:
         return Channel.read(stream(data))
     except BROKEN as error:

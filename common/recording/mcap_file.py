@@ -33,19 +33,7 @@ from mcap.records import (
 
 from common.errors import RecordingError
 from common.messages.parts import MAX_TIME_NS
-from common.recording.mcap_bounds import (
-    AROUND_BYTES,
-    ATTACHED_BYTES,
-    ATTACHMENT_BYTES,
-    ATTACHMENTS,
-    CHANNELS,
-    CHUNK_BYTES,
-    METADATA,
-    METADATA_BYTES,
-    SUMMARY_BYTES,
-    Losses,
-    WorkBudget,
-)
+from common.recording.mcap_bounds import BOUNDS, Losses, WorkBudget
 from common.recording.mcap_chunk import (
     BROKEN,
     HEAD,
@@ -105,8 +93,8 @@ class McapContent:
         """
         if number in self.channels:
             return
-        if len(self.channels) >= CHANNELS:
-            raise RecordingError(f"more than {CHANNELS} channels")
+        if len(self.channels) >= BOUNDS.channels:
+            raise RecordingError(f"more than {BOUNDS.channels} channels")
         self.channels[number] = read_channel(data)
 
 
@@ -175,7 +163,7 @@ def _bytes(fd: int, length: int, at: int) -> bytes:
 
 
 def _header(fd: int, place: _Place | None) -> Header | None:
-    if place is None or place[0] != Opcode.HEADER or place[2] > AROUND_BYTES:
+    if place is None or place[0] != Opcode.HEADER or place[2] > BOUNDS.around_bytes:
         return None
     try:
         return Header.read(stream(os.pread(fd, place[2], place[1])))
@@ -193,7 +181,7 @@ def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
         return None
     footer = Footer(*_FOOTER.unpack(tail[9:29]))
     length = size - 37 - footer.summary_start
-    summary = _bytes(fd, length, footer.summary_start) if length <= SUMMARY_BYTES else b""
+    summary = _bytes(fd, length, footer.summary_start) if length <= BOUNDS.summary_bytes else b""
     if not summary or zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
         return None
     content, budget = McapContent(profile), WorkBudget(size)
@@ -264,8 +252,8 @@ def _take_chunk(content: McapContent, at: int, length: int, opened: OpenedChunk 
 def _opened(fd: int, at: int, length: int, budget: WorkBudget, losses: Losses) -> OpenedChunk | None:
     """The chunk whose content stands there; None: it is lost."""
     try:
-        if not 0 < length <= CHUNK_BYTES + AROUND_BYTES:
-            raise RecordingError(f"{length} bytes, at most {CHUNK_BYTES}")
+        if not 0 < length <= BOUNDS.chunk_bytes + BOUNDS.around_bytes:
+            raise RecordingError(f"{length} bytes, at most {BOUNDS.chunk_bytes}")
         budget.take(length)
         return open_chunk(_bytes(fd, length, at), budget)
     except RecordingError as error:
@@ -276,11 +264,13 @@ def _opened(fd: int, at: int, length: int, budget: WorkBudget, losses: Losses) -
 def _take_attachment(content: McapContent, fd: int, at: int, length: int, budget: WorkBudget) -> None:
     """Keep an attachment whose check sum fits; the library does not look at it."""
     try:
-        if len(content.attachments) >= ATTACHMENTS:
-            raise RecordingError(f"there are {ATTACHMENTS} already")
+        if len(content.attachments) >= BOUNDS.attachments:
+            raise RecordingError(f"there are {BOUNDS.attachments} already")
         attached = sum(len(one.data) for one in content.attachments)
-        if length > min(ATTACHMENT_BYTES, ATTACHED_BYTES - attached) + AROUND_BYTES:
-            raise RecordingError(f"{length} bytes, at most {ATTACHMENT_BYTES}, and {ATTACHED_BYTES} of all")
+        if length > min(BOUNDS.attachment_bytes, BOUNDS.attached_bytes - attached) + BOUNDS.around_bytes:
+            raise RecordingError(
+                f"{length} bytes, at most {BOUNDS.attachment_bytes}, and {BOUNDS.attached_bytes} of all"
+            )
         budget.take(max(length, 0))
         data = _bytes(fd, length, at)
         if len(data) <= 4 or zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
@@ -297,10 +287,10 @@ def _take_metadata(content: McapContent, fd: int, at: int, length: int, budget: 
     """
     try:
         content.metadata_met += 1  # not by their names: one may stand in the index many times
-        if content.metadata_met > METADATA:
-            raise RecordingError(f"there are {METADATA} already")
-        if length > METADATA_BYTES:
-            raise RecordingError(f"{length} bytes, at most {METADATA_BYTES}")
+        if content.metadata_met > BOUNDS.metadata:
+            raise RecordingError(f"there are {BOUNDS.metadata} already")
+        if length > BOUNDS.metadata_bytes:
+            raise RecordingError(f"{length} bytes, at most {BOUNDS.metadata_bytes}")
         budget.take(max(length, 0))
         one = Metadata.read(stream(_bytes(fd, length, at)))
         if not "".join([one.name, *one.metadata, *one.metadata.values()]).isprintable():

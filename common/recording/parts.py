@@ -19,7 +19,7 @@ from common.messages.parts import MAX_TIME_NS
 from common.messages.sensed import Detections, ImuSample, TagDetections, TrackerPose
 from common.messages.state import Backlog
 from common.messages.streams import STREAMS, sender_of
-from common.recording.mcap_bounds import ATTACHMENT_BYTES, ATTACHMENTS
+from common.recording.mcap_bounds import BOUNDS
 
 
 def check_files(where: Path, files: Mapping[str, bytes]) -> None:
@@ -34,10 +34,12 @@ def check_files(where: Path, files: Mapping[str, bytes]) -> None:
             is_plain(folder) and slash and file.endswith(".json") and is_plain(file.removesuffix(".json"))
         ):
             raise RecordingError(f"{where}: its file {name!r}: must be FOLDER/NAME.json, each name {PLAIN}")
-        if len(data) > ATTACHMENT_BYTES:
-            raise RecordingError(f"{where}: its file {name!r}: {len(data)} bytes, at most {ATTACHMENT_BYTES}")
-    if len(files) > ATTACHMENTS:
-        raise RecordingError(f"{where}: {len(files)} files of calibration, at most {ATTACHMENTS}")
+        if len(data) > BOUNDS.attachment_bytes:
+            raise RecordingError(
+                f"{where}: its file {name!r}: {len(data)} bytes, at most {BOUNDS.attachment_bytes}"
+            )
+    if len(files) > BOUNDS.attachments:
+        raise RecordingError(f"{where}: {len(files)} files of calibration, at most {BOUNDS.attachments}")
 
 
 def channel_names(where: Path, channels: Iterable[Channel]) -> dict[int, tuple[str, str]]:

@@ -10,6 +10,7 @@ camera. Not modelled: motion blur and rolling shutter, since a board is measured
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,12 +23,22 @@ from common.geometry.transforms import invert
 from common.sim.desk import LENS_SIGMA_PX, NoiseTiles
 from common.sim.light import Float32, SrgbTables
 
-COLUMNS, ROWS = 9, 6  # inner corners
-SQUARE_M = 0.025
-TEXELS_PER_M = 8000.0
-FINE = 3  # rays per pixel and axis
-POSES = 24
-HELD_S, MOVED_S = 1.6, 0.6
+
+class BoardSettings(NamedTuple):
+    """Board of the simulated calibration, and how it is held."""
+
+    # inner corners
+    columns: int = 9
+    rows: int = 6
+    square_m: float = 0.025
+    texels_per_m: float = 8000.0
+    fine: int = 3  # rays per pixel and axis
+    poses: int = 24
+    held_s: float = 1.6
+    moved_s: float = 0.6
+
+
+BOARD = BoardSettings()
 TILT_RAD, ROLL_RAD = np.radians(38.0), np.radians(25.0)
 
 
@@ -101,11 +112,11 @@ class BoardScene:
 
         The poses repeat.
         """
-        count, step_s = len(self.poses), HELD_S + MOVED_S
+        count, step_s = len(self.poses), BOARD.held_s + BOARD.moved_s
         k = int(max(t_s, 0.0) // step_s)
-        past = max(t_s, 0.0) - k * step_s - HELD_S
+        past = max(t_s, 0.0) - k * step_s - BOARD.held_s
         now, then = self.poses[k % count], self.poses[(k + 1) % count]
-        return now if past <= 0.0 else _between(now, then, past / MOVED_S)
+        return now if past <= 0.0 else _between(now, then, past / BOARD.moved_s)
 
     def corners_m(self) -> Float:
         """The inner corners (54, 3) [m] in the board's frame, row by row."""
@@ -114,8 +125,8 @@ class BoardScene:
 
 def board_corners() -> Float:
     """Inner corners (ROWS * COLUMNS, 3) [m], row by row, board frame."""
-    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64) * SQUARE_M
+    x, y = np.meshgrid(np.arange(BOARD.columns), np.arange(BOARD.rows))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64) * BOARD.square_m
 
 
 class BoardRenderer:
@@ -132,7 +143,7 @@ class BoardRenderer:
         """
         self._scene, self._optics = scene, scene.optics(camera)
         height, width = self._optics.height_px, self._optics.width_px
-        fine = (np.arange(FINE) + 0.5) / FINE - 0.5
+        fine = (np.arange(BOARD.fine) + 0.5) / BOARD.fine - 0.5
         u = (np.arange(width)[:, None] + fine).ravel()
         v = (np.arange(height)[:, None] + fine).ravel()
         uv = np.stack(np.meshgrid(u, v), axis=-1)
@@ -167,7 +178,7 @@ class BoardRenderer:
         """Image (H, W, 3) BGR without noise of a board at T (4, 4) [m], camera frame."""
         # board (x, y, 1) -> ray: the columns of rotation and translation of a plane (Hartley & Zisserman, 8.1.1)
         to_board = np.linalg.inv(T[:3, [0, 1, 3]])
-        texels = np.diag([TEXELS_PER_M, TEXELS_PER_M, 1.0]) @ to_board
+        texels = np.diag([BOARD.texels_per_m, BOARD.texels_per_m, 1.0]) @ to_board
         texels[:2] += self._print.origin[:, None] * texels[2]
         u, v = cv2.split(cv2.perspectiveTransform(self._xy, texels))
         shade = 0.55 + 0.45 * abs(float(T[2, 2]))
@@ -194,10 +205,10 @@ class BoardRenderer:
 
 def _printed() -> Print:
     """The board, a share of 1 being all light; its origin is the first inner corner."""
-    step = round(SQUARE_M * TEXELS_PER_M)
+    step = round(BOARD.square_m * BOARD.texels_per_m)
     margin_m = 0.0125  # white paper around the squares
-    margin = round(margin_m * TEXELS_PER_M)
-    y, x = np.indices(((ROWS + 1) * step, (COLUMNS + 1) * step)) // step
+    margin = round(margin_m * BOARD.texels_per_m)
+    y, x = np.indices(((BOARD.rows + 1) * step, (BOARD.columns + 1) * step)) // step
     white, black, wall = 0.62, 0.035, 0.10  # linear light
     squares = np.where((x + y) % 2 == 0, black, white).astype(np.float32)
     texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(white,))
@@ -216,13 +227,13 @@ def _poses(optics: list[CameraModel], seed: int) -> Float:
     """
     rng = np.random.default_rng([seed, 5])
     found: list[Float] = []
-    for _ in range(200 * POSES):
+    for _ in range(200 * BOARD.poses):
         first_camera = optics[len(found) % len(optics)]
         T = first_camera.T_rig_camera @ _before(first_camera, rng)
         seen = [_sees(camera, T) for camera in optics]
         if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
             found.append(T)
-        if len(found) == POSES:
+        if len(found) == BOARD.poses:
             return np.stack(found)
     raise CalibrationError("scene board: the cameras of this rig have no view in common that holds a board")
 
@@ -249,7 +260,10 @@ def _sees(camera: CameraModel, T: Float) -> bool:
 
     With half a square around the corners.
     """
-    rim = np.array([[-1, -1, 0], [COLUMNS, -1, 0], [COLUMNS, ROWS, 0], [-1, ROWS, 0]]) * SQUARE_M
+    rim = (
+        np.array([[-1, -1, 0], [BOARD.columns, -1, 0], [BOARD.columns, BOARD.rows, 0], [-1, BOARD.rows, 0]])
+        * BOARD.square_m
+    )
     uv = camera.project(rim @ T[:3, :3].T + T[:3, 3])
     inside = (uv > 2.0) & (uv < np.array([camera.width_px, camera.height_px]) - 3.0)
     return bool(inside.all())

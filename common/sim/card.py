@@ -13,7 +13,7 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry.srgb import to_linear
 from common.geometry.transforms import axis_rotation
-from common.sim.board import TEXELS_PER_M, BoardScene, Print
+from common.sim.board import BOARD, BoardScene, Print
 from common.sim.light import DESK_LINEAR_RGB, TO_LIGHT_RIG, face_shade, marker_colour
 
 MARKER = "index"
@@ -52,7 +52,7 @@ class CardScene(BoardScene):
 
     def printed(self) -> Print:
         """As `BoardScene`."""
-        columns, rows = round(WIDTH_M * TEXELS_PER_M), round(HEIGHT_M * TEXELS_PER_M)
+        columns, rows = round(WIDTH_M * BOARD.texels_per_m), round(HEIGHT_M * BOARD.texels_per_m)
         facing = -float(TO_LIGHT_RIG @ self.poses[0, :3, 2])
         colour = np.array(face_shade(marker_colour(MARKER), facing)) / 255.0
         return Print(

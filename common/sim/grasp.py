@@ -12,6 +12,8 @@ The wrist is a little flexed round the bar, and bends by up to 7 degrees either 
 sides while the bar is turned; by 3 either way else.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from common.arrays import Float
@@ -32,10 +34,24 @@ from common.sim.motion import (
 
 ROUNDS = 5
 ROUND_S = PERIOD_S / ROUNDS
-# Seconds since the beginning of a round, before its pace.
-LEAVE_S, ARRIVE_S, CLOSED_S = 0.8, 2.4, 3.3
-LIFT_S, LIFTED_S, LOWER_S = 3.7, 4.8, 8.4
-RELEASE_S, OPEN_S, BACK_S = 9.8, 10.5, 11.8
+
+
+class GraspTiming(NamedTuple):
+    """Times [s] within one round of grasping."""
+
+    # Seconds since the beginning of a round, before its pace.
+    leave_s: float = 0.8
+    arrive_s: float = 2.4
+    closed_s: float = 3.3
+    lift_s: float = 3.7
+    lifted_s: float = 4.8
+    lower_s: float = 8.4
+    release_s: float = 9.8
+    open_s: float = 10.5
+    back_s: float = 11.8
+
+
+TIMING = GraspTiming()
 PACE = (0.92, 1.0)
 LIFT_M = (0.08, 0.12)
 PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
@@ -106,16 +122,16 @@ class Grasp:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         k, s = self.round_at(t_s)
         wobble, drift, drift_rotation = self._drift.at(max(t_s, 0.0) % PERIOD_S)
-        near = _between(s, LEAVE_S, ARRIVE_S, OPEN_S, BACK_S)
-        ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, OPEN_S + 0.3, BACK_S)
-        closed = _between(s, ARRIVE_S, CLOSED_S, RELEASE_S, OPEN_S)
+        near = _between(s, TIMING.leave_s, TIMING.arrive_s, TIMING.open_s, TIMING.back_s)
+        ready = _between(s, TIMING.leave_s, TIMING.arrive_s - 0.5, TIMING.open_s + 0.3, TIMING.back_s)
+        closed = _between(s, TIMING.arrive_s, TIMING.closed_s, TIMING.release_s, TIMING.open_s)
         lowered_s = 9.5
-        lifted = _between(s, LIFT_S, LIFTED_S, LOWER_S, lowered_s)
+        lifted = _between(s, TIMING.lift_s, TIMING.lifted_s, TIMING.lower_s, lowered_s)
         posture = self._rest + ready * (self._open - self._rest) + closed * (self._grip - self._open)
         angles = angles_of(self._model, posture, wobble + closed * (self._grip_wobble - wobble))
         still_s = 0.5  # in which the hand comes to stand still, and moves again
-        still = window(s, ARRIVE_S - still_s, LIFT_S + still_s, still_s)
-        still += window(s, lowered_s - still_s, OPEN_S + still_s, still_s)
+        still = window(s, TIMING.arrive_s - still_s, TIMING.lift_s + still_s, still_s)
+        still += window(s, lowered_s - still_s, TIMING.open_s + still_s, still_s)
         side = np.array([self._model.side_sign, 1.0, 1.0])
         shift = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
         shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
@@ -123,7 +139,7 @@ class Grasp:
         pose = base_pose(
             self._model, self._centre, shift, self._lean + rotation + (1.0 - still) * drift_rotation
         )
-        held = CLOSED_S <= s < RELEASE_S
+        held = TIMING.closed_s <= s < TIMING.release_s
         bar = (pose if held else self._T_grip) @ self._T_palm_object
         flexed_deg = 3.0
         wrist_angles = np.radians(
@@ -140,7 +156,7 @@ class Grasp:
         rotation, swing = np.zeros(3), np.zeros(2)
         for place in (0, 1):
             rotation_s, rotation_fade_s = 1.7, 0.3
-            start = LIFTED_S + 0.1 + place * rotation_s
+            start = TIMING.lifted_s + 0.1 + place * rotation_s
             if not start < s < start + rotation_s:
                 continue
             which = int(self._first[k]) ^ place

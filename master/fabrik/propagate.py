@@ -28,19 +28,31 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.kernels import inner, kernel
 
-HISTORY = 8
-OBSERVATIONS = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
-NEVER = -(2**63)
+
+class PropagationSettings(NamedTuple):
+    """Numbers of the propagation of markers to one epoch."""
+
+    history: int = 8
+    observations: int = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
+    never: int = -(2**63)
+    # what is farther away a frame later is another thing
+    leap_m_s: float = 5.0
+    leap_px: float = 5.0
+    # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to
+    # frame, and no mean removes it. New in each is at most this part of the variance that the slave states, and
+    # this much.
+    independent_share: float = 0.7
+    independent_px: float = 0.1
+    # An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much
+    # (98-99 %), half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %);
+    # this 93-97 %.
+    along: float = 0.75
+
+
+SETTINGS = PropagationSettings()
 # What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
 _SPEED_M_S = (0.01, 1.0, 1.0)
 _ACCELERATION_M_S2 = (0.3, 1.5, 15.0)
-_LEAP_M_S, _LEAP_PX = 5.0, 5.0  # what is farther away a frame later is another thing
-# Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
-# no mean removes it. New in each is at most this part of the variance that the slave states, and this much.
-_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1
-# An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much (98-99 %),
-# half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %); this 93-97 %.
-_ALONG = 0.75
 
 
 Reach = tuple[int, int, int, int]
@@ -87,14 +99,14 @@ def propagate(
         When the last frame that was used was handed to its slave [ns] (none: the epoch), and whether there are
         alternatives.
     """
-    used, track = np.empty(OBSERVATIONS, np.int64), np.empty((OBSERVATIONS, 2, 4))
+    used, track = np.empty(SETTINGS.observations, np.int64), np.empty((SETTINGS.observations, 2, 4))
     known, L, z = (
-        np.empty((OBSERVATIONS, 5)),
-        np.empty((OBSERVATIONS, OBSERVATIONS)),
-        np.empty((OBSERVATIONS, 4)),
+        np.empty((SETTINGS.observations, 5)),
+        np.empty((SETTINGS.observations, SETTINGS.observations)),
+        np.empty((SETTINGS.observations, 4)),
     )
-    fit, mixed = np.empty(6 + OBSERVATIONS), np.empty(6 + OBSERVATIONS)
-    ready_ns, alternatives = NEVER, False
+    fit, mixed = np.empty(6 + SETTINGS.observations), np.empty(6 + SETTINGS.observations)
+    ready_ns, alternatives = SETTINGS.never, False
     for c in range(len(history.total)):
         n = _around(history, c, t_ns, reach_ns, used)
         missing[c] = n == 0
@@ -106,7 +118,7 @@ def propagate(
             alternative = _read(history, c, m, t_ns, used, n, track)
             alternatives |= alternative
             if alternative:
-                _sort(track, n, _LEAP_M_S * scale)
+                _sort(track, n, SETTINGS.leap_m_s * scale)
             for i in range(2):
                 uv[i, c, m, 0] = uv[i, c, m, 1] = sigma[i, c, m] = nan
                 count = _select(track, n, i, scale, known) if alternative or i == 0 else 0
@@ -116,8 +128,8 @@ def propagate(
                     # Where independent noise would be amplified, so is that which is not new in each frame.
                     vary = mixed[3] + (_variance(track[0, i, 3]) - known[0, 4]) * max(gain, 1.0)
                     moved = t_sigma_s * t_sigma_s * (mixed[4] * mixed[4] + mixed[5] * mixed[5])
-                    sigma[i, c, m] = sqrt(vary + _ALONG * moved)
-    return t_ns if ready_ns == NEVER else ready_ns, alternatives
+                    sigma[i, c, m] = sqrt(vary + SETTINGS.along * moved)
+    return t_ns if ready_ns == SETTINGS.never else ready_ns, alternatives
 
 
 @inner
@@ -129,22 +141,22 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
     the first alone counts (two where there is none before), as if the others had not yet come: what comes out does not
     depend on how far a camera's messages ran ahead of another's.
     """
-    newest, oldest = history.total[c], max(history.total[c] - HISTORY, 0)
+    newest, oldest = history.total[c], max(history.total[c] - SETTINGS.history, 0)
     after = newest
-    while after > oldest and history.times_ns[c, (after - 1) % HISTORY, 0] >= t_ns:
+    while after > oldest and history.times_ns[c, (after - 1) % SETTINGS.history, 0] >= t_ns:
         after -= 1
     before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
-    while n < OBSERVATIONS and (before >= oldest or after < end):
+    while n < SETTINGS.observations and (before >= oldest or after < end):
         far_ns = 2**62
-        back_ns = t_ns - history.times_ns[c, before % HISTORY, 0] if before >= oldest else far_ns
-        ahead_ns = history.times_ns[c, after % HISTORY, 0] - t_ns if after < end else far_ns
+        back_ns = t_ns - history.times_ns[c, before % SETTINGS.history, 0] if before >= oldest else far_ns
+        ahead_ns = history.times_ns[c, after % SETTINGS.history, 0] - t_ns if after < end else far_ns
         if min(back_ns, ahead_ns) > reach_ns[n]:
             break
         if back_ns <= ahead_ns:
-            used[n] = before % HISTORY
+            used[n] = before % SETTINGS.history
             before -= 1
         else:
-            used[n] = after % HISTORY
+            used[n] = after % SETTINGS.history
             after += 1
         n += 1
     return n
@@ -206,7 +218,7 @@ def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> flo
     if nearest < 0:  # also where the place itself is NaN
         return nan
     distance = hypot(track[nearest, i, 0] - track[k, which, 0], track[nearest, i, 1] - track[k, which, 1])
-    return distance if distance <= _LEAP_PX + leap_px_s * away_s else inf
+    return distance if distance <= SETTINGS.leap_px + leap_px_s * away_s else inf
 
 
 @inner
@@ -224,11 +236,12 @@ def _select(track: Float, n: int, i: int, scale: float, known: Float) -> int:
     count = 0
     for k in range(n):
         u, v = track[k, i, 0] - track[0, i, 0], track[k, i, 1] - track[0, i, 1]
-        leap = _LEAP_PX + _LEAP_M_S * scale * abs(track[k, i, 2] - track[0, i, 2])
+        leap = SETTINGS.leap_px + SETTINGS.leap_m_s * scale * abs(track[k, i, 2] - track[0, i, 2])
         if u * u + v * v <= leap * leap:  # false for NaN
             known[count, 0], known[count, 1], known[count, 2], known[count, 3] = 1.0, u, v, track[k, i, 2]
             known[count, 4] = min(
-                _INDEPENDENT_SHARE * _variance(track[k, i, 3]), _INDEPENDENT_PX * _INDEPENDENT_PX
+                SETTINGS.independent_share * _variance(track[k, i, 3]),
+                SETTINGS.independent_px * SETTINGS.independent_px,
             )
             count += 1
     return count

@@ -25,7 +25,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
+from master.fabrik.propagate import SETTINGS, TrackHistory, propagate
 
 SILENT_FRAMES = 12
 
@@ -90,7 +90,7 @@ class FrameSync:
         self._deadline_ns, self._stale_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
         self._half_ns = [int(0.5e9 / rate) for rate in rates]
         self._slack_ns = self._half_ns if policy == "predict" else [0] * count
-        far_ns = int((OBSERVATIONS + 0.25) * period_ns) if continuous else -1
+        far_ns = int((SETTINGS.observations + 0.25) * period_ns) if continuous else -1
         near_ns = self._deadline_ns if continuous else self._deadline_ns // 2
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
         self._patience = SILENT_FRAMES * count
@@ -99,20 +99,20 @@ class FrameSync:
         reach_m = 0.5  # where hands are, for what a camera makes of their motion
         self._history = TrackHistory(
             np.zeros(count, np.int64),
-            np.full((count, HISTORY, 3), NEVER),
-            np.zeros((count, HISTORY)),
-            np.full((count, HISTORY, 6, markers), np.nan),
+            np.full((count, SETTINGS.history, 3), SETTINGS.never),
+            np.zeros((count, SETTINGS.history)),
+            np.full((count, SETTINGS.history, 6, markers), np.nan),
             np.array([model.row_time_ns for model in models], np.float64),
             np.array([model.matrix[0, 0] / reach_m for model in models]),
         )
-        self._newest_of = [NEVER] * count  # centre rows
+        self._newest_of = [SETTINGS.never] * count  # centre rows
         self._behind = [False] * count
         self._frames = 0  # of all cameras
         # How many those were at the last ones of each.
-        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=HISTORY) for _ in models)
+        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=SETTINGS.history) for _ in models)
         self._awaited = 0  # the camera that was waited for when an epoch was last asked for
         self._pending: deque[int] = deque()
-        self._newest_ns = self._last_ns = NEVER  # of all frames, of all epochs
+        self._newest_ns = self._last_ns = SETTINGS.never  # of all frames, of all epochs
         self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
@@ -162,7 +162,7 @@ class FrameSync:
     def _hold(self, c: int, centre_ns: int, message: MarkerDetections) -> None:
         """Copy a frame into its camera's ring."""
         total, times_ns, t_sigma_ns, all_marks, _, _ = self._history
-        slot = int(total[c]) % HISTORY
+        slot = int(total[c]) % SETTINGS.history
         total[c] += 1
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
         times_ns[c, slot, 2], t_sigma_ns[c, slot] = message.ready_t_ns, message.t_sigma_ns

@@ -20,7 +20,7 @@ from common.arrays import Float, Int
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
 from master.fabrik.blob_bias import LensShift
-from master.fabrik.propagate import HISTORY, OBSERVATIONS
+from master.fabrik.propagate import SETTINGS
 from master.fabrik.sync import SILENT_FRAMES
 from master.objects.features import Features
 
@@ -250,7 +250,7 @@ class Windows:
 
     def _at(self, t_ns: int, period_ns: int) -> Window:
         assert self._origin_ns is not None
-        reach_ns = round((OBSERVATIONS + 0.25) * period_ns)
+        reach_ns = round((SETTINGS.observations + 0.25) * period_ns)
         views = tuple(
             (_around(markers, t_ns, reach_ns), _around(tags, t_ns, reach_ns)) for markers, tags in self._seen
         )
@@ -261,7 +261,7 @@ class Windows:
 
 
 def _line() -> deque[ImageObservation]:
-    return deque(maxlen=HISTORY)
+    return deque(maxlen=SETTINGS.history)
 
 
 def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[ImageObservation, ...]:
@@ -271,6 +271,6 @@ def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[Im
     """
     known = list(line)
     before = sum(s.centre_ns < t_ns for s in known)
-    associated = known[max(before - OBSERVATIONS, 0) : max(before + 1, 2)]
+    associated = known[max(before - SETTINGS.observations, 0) : max(before + 1, 2)]
     near = [s for s in associated if abs(s.centre_ns - t_ns) <= reach_ns]
-    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[:OBSERVATIONS])
+    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[: SETTINGS.observations])

@@ -161,7 +161,7 @@ class V4l2Camera:
             return
         try:
             if self._streaming:
-                device.ioctl(abi.STREAMOFF, c.c_int(abi.CAPTURE))
+                device.ioctl(abi.STREAMOFF, c.c_int(abi.V4L2.capture))
         except OSError as error:
             _LOG.info("%s: was gone before it was stopped: %s", self._where, error.strerror)
         self._buffers.clear()
@@ -255,12 +255,12 @@ class V4l2Camera:
     def _check_capabilities(self, device: abi.Device) -> str:
         found = abi.Capability()
         device.ioctl(abi.QUERYCAP, found)
-        has = int(found.device_caps if found.capabilities & abi.CAP_DEVICE_CAPS else found.capabilities)
+        has = int(found.device_caps if found.capabilities & abi.V4L2.cap_device_caps else found.capabilities)
         name = found.card.decode("utf-8", "replace")
         if found.driver == b"uvcvideo":
             usb_sigma_ns, usb_clock_sigma_ns = 1.2e6, 0.3e6  # see above
             self._sigma_ns = usb_clock_sigma_ns if _usb_clock_is_used() else usb_sigma_ns
-        if not (has & abi.CAP_CAPTURE and has & abi.CAP_STREAMING):
+        if not (has & abi.V4L2.cap_capture and has & abi.V4L2.cap_streaming):
             raise CameraError(
                 f"{name} is no single-planar capture device (a USB camera has a second device for metadata; a Pi "
                 "camera is opened with --camera picamera2)"
@@ -284,7 +284,9 @@ class V4l2Camera:
 
     def _set_rate(self, device: abi.Device, camera: CameraCalibration) -> None:
         size, rate_hz = (camera.width_px, camera.height_px), camera.frame_rate_hz
-        parameters = abi.StreamParameters(type=abi.CAPTURE, numerator=1000, denominator=round(rate_hz * 1000))
+        parameters = abi.StreamParameters(
+            type=abi.V4L2.capture, numerator=1000, denominator=round(rate_hz * 1000)
+        )
         try:
             device.ioctl(abi.S_PARM, parameters)
         except OSError as error:
@@ -302,14 +304,14 @@ class V4l2Camera:
 
     def _stream(self, device: abi.Device) -> None:
         """Map the buffers, hand them to the driver and start."""
-        request = abi.RequestBuffers(count=BUFFERS, type=abi.CAPTURE, memory=abi.MMAP)
+        request = abi.RequestBuffers(count=BUFFERS, type=abi.V4L2.capture, memory=abi.V4L2.mmap)
         device.ioctl(abi.REQBUFS, request)
         for index in range(int(request.count)):
-            buffer = abi.Buffer(index=index, type=abi.CAPTURE, memory=abi.MMAP)
+            buffer = abi.Buffer(index=index, type=abi.V4L2.capture, memory=abi.V4L2.mmap)
             device.ioctl(abi.QUERYBUF, buffer)
             self._buffers.append(device.map(int(buffer.length), int(buffer.offset)))
             device.ioctl(abi.QBUF, buffer)
-        device.ioctl(abi.STREAMON, c.c_int(abi.CAPTURE))
+        device.ioctl(abi.STREAMON, c.c_int(abi.V4L2.capture))
         self._streaming = True
 
     def _settle(self, device: abi.Device) -> None:
@@ -344,7 +346,7 @@ class V4l2Camera:
             if newest is None:
                 continue
             stale = count >= len(self._buffers)  # the driver had no buffer left: nobody read for a while
-            damaged = bool(newest.flags & abi.BUF_ERROR) or newest.bytesused == 0
+            damaged = bool(newest.flags & abi.V4L2.buf_error) or newest.bytesused == 0
             image: Image | None = None
             if not stale and not damaged:
                 data = self._buffers[int(newest.index)][: int(newest.bytesused)]
@@ -372,14 +374,14 @@ class V4l2Camera:
         """
         stamp_ns = int(buffer.tv_sec) * 10**9 + int(buffer.tv_usec) * 1000
         if self._foreign is None:
-            monotonic = buffer.flags & abi.STAMP_CLOCK == abi.STAMP_MONOTONIC
+            monotonic = buffer.flags & abi.V4L2.stamp_clock == abi.V4L2.stamp_monotonic
             name = "monotonic" if monotonic else clock_of(stamp_ns)
             if name is None:
                 raise CameraError(f"its driver stamps frames with {stamp_ns} ns, on no known clock")
             self._foreign = ForeignClock(self._clock, system_clock(name))
         half_ns = round(self._calibration.exposure_us * 500.0)
         t_ns = self._foreign.to_own(stamp_ns)
-        if buffer.flags & abi.STAMP_SOURCE == abi.STAMP_START_OF_EXPOSURE:
+        if buffer.flags & abi.V4L2.stamp_source == abi.V4L2.stamp_start_of_exposure:
             return t_ns + half_ns
         return t_ns - round(self._calibration.height_px * self._calibration.row_time_us * 1e3) - half_ns
 
@@ -415,7 +417,7 @@ def _usb_clock_is_used() -> bool:
 
 def _take(device: abi.Device) -> abi.Buffer | None:
     """Dequeue a filled buffer, or None if there is none."""
-    buffer = abi.Buffer(type=abi.CAPTURE, memory=abi.MMAP)
+    buffer = abi.Buffer(type=abi.V4L2.capture, memory=abi.V4L2.mmap)
     try:
         device.ioctl(abi.DQBUF, buffer)
     except BlockingIOError:

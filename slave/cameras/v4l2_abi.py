@@ -14,24 +14,45 @@ import mmap
 import os
 import select
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
-MMAP = 1  # V4L2_MEMORY_MMAP
-FIELD_ANY, FIELD_NONE = 0, 1
-CAP_CAPTURE, CAP_STREAMING, CAP_DEVICE_CAPS = 0x1, 0x0400_0000, 0x8000_0000
-DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
-DEFAULT_RANGE, FULL_RANGE = (
-    0,
-    1,
-)  # V4L2_QUANTIZATION_DEFAULT, of YUV the full range where the colorspace is JPEG
-COLORSPACE_JPEG = 7
-BUF_ERROR = 0x40
-STAMP_CLOCK, STAMP_MONOTONIC = 0xE000, 0x2000
-STAMP_SOURCE, STAMP_START_OF_EXPOSURE = 0x7_0000, 0x1_0000
-CTRL_DISABLED, CTRL_GRABBED, CTRL_READ_ONLY, CTRL_INACTIVE, CTRL_WRITE_ONLY = 0x1, 0x2, 0x4, 0x10, 0x40
-CTRL_HAS_PAYLOAD, CTRL_NEXT = 0x100, 0x8000_0000
-TYPE_INTEGER, TYPE_BOOLEAN, TYPE_MENU, TYPE_INTEGER64, TYPE_BITMASK, TYPE_INTEGER_MENU = 1, 2, 3, 5, 8, 9
+
+class V4l2(NamedTuple):
+    """Numbers of the kernel's interface (linux/videodev2.h)."""
+
+    capture: int = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+    mmap: int = 1  # V4L2_MEMORY_MMAP
+    field_any: int = 0
+    field_none: int = 1
+    cap_capture: int = 0x1
+    cap_streaming: int = 0x0400_0000
+    cap_device_caps: int = 0x8000_0000
+    discrete: int = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
+    # V4L2_QUANTIZATION_DEFAULT, of YUV the full range where the colorspace is JPEG
+    default_range: int = 0
+    full_range: int = 1
+    colorspace_jpeg: int = 7
+    buf_error: int = 0x40
+    stamp_clock: int = 0xE000
+    stamp_monotonic: int = 0x2000
+    stamp_source: int = 0x7_0000
+    stamp_start_of_exposure: int = 0x1_0000
+    ctrl_disabled: int = 0x1
+    ctrl_grabbed: int = 0x2
+    ctrl_read_only: int = 0x4
+    ctrl_inactive: int = 0x10
+    ctrl_write_only: int = 0x40
+    ctrl_has_payload: int = 0x100
+    ctrl_next: int = 0x8000_0000
+    type_integer: int = 1
+    type_boolean: int = 2
+    type_menu: int = 3
+    type_integer64: int = 5
+    type_bitmask: int = 8
+    type_integer_menu: int = 9
+
+
+V4L2 = V4l2()
 
 
 def _words(*names: str) -> list[tuple[str, type[c.c_uint32]]]:

@@ -21,27 +21,17 @@ from common.errors import CameraError
 from slave.cameras.grey import Pixels
 from slave.cameras.settings import Setting
 from slave.cameras.v4l2_abi import (
-    CTRL_DISABLED,
-    CTRL_HAS_PAYLOAD,
-    CTRL_NEXT,
-    CTRL_READ_ONLY,
-    CTRL_WRITE_ONLY,
     G_EXT_CTRLS,
     QUERY_EXT_CTRL,
     QUERYMENU,
     S_EXT_CTRLS,
-    TYPE_BITMASK,
-    TYPE_BOOLEAN,
-    TYPE_INTEGER,
-    TYPE_INTEGER64,
-    TYPE_INTEGER_MENU,
-    TYPE_MENU,
     ControlValue,
     ControlValues,
     Device,
     QueryControl,
     QueryMenu,
 )
+from slave.cameras.v4l2_abi import V4L2 as V4L2_ABI
 
 EXPOSURE = "exposure_time_absolute"
 EXPOSURE_UNIT_US = 100.0
@@ -90,7 +80,14 @@ NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "white_balance": (("white_balance_temperature",), ("red_balance", "blue_balance")),
 }
 FILE_KEYS = {"exposure": "exposure_us", "gain": "analogue_gain", "white_balance": "colour_gains"}
-NUMERIC = {TYPE_INTEGER, TYPE_BOOLEAN, TYPE_MENU, TYPE_INTEGER64, TYPE_BITMASK, TYPE_INTEGER_MENU}
+NUMERIC = {
+    V4L2_ABI.type_integer,
+    V4L2_ABI.type_boolean,
+    V4L2_ABI.type_menu,
+    V4L2_ABI.type_integer64,
+    V4L2_ABI.type_bitmask,
+    V4L2_ABI.type_integer_menu,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +135,7 @@ def read_controls(device: Device) -> dict[str, Control]:
     found: dict[str, Control] = {}
     number = 0
     while True:
-        query = QueryControl(id=number | CTRL_NEXT)
+        query = QueryControl(id=number | V4L2_ABI.ctrl_next)
         try:
             device.ioctl(QUERY_EXT_CTRL, query)
         except OSError as error:
@@ -146,10 +143,19 @@ def read_controls(device: Device) -> dict[str, Control]:
                 return found
             raise
         number = int(query.id)
-        useless = CTRL_DISABLED | CTRL_READ_ONLY | CTRL_WRITE_ONLY | CTRL_HAS_PAYLOAD
+        useless = (
+            V4L2_ABI.ctrl_disabled
+            | V4L2_ABI.ctrl_read_only
+            | V4L2_ABI.ctrl_write_only
+            | V4L2_ABI.ctrl_has_payload
+        )
         if query.type in NUMERIC and not query.flags & useless:
             name = NAMES.get(number) or plain_name(query.name.decode("ascii", "replace"))
-            menu = _menu(device, query) if query.type in (TYPE_MENU, TYPE_INTEGER_MENU) else None
+            menu = (
+                _menu(device, query)
+                if query.type in (V4L2_ABI.type_menu, V4L2_ABI.type_integer_menu)
+                else None
+            )
             low, high, step = int(query.minimum), int(query.maximum), max(int(query.step), 1)
             found[name] = Control(number, name, int(query.type), low, high, step, menu)
 
@@ -167,7 +173,9 @@ def _menu(device: Device, query: QueryControl) -> dict[int, str]:
         label = bytes(entry.name)
         number = str(int.from_bytes(label[:8], "little", signed=True))
         found[index] = (
-            number if query.type == TYPE_INTEGER_MENU else label.split(b"\0")[0].decode("ascii", "replace")
+            number
+            if query.type == V4L2_ABI.type_integer_menu
+            else label.split(b"\0")[0].decode("ascii", "replace")
         )
     return found
 
@@ -275,7 +283,7 @@ def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Se
         control = controls[setting.name]
         value = control.nearest(setting.wanted[0])
         values, one = _one(control)
-        if control.type == TYPE_INTEGER64:
+        if control.type == V4L2_ABI.type_integer64:
             one.of.value64 = value
         else:
             one.of.value = value
@@ -299,7 +307,7 @@ def read_back(device: Device, controls: Mapping[str, Control], settings: Iterabl
         control = controls[setting.name]
         values, one = _one(control)
         device.ioctl(G_EXT_CTRLS, values)
-        found[setting.name] = int(one.of.value64 if control.type == TYPE_INTEGER64 else one.of.value)
+        found[setting.name] = int(one.of.value64 if control.type == V4L2_ABI.type_integer64 else one.of.value)
     return found
 
 

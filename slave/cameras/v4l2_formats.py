@@ -20,15 +20,9 @@ from common.errors import CameraError, PictureError
 from common.recording.pictures import decode
 from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma
 from slave.cameras.v4l2_abi import (
-    CAPTURE,
-    COLORSPACE_JPEG,
-    DEFAULT_RANGE,
-    DISCRETE,
     ENUM_FMT,
     ENUM_FRAMEINTERVALS,
     ENUM_FRAMESIZES,
-    FIELD_NONE,
-    FULL_RANGE,
     S_FMT,
     Device,
     Format,
@@ -38,6 +32,7 @@ from slave.cameras.v4l2_abi import (
     fourcc,
     fourcc_text,
 )
+from slave.cameras.v4l2_abi import V4L2 as V4L2_ABI
 
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
@@ -97,7 +92,9 @@ def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
     Of a continuous range of sizes, its ends and, if within, the wanted size [px] are returned.
     """
     offers: list[Offer] = []
-    for description in _enumerate(device, ENUM_FMT, lambda i: FormatDescription(index=i, type=CAPTURE)):
+    for description in _enumerate(
+        device, ENUM_FMT, lambda i: FormatDescription(index=i, type=V4L2_ABI.capture)
+    ):
         pixel_format = int(description.pixelformat)
         for size in _sizes(device, pixel_format, wanted):
             offers.append(_with_rates(device, pixel_format, size))
@@ -177,16 +174,16 @@ def set_format(device: Device, offer: Offer, pixels: Pixels) -> Layout:
         CameraError: Something else.
         OSError: The driver refuses.
     """
-    asked = Format(type=CAPTURE)
+    asked = Format(type=V4L2_ABI.capture)
     pix = asked.fmt.pix
     pix.width, pix.height = offer.size
-    pix.pixelformat, pix.field = offer.pixel_format, FIELD_NONE
+    pix.pixelformat, pix.field = offer.pixel_format, V4L2_ABI.field_none
     device.ioctl(S_FMT, asked)
     name = fourcc_text(pix.pixelformat)
     if (pix.width, pix.height, pix.pixelformat) != (*offer.size, offer.pixel_format):
         raise CameraError(f"format: wanted {offer.text()}, got {name} {pix.width}x{pix.height}")
-    of_jpeg = pix.quantization == DEFAULT_RANGE and pix.colorspace == COLORSPACE_JPEG
-    full_range = of_jpeg or pix.quantization == FULL_RANGE
+    of_jpeg = pix.quantization == V4L2_ABI.default_range and pix.colorspace == V4L2_ABI.colorspace_jpeg
+    full_range = of_jpeg or pix.quantization == V4L2_ABI.full_range
     return Layout(pixels, name, offer.size, int(pix.bytesperline), full_range)
 
 
@@ -225,7 +222,7 @@ def _sizes(device: Device, pixel_format: int, wanted: tuple[int, int]) -> list[t
     for entry in _enumerate(
         device, ENUM_FRAMESIZES, lambda i: FrameSizes(index=i, pixel_format=pixel_format)
     ):
-        if entry.type == DISCRETE:
+        if entry.type == V4L2_ABI.discrete:
             found.append((int(entry.size[0]), int(entry.size[1])))
             continue
         low_w, high_w, step_w, low_h, high_h, step_h = (int(value) for value in entry.size)
@@ -248,7 +245,7 @@ def _with_rates(device: Device, pixel_format: int, size: tuple[int, int]) -> Off
         lambda i: FrameIntervals(index=i, pixel_format=pixel_format, width=width, height=height),
     ):
         values = [int(value) for value in entry.interval]
-        if entry.type != DISCRETE:
+        if entry.type != V4L2_ABI.discrete:
             slowest, fastest = _rate(values[2], values[3]), _rate(values[0], values[1])
             return Offer(pixel_format, size, (slowest, fastest), continuous=True)
         rates.append(_rate(values[0], values[1]))

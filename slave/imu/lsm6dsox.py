@@ -174,15 +174,15 @@ class Lsm6dsoxImu:
     def _begin(self, rate: Rate) -> float:
         """Set it up; how much faster than nominal its clock runs."""
         identity = self._get(Register.WHO_AM_I)[0]
-        if identity != chip.IDENTITY:
+        if identity != chip.FIFO.identity:
             other = chip.OTHERS.get(identity, "another part")
             raise ImuError(
-                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {chip.IDENTITY:#04x}"
+                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {chip.FIFO.identity:#04x}"
             )
-        self._put(Register.CTRL3_C, chip.SW_RESET)
+        self._put(Register.CTRL3_C, chip.FIFO.sw_reset)
         reset_polls = 20
         for _ in range(reset_polls):
-            if not self._get(Register.CTRL3_C)[0] & chip.SW_RESET:
+            if not self._get(Register.CTRL3_C)[0] & chip.FIFO.sw_reset:
                 break
             self._stop.wait(POLL_S)
         for register, value in chip.settings(rate).items():
@@ -190,8 +190,8 @@ class Lsm6dsoxImu:
         fine = int.from_bytes(self._get(Register.INTERNAL_FREQ_FINE), signed=True)
         settle_s = 0.1  # a gyroscope starts within 70 ms
         self._stop.wait(settle_s)
-        self._set(Register.FIFO_CTRL4, chip.FIFO_CONTINUOUS)
-        return 1.0 + chip.FREQ_FINE_STEP * fine
+        self._set(Register.FIFO_CTRL4, chip.FIFO.fifo_continuous)
+        return 1.0 + chip.FIFO.freq_fine_step * fine
 
     def _fetch(self) -> None:
         """Take from the FIFO what is there, or wait a little."""
@@ -199,7 +199,7 @@ class Lsm6dsoxImu:
         arrival_ns = self._clock.now_ns()
         most_words = 90  # of one read: half a kilobyte
         words = min((high & 3) << 8 | low, most_words)
-        self._counts["imu.overrun"] += bool(high & chip.OVERRUN)
+        self._counts["imu.overrun"] += bool(high & chip.FIFO.overrun)
         temperature_ns = 1_000_000_000
         if self._heated_ns is None or arrival_ns - self._heated_ns >= temperature_ns:
             self._heated_ns = arrival_ns
@@ -211,7 +211,7 @@ class Lsm6dsoxImu:
             self._stop.wait(POLL_S)
             return
         self._silent = 0
-        fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * chip.WORD))
+        fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * chip.FIFO.word))
         dated = [(stamp, one) for one in fresh if (stamp := self._stamp(one.ticks, arrival_ns)) is not None]
         self._came.extend(self._sample(stamp, one) for stamp, one in dated)
 

@@ -22,7 +22,23 @@ import numpy as np
 
 from common.arrays import Float
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
+
+class Fifo(NamedTuple):
+    """Registers' values and scales of the LSM6DSOX and its FIFO."""
+
+    standard_gravity: float = 9.80665  # m/s^2
+    identity: int = 0x6C
+    sw_reset: int = 0x01  # CTRL3_C, clears itself
+    fifo_continuous: int = 0x46  # newest words replace the oldest
+    overrun: int = 0x08  # FIFO_STATUS2: words were replaced since it was read
+    word: int = 7  # bytes
+    freq_fine_step: float = 0.0015
+    gyro: int = 1
+    accel: int = 2
+    stamp: int = 4
+
+
+FIFO = Fifo()
 
 
 class Register(IntEnum):
@@ -44,7 +60,6 @@ class Register(IntEnum):
     FIFO_DATA_OUT_TAG = 0x78  # read on, it rolls over from 0x7E to here
 
 
-IDENTITY = 0x6C
 OTHERS = {
     0x69: "LSM6DS3",
     0x6A: "LSM6DSL or LSM6DS3TR-C",
@@ -52,14 +67,8 @@ OTHERS = {
     0xEA: "ICM-20948",
     0x68: "MPU-6050",
 }
-SW_RESET = 0x01  # CTRL3_C, clears itself
-FIFO_CONTINUOUS = 0x46  # newest words replace the oldest
-OVERRUN = 0x08  # FIFO_STATUS2: words were replaced since it was read
-WORD = 7  # bytes
-FREQ_FINE_STEP = 0.0015
 RAD_S_PER_LSB = float(np.radians(0.070))  # at 2000 deg/s, DS12814 table 2
-M_S2_PER_LSB = 0.488e-3 * STANDARD_GRAVITY  # at 16 g
-_GYRO, _ACCEL, _STAMP = 1, 2, 4
+M_S2_PER_LSB = 0.488e-3 * FIFO.standard_gravity  # at 16 g
 
 
 class Rate(NamedTuple):
@@ -129,8 +138,8 @@ class Slots:
 
     def push(self, data: bytes) -> Iterator[Measured]:
         """The slots that whole words of the FIFO complete, in order."""
-        for start in range(0, len(data) - WORD + 1, WORD):
-            tag, word = data[start], data[start + 1 : start + WORD]
+        for start in range(0, len(data) - FIFO.word + 1, FIFO.word):
+            tag, word = data[start], data[start + 1 : start + FIFO.word]
             if tag.bit_count() % 2:
                 self.counts["broken.parity"] += 1
                 continue
@@ -138,22 +147,22 @@ class Slots:
             if slot != self._slot:
                 self.counts["broken.incomplete"] += bool(self._words)
                 self._slot, self._words = slot, {}
-            if what in (_GYRO, _ACCEL, _STAMP):
+            if what in (FIFO.gyro, FIFO.accel, FIFO.stamp):
                 self._words[what] = word
             if len(self._words) == 3:
                 yield self._measured(self._words)
                 self._words = {}
 
     def _measured(self, words: dict[int, bytes]) -> Measured:
-        [raw] = struct.unpack("<I2x", words[_STAMP])
+        [raw] = struct.unpack("<I2x", words[FIFO.stamp])
         if self._ticks is None:
             self._ticks = raw
         else:
             self._ticks += (raw - self._ticks) % (1 << 32)  # it wraps after 30 hours
         return Measured(
             self._ticks,
-            self._vector(words[_GYRO], RAD_S_PER_LSB),
-            self._vector(words[_ACCEL], M_S2_PER_LSB),
+            self._vector(words[FIFO.gyro], RAD_S_PER_LSB),
+            self._vector(words[FIFO.accel], M_S2_PER_LSB),
         )
 
     def _vector(self, word: bytes, scale: float) -> Float:

@@ -17,6 +17,7 @@ Torch and IR mode, in which no time-out ends the light, are never written.
 
 import fcntl
 from collections import Counter
+from typing import NamedTuple
 
 from smbus2 import SMBus
 
@@ -24,11 +25,24 @@ from common.calibration.strobe import StrobeCalibration
 from common.errors import LightsError
 from common.recording.frame_recording import Illumination
 
-# 8.6.1 to 8.6.12
-ENABLE, LED1_FLASH, LED2_FLASH, TIMING, FLAGS1, FLAGS2, DEVICE_ID = 0x01, 0x03, 0x04, 0x08, 0x0A, 0x0B, 0x0C
-STANDBY = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has an effect
+
+class Register(NamedTuple):
+    """Registers of the LM3644 and their values, data sheet section 8.6."""
+
+    # 8.6.1 to 8.6.12
+    enable: int = 0x01
+    led1_flash: int = 0x03
+    led2_flash: int = 0x04
+    timing: int = 0x08
+    flags1: int = 0x0A
+    flags2: int = 0x0B
+    device_id: int = 0x0C
+    standby: int = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has an effect
+    lm3644tt: int = 0x04  # 8.6.12
+
+
+REGISTER = Register()
 FLASH = {Illumination.LASER: 0x0D, Illumination.LED: 0x0E}  # 8.6.1: mode 11 (flash) with LED1, with LED2
-LM3644TT = 0x04  # 8.6.12
 # 8.6.10, 8.6.11, from bit 0 on
 FAULTS1 = (
     "timeout",
@@ -91,15 +105,15 @@ class FlashDriverLights:
         if not self._ready:
             self._set_up()
             self._counts["reopened"] += 1
-        self._write(ENABLE, FLASH[lit])
+        self._write(REGISTER.enable, FLASH[lit])
 
     def off(self) -> None:
         """Standby, read back; then the flags."""
         if self._closed:
             return
-        self._write(ENABLE, STANDBY)
+        self._write(REGISTER.enable, REGISTER.standby)
         is_on = 0x0F  # 8.6.1: mode and LED bits
-        if (got := self._read(ENABLE)) & is_on:
+        if (got := self._read(REGISTER.enable)) & is_on:
             raise LightsError(f"{self._where}: was sent to standby, and reports 0x{got:02x}: it may be lit")
         self._count_faults()
 
@@ -124,15 +138,24 @@ class FlashDriverLights:
         """Check which chip it is, and write and read back what it needs."""
         if self._bus is None:
             self._bus = self._opened()
-        self._write(ENABLE, STANDBY)
+        self._write(REGISTER.enable, REGISTER.standby)
         id_mask, lm3644 = 0x3F, 0x02  # 8.6.12
-        kind = self._read(DEVICE_ID) & id_mask
+        kind = self._read(REGISTER.device_id) & id_mask
         if kind != lm3644:
-            what = "an LM3644TT, whose shortest time-out is 40 ms" if kind == LM3644TT else f"id 0x{kind:02x}"
+            what = (
+                "an LM3644TT, whose shortest time-out is 40 ms"
+                if kind == REGISTER.lm3644tt
+                else f"id 0x{kind:02x}"
+            )
             raise LightsError(f"{self._where}: is {what}; an LM3644 (id 0x{lm3644:02x}) is needed")
         laser, led = self._codes  # bit 7 of LED1's register clear: LED2 has a current of its own (8.6.3)
         timeout_10_ms = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset
-        wanted = {LED1_FLASH: laser, LED2_FLASH: led, TIMING: timeout_10_ms, ENABLE: STANDBY}
+        wanted = {
+            REGISTER.led1_flash: laser,
+            REGISTER.led2_flash: led,
+            REGISTER.timing: timeout_10_ms,
+            REGISTER.enable: REGISTER.standby,
+        }
         for register, value in wanted.items():
             self._write(register, value)
         for register, value in wanted.items():
@@ -144,7 +167,7 @@ class FlashDriverLights:
         self._ready = True
 
     def _count_faults(self) -> None:
-        for register, names in ((FLAGS1, FAULTS1), (FLAGS2, FAULTS2)):
+        for register, names in ((REGISTER.flags1, FAULTS1), (REGISTER.flags2, FAULTS2)):
             flags = self._read(register)
             self._counts.update(f"fault.{name}" for bit, name in enumerate(names) if flags >> bit & 1)
 

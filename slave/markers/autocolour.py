@@ -16,16 +16,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.errors import FitError
-from slave.markers.autocolour_surroundings import (
-    RESTING_SKIN,
-    SHIFT_PX,
-    SHIFT_SHARE,
-    SKIN_AROUND,
-    background_of,
-    skin_of,
-    spread,
-    surroundings_of,
-)
+from slave.markers.autocolour_surroundings import SETTINGS, background_of, skin_of, spread, surroundings_of
 from slave.markers.autocolour_things import Surroundings, Thing, coloured, hsv_of, things_of
 from slave.markers.classify import HUES
 from slave.markers.colours import (
@@ -75,7 +66,7 @@ class MarkerColour:
         size = float(np.median([thing.size for thing in self.things]))
         place = np.array([(thing.u, thing.v) for thing in self.things])
         low, high = np.percentile(place, (5, 95), axis=0)
-        return float(np.hypot(*(high - low))) > SHIFT_PX + SHIFT_SHARE * size
+        return float(np.hypot(*(high - low))) > SETTINGS.shift_px + SETTINGS.shift_share * size
 
 
 def calibrate_moving(
@@ -135,7 +126,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
     seen_least = 4  # and at least so many
     least = max(seen_least, seen_share * frames)
     every = [colour for colour in _by_hue(things) if len(colour.things) >= least]
-    near_skin = [colour for colour in every if colour.skin >= SKIN_AROUND]
+    near_skin = [colour for colour in every if colour.skin >= SETTINGS.skin_around]
     typical = float(np.median([colour.area for colour in near_skin])) if near_skin else 0.0
     size_share = 0.25  # of the typical area of all; a smaller thing is the fringe of another
     near_skin = [colour for colour in near_skin if colour.area >= size_share * typical]
@@ -144,7 +135,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
     resting = [
         colour
         for colour in near_skin
-        if not colour.moved and colour.skin >= RESTING_SKIN and not around.wooden
+        if not colour.moved and colour.skin >= SETTINGS.resting_skin and not around.wooden
     ]
     found = sorted(moving, key=lambda colour: -len(colour.things))
     if len(found) < count:
@@ -257,9 +248,9 @@ def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
     The text is for the error message.
     """
     reasons = ""
-    if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SKIN_AROUND]:
+    if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SETTINGS.skin_around]:
         reasons += f"; hue {', '.join(bare)} has no skin beside it"
-    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SKIN_AROUND]:
+    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SETTINGS.skin_around]:
         reasons += f"; what is coloured beside skin with hue {', '.join(still)} never moved"
     desk = np.flatnonzero((around.floor > PALE) & (around.floor < 256.0))
     if len(desk):

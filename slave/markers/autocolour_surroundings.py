@@ -9,6 +9,7 @@ clutter      things of the background that stay whole in one place while the han
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,21 +30,34 @@ from slave.markers.autocolour_things import (
 from slave.markers.classify import HUES
 from slave.markers.colours import HUE_GROW, PALE, circular_median, hue_distance
 
-MEDIAN_FRAMES = 25  # enough for a median; more only cost memory
-DIFFERENT = 25  # grey levels that no noise reaches, in any channel
+
+class SurroundingsSettings(NamedTuple):
+    """Numbers that part a painted hand from its surroundings."""
+
+    median_frames: int = 25  # enough for a median; more only cost memory
+    different: int = 25  # grey levels that no noise reaches, in any channel
+    tiles: int = 8  # the image in so many rows and columns:
+    # a thing that went farther, plus this share of its size, has moved
+    shift_px: float = 2.0
+    shift_share: float = 0.05
+    whole: float = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
+    moved_frames: int = 3
+    skin_around: float = (
+        0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
+    )
+    resting_skin: float = (
+        0.5  # share of skin around a thing that never moved, from which it is painted on the hand
+    )
+
+
+SETTINGS = SurroundingsSettings()
 SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
 SKIN_SATURATION = 30, 210
-TILES = 8  # the image in so many rows and columns:
-SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
-WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
-MOVED_FRAMES = 3
-SKIN_AROUND = 0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
-RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
 
 
 def background_of(images: Sequence[Image]) -> Image:
     """Median over at most `MEDIAN_FRAMES` frames, evenly taken; (H, W, 3)."""
-    chosen = [images[k] for k in spread(len(images), MEDIAN_FRAMES)]
+    chosen = [images[k] for k in spread(len(images), SETTINGS.median_frames)]
     rows = [np.median([image[v] for image in chosen], axis=0) for v in range(chosen[0].shape[0])]
     return np.stack(rows).astype(np.uint8)
 
@@ -64,9 +78,9 @@ def skin_of(images: Sequence[Image], background: Image) -> Skin:
     """
     samples: list[Image] = []
     moving = 0.0
-    chosen = spread(len(images), MEDIAN_FRAMES)
+    chosen = spread(len(images), SETTINGS.median_frames)
     for k in chosen:
-        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > DIFFERENT
+        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > SETTINGS.different
         moving += float(differs.mean()) / len(chosen)
         hsv = hsv_of(images[k])[differs]
         hue, saturation = hsv[:, 0], hsv[:, 1]
@@ -97,8 +111,8 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
     for thing in standing:
         if _moved(thing, images):
             continue
-        resting = thing.skin >= RESTING_SKIN or (
-            thing.skin >= SKIN_AROUND and _uncovered(thing, images, background, skin)
+        resting = thing.skin >= SETTINGS.resting_skin or (
+            thing.skin >= SETTINGS.skin_around and _uncovered(thing, images, background, skin)
         )
         if wooden or not resting:
             clutter.append(thing)
@@ -112,14 +126,14 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
     """
     height, width = background.shape[:2]
     samples: list[Image] = []
-    tiles = np.zeros((HUES, TILES * TILES))
-    row: Int = np.arange(height, dtype=np.int64) * TILES // height
-    column: Int = np.arange(width, dtype=np.int64) * TILES // width
-    tile: Int = row[:, None] * TILES + column
+    tiles = np.zeros((HUES, SETTINGS.tiles * SETTINGS.tiles))
+    row: Int = np.arange(height, dtype=np.int64) * SETTINGS.tiles // height
+    column: Int = np.arange(width, dtype=np.int64) * SETTINGS.tiles // width
+    tile: Int = row[:, None] * SETTINGS.tiles + column
     desk_frames = 3  # from which the saturation of the desk is measured, noise included
     for k in spread(len(images), desk_frames):
         hsv = hsv_of(images[k])
-        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= DIFFERENT
+        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= SETTINGS.different
         desk &= (hsv[..., 1] >= PALE) & (hsv[..., 2] >= DARK)
         samples.append(hsv[desk])
         desk_tile = 100.0  # where one pixel in so many has it
@@ -133,7 +147,7 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
         ]
     )
     desk_share = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
-    everywhere = (around >= height * width / TILES**2).mean(axis=1) >= desk_share
+    everywhere = (around >= height * width / SETTINGS.tiles**2).mean(axis=1) >= desk_share
     floor = np.full(HUES, float(PALE))
     pixels = np.concatenate(samples)
     for hue in np.flatnonzero(everywhere):
@@ -172,12 +186,15 @@ def _moved(thing: Thing, images: Sequence[Image]) -> bool:
         best = int(np.argmax(overlap))
         if overlap[best]:
             seen.append((float(stats[best, cv2.CC_STAT_AREA]), *centres[best].tolist()))
-    if len(seen) < MOVED_FRAMES:
+    if len(seen) < SETTINGS.moved_frames:
         return False
     area, u, v = np.array(seen).T
-    whole = (area >= WHOLE * np.median(area)) & (area <= np.median(area) / WHOLE)
+    whole = (area >= SETTINGS.whole * np.median(area)) & (area <= np.median(area) / SETTINGS.whole)
     shift = np.hypot(u - np.median(u), v - np.median(v))
-    return int((whole & (shift > SHIFT_PX + SHIFT_SHARE * thing.size)).sum()) >= MOVED_FRAMES
+    return (
+        int((whole & (shift > SETTINGS.shift_px + SETTINGS.shift_share * thing.size)).sum())
+        >= SETTINGS.moved_frames
+    )
 
 
 def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
@@ -200,6 +217,6 @@ def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: S
     colour = np.median(desk, axis=0)
     bare = 0
     for image in images:
-        away = np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) <= DIFFERENT
+        away = np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) <= SETTINGS.different
         bare += bool(away.mean() > 0.5)
-    return bare >= MOVED_FRAMES
+    return bare >= SETTINGS.moved_frames

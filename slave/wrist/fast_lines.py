@@ -24,13 +24,19 @@ def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
     most = band.size // 2 + band.shape[0] + 1
     whole = np.empty((most, 3), dtype=np.int64)
     parts = np.empty((most, 2))
-    limits = (runs.THICKEST_PX, runs.FLAT_PX, runs.TOP, runs.OF_PEAK, runs.OF_FLAT)
+    limits = (
+        runs.SETTINGS.thickest_px,
+        runs.SETTINGS.flat_px,
+        runs.SETTINGS.top,
+        runs.SETTINGS.of_peak,
+        runs.SETTINGS.of_flat,
+    )
     count = _scan(np.asarray(band, np.uint8), np.asarray(least, np.uint8), corner, limits, whole, parts)
     if not count:
         return NO_RUNS, np.empty(0, dtype=np.bool_)
     whole, parts = whole[:count], parts[:count]
     order, line, joins = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    number = _link(whole, parts, runs.JUMP_PX, order, line, joins)
+    number = _link(whole, parts, runs.SETTINGS.jump_px, order, line, joins)
     column, start, end = np.ascontiguousarray(whole[order].T)
     row, peak = np.ascontiguousarray(parts[order].T)
     found = Runs(column, row, start, end, peak, line[:number].copy(), joins[:number].copy())

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from slave.wrist.finger_lines import NONE
-from slave.wrist.runs import SHORT, Runs
+from slave.wrist.runs import SETTINGS, Runs
 from slave.wrist.workspace import LaserWorkspace
 
 # Where `LaserWorkspace.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
@@ -105,9 +105,9 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
         begin = _climb(i, range(i - 1, int(runs.first[of_line - 1]) - 1, -1), runs.row, out == out[i])
         stop = _climb(i + 1, range(i + 2, end), runs.row, finger == finger[i + 1]) + 1
         top = begin + int(runs.row[begin:stop].argmin())
-        if stop - top < SHORT:
+        if stop - top < SETTINGS.short:
             top = stop
-        elif top - begin < SHORT:
+        elif top - begin < SETTINGS.short:
             top = begin
         out[begin:top], out[top:stop] = out[i], finger[i + 1]
     return out

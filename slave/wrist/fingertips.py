@@ -17,7 +17,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
 from slave.wrist.led_depth import SHRINK, Float32, depth_about, led_optics, nearness, shrink
-from slave.wrist.outline import DIRECTIONS as OUTLINE
+from slave.wrist.outline import SETTINGS as OUTLINE
 from slave.wrist.outline import Circles, fitted
 from slave.wrist.postures import (
     ABOVE,
@@ -33,46 +33,72 @@ from slave.wrist.postures import (
 from slave.wrist.view import WristView
 
 LEAST_NEAR = np.float32(1.5)  # roots of grey levels: noise
-MOST_ABDUCTION = 1.7  # of the outer two of the table
-# How far a posture may meet the laser from where it was seen: flesh is off its cones.
-WITHIN_M, SIGMA_M = 4e-3, 2.5e-3
-MOST_OFF_M, SPREAD_M = 15e-3, 3e-3  # where no posture is as near as that
-ASIDE_M, MOST_ASIDE = 2.5e-3, 3.0  # standard deviation across the fingers, and deviations allowed
-FAR = 3  # of the samples above a finger: from there on they are far
-UPWARDS = 6  # of directions
-UNSURE, VARIANT = 0.18, 1.2  # of the outer abductions: less is one; deviations of the other two
-MOST_OFF = 0.35  # of the logarithm of a fingertip's nearness
-THUMB_WITHIN_M, THUMB_SIGMA_M = 12e-3, 5e-3
-ABDUCTION_SIGMA = 0.5  # of the outer two
-OWN_SIGMA, OWN_MOST = 0.1, 9.0  # of the logarithm of nearness on the finger; squares of deviations that count
-SCALE_SIGMA = 0.12  # of that which all samples of a finger share
-DARKER, AS_BRIGHT = 0.65, 0.95  # of a finger's nearness: what is beyond its end costs nothing, costs all
-ABOVE_MOST, ABOVE_UNKNOWN = 9.0, 0.33  # and of the root of that where the image is saturated
-# Above a folded finger, the same: what is lit there may be an object that hides the rest of an extended one.
-FOLDED_DARKER, FOLDED_AS_BRIGHT = 0.15, 0.35
-UNKNOWN_COST = (
-    1.0  # of a sample outside of the image, or where that is saturated, or where something hides it
-)
-HIDDEN, HIDES = (
-    -0.6,
-    8.0,
-)  # logarithm of nearness of what hides skin; what it costs that there is such a thing
-# before a finger: the thumb is before all that a hand grips.
-SIDE = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
-MODES = 8  # places of a finger whose outlines are looked at
-MODE_WITHIN = 24.0  # what they may cost more than the best
-APART = 0.4  # of the radius of a fingertip: places that differ
-UNSEEN_COST = 30.0  # what an outline that is not seen at all costs
-AT_SIGMA, SIZE_SIGMA = 0.35, 0.12  # of the radius: how far a posture's outline may be from the seen one
-AT_SURE, LASER_SURE_M = 0.1, 8e-4  # how well an outline is seen, of the radius, and a laser point
-TWIST_SIGMA = 0.05  # rad: of the hinges of real fingers
-ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
-CORRELATED = 2.5  # samples that differ for one reason
+
+
+class FingertipSettings(NamedTuple):
+    """Numbers of the search for fingertips in the LED image."""
+
+    most_abduction: float = 1.7  # of the outer two of the table
+    # How far a posture may meet the laser from where it was seen: flesh is off its cones.
+    within_m: float = 4e-3
+    sigma_m: float = 2.5e-3
+    # where no posture is as near as that
+    most_off_m: float = 15e-3
+    spread_m: float = 3e-3
+    # standard deviation across the fingers, and deviations allowed
+    aside_m: float = 2.5e-3
+    most_aside: float = 3.0
+    far: int = 3  # of the samples above a finger: from there on they are far
+    upwards: int = 6  # of directions
+    unsure: float = 0.18  # of the outer abductions: less is one
+    variant: float = 1.2  # deviations of the other two
+    most_off: float = 0.35  # of the logarithm of a fingertip's nearness
+    thumb_within_m: float = 12e-3
+    thumb_sigma_m: float = 5e-3
+    abduction_sigma: float = 0.5  # of the outer two
+    own_sigma: float = 0.1  # of the logarithm of nearness on the finger
+    own_most: float = 9.0  # squares of deviations that count
+    scale_sigma: float = 0.12  # of that which all samples of a finger share
+    # of a finger's nearness: what is beyond its end costs nothing, costs all
+    darker: float = 0.65
+    as_bright: float = 0.95
+    # and of the root of that where the image is saturated
+    above_most: float = 9.0
+    above_unknown: float = 0.33
+    # Above a folded finger, the same: what is lit there may be an object that hides the rest of an extended one.
+    folded_darker: float = 0.15
+    folded_as_bright: float = 0.35
+    unknown_cost: float = (
+        1.0  # of a sample outside of the image, or where that is saturated, or where something hides it
+    )
+    hidden: float = -0.6  # logarithm of nearness of what hides skin
+    hides: float = 8.0  # what it costs that there is such a thing
+    # before a finger: the thumb is before all that a hand grips.
+    side: float = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
+    modes: int = 8  # places of a finger whose outlines are looked at
+    mode_within: float = 24.0  # what they may cost more than the best
+    apart: float = 0.4  # of the radius of a fingertip: places that differ
+    unseen_cost: float = 30.0  # what an outline that is not seen at all costs
+    # of the radius: how far a posture's outline may be from the seen one
+    at_sigma: float = 0.35
+    size_sigma: float = 0.12
+    # how well an outline is seen, of the radius, and a laser point
+    at_sure: float = 0.1
+    laser_sure_m: float = 8e-4
+    twist_sigma: float = 0.05  # rad: of the hinges of real fingers
+    ends_within: float = 40.0  # of the best posture's cost: those whose ends are averaged
+    correlated: float = 2.5  # samples that differ for one reason
+    # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is
+    # that faces the camera; and the residual at which they are twice as large.
+    pixel: float = 0.7
+    surface: float = 0.05
+    pulp: float = 0.08
+    cost_scale: float = 20.0
+
+
+SETTINGS = FingertipSettings()
 # Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
 LEAST_SHOWN = np.array([0.75, 0.6])
-# Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
-# the camera; and the residual at which they are twice as large.
-PIXEL, SURFACE, PULP, COST_SCALE = 0.7, 0.05, 0.08, 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,38 +192,38 @@ def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32, Flo
     """
     x, z = plane[1:, :1], plane[1:, 1:]
     (x0, z0), (x1, z1), (x2, z2) = table.laser
-    gain = x1 * np.float32(1.0 / ASIDE_M**2)
+    gain = x1 * np.float32(1.0 / SETTINGS.aside_m**2)
     known = gain * x1
-    known += np.float32(1.0 / ABDUCTION_SIGMA**2)
+    known += np.float32(1.0 / SETTINGS.abduction_sigma**2)
     gain /= known
     aside = x - x0
     share = aside * gain
     share = (aside - x2 * share * share) * gain
     off = np.abs(z0 + share * (z1 + share * z2) - z)
     aside -= share * (x1 + share * x2)
-    aside *= np.float32(1.0 / ASIDE_M)
-    off[~((np.abs(share) < MOST_ABDUCTION) & (np.abs(aside) < MOST_ASIDE))] = np.inf
+    aside *= np.float32(1.0 / SETTINGS.aside_m)
+    off[~((np.abs(share) < SETTINGS.most_abduction) & (np.abs(aside) < SETTINGS.most_aside))] = np.inf
     least = np.fmin.reduce(off, axis=1, keepdims=True, initial=np.inf)
-    least[~(least < MOST_OFF_M)] = -np.inf  # nothing is as near as that
-    rows = np.flatnonzero(off < np.maximum(WITHIN_M, least + SPREAD_M) * (least >= 0.0))
+    least[~(least < SETTINGS.most_off_m)] = -np.inf  # nothing is as near as that
+    rows = np.flatnonzero(off < np.maximum(SETTINGS.within_m, least + SETTINGS.spread_m) * (least >= 0.0))
     share, aside = share.ravel()[rows], aside.ravel()[rows]
-    off = (off - least).ravel()[rows] * np.float32(1.0 / SIGMA_M)
-    cost = off * off + (share * np.float32(1.0 / ABDUCTION_SIGMA)) ** 2 + aside * aside
-    spread = np.float32(VARIANT) / np.sqrt(known.ravel()[rows])
-    wide = np.flatnonzero(spread > VARIANT * UNSURE)
-    more = cost[wide] + np.float32(VARIANT**2)
+    off = (off - least).ravel()[rows] * np.float32(1.0 / SETTINGS.sigma_m)
+    cost = off * off + (share * np.float32(1.0 / SETTINGS.abduction_sigma)) ** 2 + aside * aside
+    spread = np.float32(SETTINGS.variant) / np.sqrt(known.ravel()[rows])
+    wide = np.flatnonzero(spread > SETTINGS.variant * SETTINGS.unsure)
+    more = cost[wide] + np.float32(SETTINGS.variant**2)
     spread = spread[wide]
-    aside *= np.float32(ASIDE_M)
+    aside *= np.float32(SETTINGS.aside_m)
     moved = spread * x1.ravel()[rows[wide]]
     off = table.thumb_laser - plane[0, :, None]
     square = off[0] ** 2 + off[1] ** 2
-    thumb = np.flatnonzero(square < THUMB_WITHIN_M**2)
+    thumb = np.flatnonzero(square < SETTINGS.thumb_within_m**2)
     rows += table.thumb
     return (
         np.concatenate([thumb, rows, rows[wide], rows[wide]]),
         np.concatenate([np.zeros(len(thumb), np.float32), share, share[wide] + spread, share[wide] - spread]),
         np.concatenate([np.zeros(len(thumb), np.float32), aside, aside[wide] - moved, aside[wide] + moved]),
-        np.concatenate([square[thumb] * np.float32(1.0 / THUMB_SIGMA_M**2), cost, more, more]),
+        np.concatenate([square[thumb] * np.float32(1.0 / SETTINGS.thumb_sigma_m**2), cost, more, more]),
     )
 
 
@@ -215,7 +241,7 @@ def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) ->
     rows, share, aside, cost = allowed(table, on_plane(laser_m, view))
     seen, bound, outside = image.at(_at(table.middle[rows], share))
     off = _logarithm(seen, table.near[rows, END] * np.float32(gain), bound)
-    kept = np.flatnonzero((np.abs(off) < MOST_OFF) & ~outside)
+    kept = np.flatnonzero((np.abs(off) < SETTINGS.most_off) & ~outside)
     if not len(kept):
         return None
     kept = kept[np.argsort(rows[kept], kind="stable")]
@@ -253,31 +279,34 @@ def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
     predicted = some.table.near[some.rows] * np.float32(gain)
     off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
     unknown = bound[:, BONES] | outside[:, BONES]
-    hidden = (off < HIDDEN) & ~unknown & (some.finger > 0)[:, None]
+    hidden = (off < SETTINGS.hidden) & ~unknown & (some.finger > 0)[:, None]
     off[hidden] = 0.0
-    most = np.float32(3.0 * OWN_SIGMA + SCALE_SIGMA)
+    most = np.float32(3.0 * SETTINGS.own_sigma + SETTINGS.scale_sigma)
     count = off.shape[1]
-    weight = np.float32(1.0 / (count + (OWN_SIGMA / SCALE_SIGMA) ** 2))
+    weight = np.float32(1.0 / (count + (SETTINGS.own_sigma / SETTINGS.scale_sigma) ** 2))
     scale = weight * np.minimum(np.maximum(off, -most), most).sum(axis=1)
-    square = ((off - scale[:, None]) * np.float32(1.0 / OWN_SIGMA)) ** 2
-    np.minimum(square, OWN_MOST, out=square)
-    np.maximum(square, UNKNOWN_COST, out=square, where=bound[:, BONES])
-    square[outside[:, BONES] | hidden] = UNKNOWN_COST
-    cost = some.cost + square.sum(axis=1) + (scale * np.float32(1.0 / SCALE_SIGMA)) ** 2
-    cost += np.float32(HIDES) * hidden.any(axis=1)
+    square = ((off - scale[:, None]) * np.float32(1.0 / SETTINGS.own_sigma)) ** 2
+    np.minimum(square, SETTINGS.own_most, out=square)
+    np.maximum(square, SETTINGS.unknown_cost, out=square, where=bound[:, BONES])
+    square[outside[:, BONES] | hidden] = SETTINGS.unknown_cost
+    cost = some.cost + square.sum(axis=1) + (scale * np.float32(1.0 / SETTINGS.scale_sigma)) ** 2
+    cost += np.float32(SETTINGS.hides) * hidden.any(axis=1)
     # Above the finger.
-    folded = some.table.open[some.rows, UPWARDS] == 0.0
+    folded = some.table.open[some.rows, SETTINGS.upwards] == 0.0
     seen, bound, outside = seen[:, ABOVE], bound[:, ABOVE], outside[:, ABOVE]
-    seen[folded, FAR:] = image.above(some.uv[folded, ABOVE][:, FAR:])
+    seen[folded, SETTINGS.far :] = image.above(some.uv[folded, ABOVE][:, SETTINGS.far :])
     darker, as_bright = (
         np.where(folded, np.float32(a), np.float32(b))[:, None]
-        for a, b in ((FOLDED_DARKER, DARKER), (FOLDED_AS_BRIGHT, AS_BRIGHT))
+        for a, b in (
+            (SETTINGS.folded_darker, SETTINGS.darker),
+            (SETTINGS.folded_as_bright, SETTINGS.as_bright),
+        )
     )
     bright = seen / np.maximum(predicted[:, HIGHEST, None], np.float32(0.1))
     bright = np.minimum(np.maximum((bright - darker) / (as_bright - darker), 0.0), 1.0)
-    bright[bound] = ABOVE_UNKNOWN
+    bright[bound] = SETTINGS.above_unknown
     bright[outside | (predicted[:, ABOVE] > 0.0)] = 0.0
-    return cost + np.float32(ABOVE_MOST) * (bright * bright).sum(axis=1)
+    return cost + np.float32(SETTINGS.above_most) * (bright * bright).sum(axis=1)
 
 
 def modes(some: Hypotheses, cost: Float32) -> Int:
@@ -285,15 +314,15 @@ def modes(some: Hypotheses, cost: Float32) -> Int:
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least = np.repeat(np.minimum.reduceat(cost, first), np.diff(first, append=len(cost)))
     more = cost - least
-    good = np.flatnonzero(more < MODE_WITHIN)
+    good = np.flatnonzero(more < SETTINGS.mode_within)
     order = good[np.argsort(more[good])]
     u, v = some.uv[order, END].T.tolist()
-    near = (APART * some.table.end[some.rows[order], 0]).tolist()
+    near = (SETTINGS.apart * some.table.end[some.rows[order], 0]).tolist()
     out: list[int] = []
     kept: tuple[list[tuple[float, float, float]], ...] = ([], [], [], [], [])
     for k, finger, x, y, r in zip(order.tolist(), some.finger[order].tolist(), u, v, near, strict=True):
         others = kept[int(finger)]
-        if len(others) == MODES:
+        if len(others) == SETTINGS.modes:
             continue
         if all((x - a) ** 2 + (y - b) ** 2 >= apart for a, b, apart in others):
             others.append((x, y, r * r))
@@ -340,10 +369,10 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     cost = costs(some, image, gain)
     best = modes(some, cost)
     finger, rows = some.finger[best], some.rows[best]
-    outline = np.repeat(_open(some, best, image, gain), OUTLINE // DIRECTIONS, axis=1)
+    outline = np.repeat(_open(some, best, image, gain), OUTLINE.directions // DIRECTIONS, axis=1)
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
-    residual = cost[best] + UNSEEN_COST * (1.0 - circle.shown)
+    residual = cost[best] + SETTINGS.unseen_cost * (1.0 - circle.shown)
     residual += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
     order = np.lexsort((residual, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
@@ -359,11 +388,11 @@ def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32
     open_, uv = some.table.open[some.rows[which]], some.uv[which]
     seen, bound, outside = image.at(uv[:, BONES])
     off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
-    hidden = (off < HIDDEN) & ~bound & ~outside
+    hidden = (off < SETTINGS.hidden) & ~bound & ~outside
     angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     way = uv[:, BONES] - uv[:, END, None]
     along = way @ np.stack([np.cos(angle), np.sin(angle)])
-    towards = hidden[..., None] & (along > SIDE * np.linalg.norm(way, axis=-1)[..., None])
+    towards = hidden[..., None] & (along > SETTINGS.side * np.linalg.norm(way, axis=-1)[..., None])
     return np.where(towards.any(axis=1), np.float32(0.0), open_)
 
 
@@ -372,8 +401,8 @@ def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
 
     By place and by size.
     """
-    off = (middle - at) / (AT_SIGMA * radius)[:, None]
-    return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SIZE_SIGMA)) ** 2
+    off = (middle - at) / (SETTINGS.at_sigma * radius)[:, None]
+    return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SETTINGS.size_sigma)) ** 2
 
 
 class Ends(NamedTuple):
@@ -394,9 +423,13 @@ def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candi
     radius = circle.radius
     of_spread = 0.6  # postures that are possible differ by more than the mean of them is off
     surface = radius * np.sqrt(
-        SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (of_spread * ends.spread) ** 2
+        SETTINGS.surface**2
+        + (SETTINGS.pulp * np.maximum(ends.facing, 0.0)) ** 2
+        + (of_spread * ends.spread) ** 2
     )
-    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + residual / COST_SCALE)
+    sigma = np.sqrt(SETTINGS.pixel**2 + surface**2 + circle.sigma_px**2) * (
+        1.0 + residual / SETTINGS.cost_scale
+    )
     at = circle.middle + ends.towards * radius[:, None]
     return Candidates(finger, at, sigma, radius, residual, circle.shown, ends.seen)
 
@@ -409,15 +442,15 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     least = np.full(5, np.inf)
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least[some.finger[first]] = np.minimum.reduceat(cost, first)
-    near = np.flatnonzero(cost < least[some.finger] + ENDS_WITHIN)
+    near = np.flatnonzero(cost < least[some.finger] + SETTINGS.ends_within)
     row = np.zeros(5, np.int64)
     row[finger] = np.arange(len(finger))
     of = row[some.finger[near]]
     end, uv, radius = some.table.end[some.rows[near]], some.uv[near], circle.radius[of]
     square = cost[near] + _apart(uv[:, END], end[:, 0], circle.middle[of], radius)
-    sigma = AT_SURE + circle.sigma_px / circle.radius
+    sigma = SETTINGS.at_sure + circle.sigma_px / circle.radius
     first = np.searchsorted(of, np.arange(len(finger)))
-    weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / CORRELATED))
+    weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / SETTINGS.correlated))
     what = np.empty((len(of), 6))
     what[:, 0] = 1.0
     rotated = _rotated(some, near, (circle.middle[of] - uv[:, END]) / radius[:, None], sigma[of])
@@ -444,16 +477,16 @@ def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
     across = table.laser[:, 0].reshape(3, -1)[:, rows[finger] - table.thumb]
     laser[0, finger] = across[1] + 2.0 * by[finger] * across[2]
     laser[1] = table.twist[rows, 4]
-    laser *= 1.0 / LASER_SURE_M
+    laser *= 1.0 / SETTINGS.laser_sure_m
     moved = uv[:, 1] + (2.0 * by)[:, None, None] * uv[:, 2]
     at = np.stack([moved[:, END], table.twist[rows, :2]]) / radius
     tip = np.stack([moved[:, APEX], table.twist[rows, 2:4]]) / radius
     sure = sigma**-2
-    a = sure * np.vecdot(at[0], at[0]) + laser[0] ** 2 + ABDUCTION_SIGMA**-2
+    a = sure * np.vecdot(at[0], at[0]) + laser[0] ** 2 + SETTINGS.abduction_sigma**-2
     b = sure * np.vecdot(at[0], at[1]) + laser[0] * laser[1]
-    c = sure * np.vecdot(at[1], at[1]) + laser[1] ** 2 + TWIST_SIGMA**-2
-    aside = some.aside[which] * (1.0 / LASER_SURE_M)
-    p = sure * np.vecdot(at[0], off) + laser[0] * aside - by * ABDUCTION_SIGMA**-2
+    c = sure * np.vecdot(at[1], at[1]) + laser[1] ** 2 + SETTINGS.twist_sigma**-2
+    aside = some.aside[which] * (1.0 / SETTINGS.laser_sure_m)
+    p = sure * np.vecdot(at[0], off) + laser[0] * aside - by * SETTINGS.abduction_sigma**-2
     q = sure * np.vecdot(at[1], off) + laser[1] * aside
     scale = 1.0 / (a * c - b * b)
     abduction, twist = (c * p - b * q) * scale, (a * q - b * p) * scale

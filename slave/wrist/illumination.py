@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from math import inf, log2
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,22 +29,37 @@ from common.arrays import Image
 
 _Cells = cv2.typing.MatLike  # of a coarse frame
 _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
-_NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
-_SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
-_NOISE_OF_LEVEL = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
-_LINE = 20  # levels beyond that: a line that a centroid can be taken of
+
+
+class IlluminationSettings(NamedTuple):
+    """Numbers that tell laser, LED and ambient frames apart."""
+
+    noise: int = (
+        6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
+    )
+    swing: float = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
+    line: int = 20  # levels beyond that: a line that a centroid can be taken of
+    led_least: float = (
+        0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
+    )
+    led_never: float = (
+        0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
+    )
+    # How many times as many cells of flash on the hand as there are
+    laser_of_elsewhere: float = 4.0  # of flash elsewhere
+    valid_least: float = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
+
+
+SETTINGS = IlluminationSettings()
+_NOISE_OF_LEVEL = (SETTINGS.noise + SETTINGS.swing * np.arange(256)).astype(
+    np.uint8
+)  # by the darker of two levels
 # Neighbourhoods, (rows, columns) of cells.
 _SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
 _COLUMN = np.ones((9, 1), np.uint8)
 _LINE_HIGH = np.ones((5, 1), np.uint8)  # a line hides so many from the LEDs
 _AROUND = np.ones((5, 5), np.uint8)
 _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a window moves in one frame
-
-LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
-LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
-# How many times as many cells of flash on the hand as there are
-LASER_OF_ELSEWHERE = 4.0  # of flash elsewhere
-VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +109,13 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     """
     darker = cv2.min(ambient, led)
     valid = _valid(darker)
-    if valid < VALID_LEAST * ambient.size:
+    if valid < SETTINGS.valid_least * ambient.size:
         return NO_EVIDENCE
     noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
     led_gain = cv2.subtract(cv2.subtract(led, ambient), noise)
-    if cv2.countNonZero(led_gain) <= LED_LEAST * valid:
+    if cv2.countNonZero(led_gain) <= SETTINGS.led_least * valid:
         return NO_EVIDENCE
-    lit = _octaves(_broad(led_gain) / valid, LED_LEAST)
+    lit = _octaves(_broad(led_gain) / valid, SETTINGS.led_least)
     laser_gain, laser_loss = _each_over(laser, ambient)
     laser_least = 8  # cells of flash: the line on one finger
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= laser_least:
@@ -107,11 +123,15 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     led_loss = cv2.subtract(cv2.subtract(ambient, led), noise)
     halo = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
     above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=halo))
-    steady = -_octaves(max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, LED_NEVER)
+    steady = -_octaves(
+        max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, SETTINGS.led_never
+    )
     if not steady > 0.0:
         return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
-    line = cv2.subtract(_above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=_LINE))
+    line = cv2.subtract(
+        _above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=SETTINGS.line)
+    )
     flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
     if cv2.countNonZero(flash) <= laser_least:
         return Evidence(lit, -inf, -inf, steady)
@@ -122,7 +142,7 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
     laser_of_own = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
     laser_of_excess = 8.0  # of lines within the hand that the ambient frame has and another has not
-    rest = max(LASER_OF_ELSEWHERE * elsewhere, laser_of_own * own, laser_of_excess * excess)
+    rest = max(SETTINGS.laser_of_elsewhere * elsewhere, laser_of_own * own, laser_of_excess * excess)
     return Evidence(lit, _octaves(on_hand, laser_least), _octaves(on_hand, rest), steady)
 
 
@@ -133,11 +153,12 @@ def unlit(frames: Sequence[Image]) -> bool:
     """
     darkest = reduce(cv2.min, frames)
     valid = _valid(darkest)
-    if valid < VALID_LEAST * darkest.size:
+    if valid < SETTINGS.valid_least * darkest.size:
         return False
     gain = cv2.subtract(reduce(cv2.max, frames), darkest)
     return (
-        _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), LED_NEVER * valid) <= LED_NEVER * valid
+        _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), SETTINGS.led_never * valid)
+        <= SETTINGS.led_never * valid
     )
 
 
@@ -147,12 +168,12 @@ def brighter(frame: Image, other: Image) -> bool:
     It must also lack none that the other has; such light is that of the LEDs.
     """
     darker = cv2.min(frame, other)
-    valid = max(_valid(darker), VALID_LEAST * frame.size)
+    valid = max(_valid(darker), SETTINGS.valid_least * frame.size)
     noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
     gain = cv2.subtract(cv2.subtract(frame, other), noise)
-    if _broad(gain, LED_LEAST * valid) <= LED_LEAST * valid:
+    if _broad(gain, SETTINGS.led_least * valid) <= SETTINGS.led_least * valid:
         return False
-    return _broad(cv2.subtract(cv2.subtract(other, frame), noise)) <= LED_NEVER * valid
+    return _broad(cv2.subtract(cv2.subtract(other, frame), noise)) <= SETTINGS.led_never * valid
 
 
 def _valid(darker: _Cells) -> int:
@@ -203,13 +224,13 @@ def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
 
     `where` is called only if there can be any.
     """
-    if cv2.minMaxLoc(over)[1] <= _LINE:
+    if cv2.minMaxLoc(over)[1] <= SETTINGS.line:
         return 0
     return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
 
 
 def _thin(over: _Cells) -> _Cells:
-    bright = cv2.threshold(over, _LINE, 255, cv2.THRESH_BINARY)[1]
+    bright = cv2.threshold(over, SETTINGS.line, 255, cv2.THRESH_BINARY)[1]
     high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
     return cv2.subtract(bright, high)
 

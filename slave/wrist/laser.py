@@ -14,14 +14,14 @@ from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.finger_labels import finger_labels
 from slave.wrist.finger_lines import NONE, FingerLines
 from slave.wrist.fingers import Fingers
-from slave.wrist.runs import FLOOR
+from slave.wrist.runs import SETTINGS
 from slave.wrist.thumb_line import beyond_ball, on_ball
 from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
 _LINE_PX = 0.6  # one whole line
-_FAINT = 3.0 * FLOOR  # a line no brighter: what is left of one where the sun saturates
+_FAINT = 3.0 * SETTINGS.floor  # a line no brighter: what is left of one where the sun saturates
 
 
 @dataclass(frozen=True, slots=True, eq=False)

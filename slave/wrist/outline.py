@@ -15,26 +15,41 @@ import numpy as np
 from common.arrays import Bool, Float, Image, Int
 from slave.wrist.led_depth import Float32
 
-DIRECTIONS = 16
-_STEPS = 24
-_FIRST, _LAST = 0.45, 1.75  # of the radius: where an edge is sought
+
+class OutlineSettings(NamedTuple):
+    """Numbers of the fit of a fingertip's outline."""
+
+    directions: int = 16
+    steps: int = 24
+    # of the radius: where an edge is sought
+    first: float = 0.45
+    last: float = 1.75
+    expected: float = 0.35  # of the radius: how far off edges are, standard deviation
+    least_drop: float = 0.12  # of the logarithm of light over an edge: none
+    firm_drop: float = 0.4  # so much more is a sure one
+    tiny: float = 1e-6
+    rim: float = 0.05  # of the radius: how far light falls off within the outline
+    width: int = 3  # steps of an edge
+    # of the radius: how well the middle and the radius are predicted
+    middle_sigma: float = 0.6
+    radius_sigma: float = 0.12
+    edge_sigma: float = 0.08  # of the radius: how far skin is off a circle
+
+
+SETTINGS = OutlineSettings()
 LOG = np.log(np.arange(256, dtype=np.float32) + 6.0).astype(np.float32)  # of grey levels and what is dark
-_EXPECTED = 0.35  # of the radius: how far off edges are, standard deviation
-LEAST_DROP, FIRM_DROP = 0.12, 0.4  # of the logarithm of light over an edge: none; so much more is a sure one
-_TINY = 1e-6
-RIM = 0.05  # of the radius: how far light falls off within the outline
-WIDTH = 3  # steps of an edge
-MIDDLE_SIGMA, RADIUS_SIGMA = 0.6, 0.12  # of the radius: how well the middle and the radius are predicted
-EDGE_SIGMA = 0.08  # of the radius: how far skin is off a circle
 WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
-_ANGLES = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+_ANGLES = np.arange(SETTINGS.directions) * (2.0 * np.pi / SETTINGS.directions)
 WAY: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-_DESIGN = np.concatenate([WAY, np.ones((DIRECTIONS, 1))], axis=1)
-_PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(DIRECTIONS, 9)
-_PRIOR_NORMAL = np.diag(EDGE_SIGMA**2 / np.array([MIDDLE_SIGMA, MIDDLE_SIGMA, RADIUS_SIGMA]) ** 2)
-SHARE = np.linspace(_FIRST, _LAST, _STEPS).astype(np.float32)
-MIDDLES = 0.5 * (SHARE[WIDTH:] + SHARE[:-WIDTH])
-WEIGHT = np.exp(-0.5 * ((MIDDLES - 1.0) / _EXPECTED) ** 2).astype(np.float32)
+_DESIGN = np.concatenate([WAY, np.ones((SETTINGS.directions, 1))], axis=1)
+_PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(SETTINGS.directions, 9)
+_PRIOR_NORMAL = np.diag(
+    SETTINGS.edge_sigma**2
+    / np.array([SETTINGS.middle_sigma, SETTINGS.middle_sigma, SETTINGS.radius_sigma]) ** 2
+)
+SHARE = np.linspace(SETTINGS.first, SETTINGS.last, SETTINGS.steps).astype(np.float32)
+MIDDLES = 0.5 * (SHARE[SETTINGS.width :] + SHARE[: -SETTINGS.width])
+WEIGHT = np.exp(-0.5 * ((MIDDLES - 1.0) / SETTINGS.expected) ** 2).astype(np.float32)
 STEP = float(SHARE[1] - SHARE[0])
 
 
@@ -65,7 +80,9 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
     middle, radius = middle.astype(np.float64), radius.astype(np.float64)
     off, strength, inside = _edges(led, middle, radius)
     wanted: Float = np.asarray(open_, np.float64) * inside
-    firm = wanted * np.minimum(np.maximum((strength - LEAST_DROP) * (1.0 / FIRM_DROP), 0.0), 1.0)
+    firm = wanted * np.minimum(
+        np.maximum((strength - SETTINGS.least_drop) * (1.0 / SETTINGS.firm_drop), 0.0), 1.0
+    )
     weight: Float = firm
     solution, rest, normal = np.zeros((len(radius), 3)), off, np.broadcast_to(np.eye(3), (len(radius), 3, 3))
     for width in WIDTHS:
@@ -75,8 +92,8 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
         )
         rest = (off - solution @ _DESIGN.T) * (1.0 / width)
         weight = firm / (1.0 + rest * rest) ** 2
-    shown = (firm * (np.abs(rest) < 1.0)).sum(axis=1) / np.maximum(wanted.sum(axis=1), _TINY)
-    variance = np.linalg.inv(normal)[:, (0, 1), (0, 1)].sum(axis=1) * (0.5 * EDGE_SIGMA**2)
+    shown = (firm * (np.abs(rest) < 1.0)).sum(axis=1) / np.maximum(wanted.sum(axis=1), SETTINGS.tiny)
+    variance = np.linalg.inv(normal)[:, (0, 1), (0, 1)].sum(axis=1) * (0.5 * SETTINGS.edge_sigma**2)
     solution *= radius[:, None]
     return Circles(middle + solution[:, :2], radius + solution[:, 2], radius * np.sqrt(variance), shown)
 
@@ -94,15 +111,17 @@ def _edges(led: Image, middle: Float, radius: Float) -> tuple[Float, Float, Bool
     )
     height, width = led.shape
     inside: Bool = (x[..., -1] > 0) & (y[..., -1] > 0) & (x[..., -1] < width - 1) & (y[..., -1] < height - 1)
-    along = x.reshape(-1, _STEPS), y.reshape(-1, _STEPS)
+    along = x.reshape(-1, SETTINGS.steps), y.reshape(-1, SETTINGS.steps)
     light = cv2.remap(led, *along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     log: Float32 = LOG[np.asarray(light, np.uint8)]
-    drop = log[:, :-WIDTH] - log[:, WIDTH:]
+    drop = log[:, : -SETTINGS.width] - log[:, SETTINGS.width :]
     best: Int = (drop * WEIGHT).argmax(axis=1)
     steps, flat = drop.shape[1], drop.ravel()
     at = best + np.arange(len(best), dtype=np.int64) * steps
     # The parabola through the steepest step and its neighbours.
     before, here, behind = flat[at - (best > 0)], flat[at], flat[at + (best < steps - 1)]
-    part = 0.5 * (behind - before) / np.maximum(2.0 * here - before - behind, _TINY)
-    off: Float = RIM - 1.0 + MIDDLES[best] + STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
+    part = 0.5 * (behind - before) / np.maximum(2.0 * here - before - behind, SETTINGS.tiny)
+    off: Float = (
+        SETTINGS.rim - 1.0 + MIDDLES[best] + STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
+    )
     return off.reshape(inside.shape), here.reshape(inside.shape).astype(np.float64), inside

@@ -8,21 +8,33 @@ overlap; a jump is the border of another surface.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
 
-FLOOR = 16.0  # grey levels: less is noise even in the dark
+
+class RunSettings(NamedTuple):
+    """Numbers of the search for the laser line in image columns."""
+
+    floor: float = 16.0  # grey levels: less is noise even in the dark
+    short: int = 8  # of so few columns it must be brighter
+    # so many pixels as bright as this share of the peak: a flat, saturated top
+    top: float = 0.93
+    flat_px: int = 4
+    # of its peak: what of a run is weighed
+    of_peak: float = 0.5
+    of_flat: float = 0.85
+    column: float = 1024.0  # rows of a column when all are counted through: more than an image has
+    jump_px: float = 6.0  # between columns: another surface
+    thickest_px: int = 64  # the line on a thumb right before the camera; what is thicker is no line
+
+
+SETTINGS = RunSettings()
 _NEIGHBOURHOOD = np.ones((33, 1), dtype=np.uint8)
 _NEAR = np.ones((5, 3), dtype=np.uint8)
-SHORT = 8  # of so few columns it must be brighter
-TOP, FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
-OF_PEAK, OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
-_COLUMN = 1024.0  # rows of a column when all are counted through: more than an image has
-JUMP_PX = 6.0  # between columns: another surface
-THICKEST_PX = 64  # the line on a thumb right before the camera; what is thicker is no line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +87,7 @@ def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]
     # standard deviations above the mean of what no laser reaches
     noise = float(mean[0, 0]) + 6.0 * float(deviation[0, 0])
     of_brightest = 0.1  # of the brightest of the image: less is glow
-    threshold = min(max(FLOOR, noise, of_brightest * cv2.minMaxLoc(band)[1]), 255.0)
+    threshold = min(max(SETTINGS.floor, noise, of_brightest * cv2.minMaxLoc(band)[1]), 255.0)
     band = cv2.threshold(band, np.ceil(threshold) - 1.0, 0.0, cv2.THRESH_TOZERO)[1]
     left, top, width, height = cv2.boundingRect(band)
     corner = (left, top + first_row)
@@ -101,7 +113,7 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     edges = np.flatnonzero(flat[1:] != flat[:-1])
     column, begin = np.divmod(edges[::2], height + 2)
     size = edges[1::2] - edges[::2]
-    good = size <= THICKEST_PX
+    good = size <= SETTINGS.thickest_px
     if not good.all():
         levels = levels[np.repeat(good, size)]
         column, begin, size = column[good], begin[good], size[good]
@@ -126,8 +138,11 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
     first -= size
     peak = np.maximum.reduceat(levels, first).astype(np.float32)
     level = levels.astype(np.float32)
-    flat = np.add.reduceat(level > np.repeat(TOP * peak, size), first, dtype=np.int64) >= FLAT_PX
-    level -= np.repeat(np.where(flat, OF_FLAT, OF_PEAK) * peak, size)
+    flat = (
+        np.add.reduceat(level > np.repeat(SETTINGS.top * peak, size), first, dtype=np.int64)
+        >= SETTINGS.flat_px
+    )
+    level -= np.repeat(np.where(flat, SETTINGS.of_flat, SETTINGS.of_peak) * peak, size)
     np.maximum(level, 0.0, out=level)
     whole = np.add.reduceat(level, first)
     level *= np.arange(len(levels)) - np.repeat(first, size)
@@ -159,7 +174,7 @@ def in_lines(runs: Runs) -> Bool:
     joined = np.bincount(joins, columns, len(joins))
     glow = 0.4  # of the brightest near by: a darker line is glow
     glow_of_short = 0.7  # of so few columns it must be brighter
-    share = np.where(joined < SHORT, glow_of_short, glow)
+    share = np.where(joined < SETTINGS.short, glow_of_short, glow)
     fewest = 3  # columns of a line
     line = (brightest >= share * nearby) & (joined >= fewest)
     faded = 0.5  # of the brightest of the line: its edge, through the blur of the camera
@@ -176,14 +191,14 @@ def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
 
     Where two meet in one, the line goes on from the nearer one, and the other joins it.
     """
-    there = (column + 1) * _COLUMN + row  # the same row of the next column
-    after = np.searchsorted(there - _COLUMN, there)
-    off_above = there - (there - _COLUMN)[after - 1]
-    off_below = np.append(there - _COLUMN, np.inf)[after] - there
+    there = (column + 1) * SETTINGS.column + row  # the same row of the next column
+    after = np.searchsorted(there - SETTINGS.column, there)
+    off_above = there - (there - SETTINGS.column)[after - 1]
+    off_below = np.append(there - SETTINGS.column, np.inf)[after] - there
     off = np.minimum(off_above, off_below)
     near = after - (off_above <= off_below)
     here = np.flatnonzero(
-        (off < JUMP_PX) & (start[near % len(near)] <= end) & (end[near % len(near)] >= start)
+        (off < SETTINGS.jump_px) & (start[near % len(near)] <= end) & (end[near % len(near)] >= start)
     )
     to = near[here]  # rising, as lines do not cross
     lost: list[tuple[Int, Int]] = []

@@ -10,13 +10,13 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.geometry.transforms import transform
-from common.sim.board import COLUMNS, HELD_S, MOVED_S, ROWS, SQUARE_M, BoardRenderer, BoardScene
+from common.sim.board import BOARD, BoardRenderer, BoardScene
 
 CALIB = Path(__file__).parents[2] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)
 CAMERAS = {name: load(CALIB / "cameras" / f"{name}.json", CameraCalibration) for name in RIG.cameras}
 SCENE = BoardScene(RIG, CAMERAS, 7)
-STEP_S = HELD_S + MOVED_S
+STEP_S = BOARD.held_s + BOARD.moved_s
 
 
 def seen_at(renderer: BoardRenderer, camera: str, t_s: float) -> tuple[Float, Float]:
@@ -42,17 +42,19 @@ def test_corners_are_drawn_where_the_camera_sees_them(camera: str) -> None:
 
 def test_an_untouched_picture_shows_the_whole_board() -> None:
     grey = np.asarray(cv2.cvtColor(BoardRenderer(SCENE, "left").render(0.0), cv2.COLOR_BGR2GRAY))
-    found, corners = cv2.findChessboardCornersSB(grey, (COLUMNS, ROWS))
+    found, corners = cv2.findChessboardCornersSB(grey, (BOARD.columns, BOARD.rows))
     assert found
-    assert np.asarray(corners).reshape(-1, 2).shape == (COLUMNS * ROWS, 2)
+    assert np.asarray(corners).reshape(-1, 2).shape == (BOARD.columns * BOARD.rows, 2)
 
 
 def test_the_board_is_held_and_then_moved() -> None:
     for k in range(3):
         start = k * STEP_S
-        np.testing.assert_array_equal(SCENE.T_rig_board(start), SCENE.T_rig_board(start + HELD_S))
+        np.testing.assert_array_equal(SCENE.T_rig_board(start), SCENE.T_rig_board(start + BOARD.held_s))
         assert not np.allclose(SCENE.T_rig_board(start), SCENE.T_rig_board(start + STEP_S), atol=1e-3)
-    way = np.array([SCENE.T_rig_board(HELD_S + MOVED_S * s)[:3, 3] for s in np.linspace(0.0, 1.0, 31)])
+    way = np.array(
+        [SCENE.T_rig_board(BOARD.held_s + BOARD.moved_s * s)[:3, 3] for s in np.linspace(0.0, 1.0, 31)]
+    )
     assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < 0.05  # it moves, it does not jump
     for T in SCENE.poses:
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
@@ -60,9 +62,9 @@ def test_the_board_is_held_and_then_moved() -> None:
 
 
 def test_squares_have_their_size() -> None:
-    edge = SCENE.corners_m().reshape(ROWS, COLUMNS, 3)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=1), axis=2), SQUARE_M)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=0), axis=2), SQUARE_M)
+    edge = SCENE.corners_m().reshape(BOARD.rows, BOARD.columns, 3)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=1), axis=2), BOARD.square_m)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=0), axis=2), BOARD.square_m)
 
 
 def test_more_light_is_a_brighter_picture() -> None:

@@ -12,14 +12,14 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.geometry.srgb import to_linear
 from common.geometry.transforms import transform
-from common.sim.board import HELD_S, MOVED_S, BoardRenderer
+from common.sim.board import BOARD, BoardRenderer
 from common.sim.card import DISTANCES_M, HEIGHT_M, MARKER, WIDTH_M, CardScene
 
 CALIB = Path(__file__).parents[2] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)
 CAMERAS = {name: load(CALIB / "cameras" / f"{name}.json", CameraCalibration) for name in RIG.cameras}
 SCENE = CardScene(RIG, CAMERAS, 7)
-STEP_S = HELD_S + MOVED_S
+STEP_S = BOARD.held_s + BOARD.moved_s
 SIDE = np.linspace(-0.5, 0.5, 50)
 
 
@@ -59,7 +59,7 @@ def test_the_card_is_drawn_where_the_camera_sees_it(camera: str) -> None:
 def test_it_is_held_at_the_distances_between_the_lenses_and_faces_them() -> None:
     left, right = (RIG.camera_pose(name) for name in RIG.cameras)
     for place, distance_m in enumerate(DISTANCES_M):
-        T = SCENE.T_rig_board(place * STEP_S + 0.5 * HELD_S)
+        T = SCENE.T_rig_board(place * STEP_S + 0.5 * BOARD.held_s)
         middle = T[:3, 3] - 0.5 * (left[:3, 3] + right[:3, 3])
         assert (T[:3, 3] - left[:3, 3]) @ left[:3, 2] == pytest.approx(distance_m, abs=1e-12)
         np.testing.assert_allclose(np.cross(middle, left[:3, 2]), 0.0, atol=1e-12)
@@ -86,7 +86,7 @@ def test_held_frames_differ_by_noise_alone_and_moved_ones_by_the_card() -> None:
     assert (first != second).any()
     again = renderer.render(0.0)
     np.testing.assert_array_equal(again, first)  # of what was kept as of what is drawn afresh
-    moved = renderer.render(14 * (HELD_S + MOVED_S) + HELD_S + 0.5 * MOVED_S)
+    moved = renderer.render(14 * (BOARD.held_s + BOARD.moved_s) + BOARD.held_s + 0.5 * BOARD.moved_s)
     assert np.abs(second.astype(int) - first).max() < 25 < np.abs(moved.astype(int) - first).max()
 
 

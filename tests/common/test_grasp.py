@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.geometry.transforms import invert
 from common.hand.model import HandModel
-from common.sim.grasp import BACK_S, CLOSED_S, LIFT_S, LIFTED_S, LOWER_S, RELEASE_S, ROUND_S, ROUNDS, Grasp
+from common.sim.grasp import ROUND_S, ROUNDS, TIMING, Grasp
 from common.sim.grip import MCP_PER_PIP, bar_in_palm, closed_round, gaps_m
 from common.sim.held import Cylinder
 from common.sim.motion import PERIOD_S, HandState, angles_of
@@ -93,7 +93,7 @@ def test_the_bar_lies_still_follows_the_palm_and_comes_back_without_a_jump() -> 
     assert np.linalg.norm(moved, axis=1).max() < 3.0  # m/s^2; a jump of 2 mm would be 5
     for k in range(ROUNDS):
         of_round = slice(round(k * ROUND_S / STEP_S), round((k + 1) * ROUND_S / STEP_S))
-        lifted = motion.at(k * ROUND_S + LIFTED_S * float(motion.pace[k])).things[0]
+        lifted = motion.at(k * ROUND_S + TIMING.lifted_s * float(motion.pace[k])).things[0]
         assert 0.07 < place[0, 1, 3] - lifted.T_rig_object[1, 3] < 0.13
         rotations = place[0, :3, :3].T @ place[of_round, :3, :3]
         rotated = np.arccos(np.clip(0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
@@ -105,7 +105,7 @@ def held_times(motion: Grasp, step_s: float) -> list[float]:
     return [
         (k * ROUND_S) + s * float(motion.pace[k])
         for k in range(ROUNDS)
-        for s in np.arange(CLOSED_S, RELEASE_S, step_s).tolist()
+        for s in np.arange(TIMING.closed_s, TIMING.release_s, step_s).tolist()
     ]
 
 
@@ -118,12 +118,20 @@ def test_both_cameras_lose_all_tips_while_it_is_held_and_never_the_back(side: st
         assert shown[:, :5].max() < 0.5
         assert (shown[:, :5] < 0.1).mean() > 0.8
         assert shown[:, 5].min() > 0.9
-        back = renderer.visible_fraction(BACK_S)
+        back = renderer.visible_fraction(TIMING.back_s)
         assert back.min() > 0.9  # at rest all are seen again
 
 
 def test_the_timeline_is_in_order() -> None:
-    assert CLOSED_S < LIFT_S < LIFTED_S < LOWER_S < RELEASE_S < BACK_S < ROUND_S
+    assert (
+        TIMING.closed_s
+        < TIMING.lift_s
+        < TIMING.lifted_s
+        < TIMING.lower_s
+        < TIMING.release_s
+        < TIMING.back_s
+        < ROUND_S
+    )
 
 
 class Before:

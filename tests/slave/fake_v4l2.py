@@ -38,34 +38,34 @@ class Knob:
 
 def webcam_knobs() -> list[Knob]:
     """Controls of a common UVC camera, named as kernel 6 does; the last one is of a kernel before 5.10."""
-    off_on = (abi.TYPE_BOOLEAN, 0, 1, 1)
+    off_on = (abi.V4L2.type_boolean, 0, 1, 1)
     return [
-        Knob(0x00980001, "User Controls", 6, 0, 0, 0, 0, flags=abi.CTRL_READ_ONLY),
-        Knob(0x00980900, "Brightness", abi.TYPE_INTEGER, -64, 64, 1, 0),
+        Knob(0x00980001, "User Controls", 6, 0, 0, 0, 0, flags=abi.V4L2.ctrl_read_only),
+        Knob(0x00980900, "Brightness", abi.V4L2.type_integer, -64, 64, 1, 0),
         Knob(0x0098090C, "White Balance, Automatic", *off_on, 1),
-        Knob(0x00980913, "Gain", abi.TYPE_INTEGER, 0, 100, 1, 17),
+        Knob(0x00980913, "Gain", abi.V4L2.type_integer, 0, 100, 1, 17),
         Knob(
             0x00980918,
             "Power Line Frequency",
-            abi.TYPE_MENU,
+            abi.V4L2.type_menu,
             0,
             2,
             1,
             1,
             {0: "Disabled", 1: "50 Hz", 2: "60 Hz"},
         ),
-        Knob(0x0098091A, "White Balance Temperature", abi.TYPE_INTEGER, 2800, 6500, 10, 4600),
+        Knob(0x0098091A, "White Balance Temperature", abi.V4L2.type_integer, 2800, 6500, 10, 4600),
         Knob(
             0x009A0901,
             "Exposure, Auto",
-            abi.TYPE_MENU,
+            abi.V4L2.type_menu,
             0,
             3,
             1,
             3,
             {1: "Manual Mode", 3: "Aperture Priority Mode"},
         ),
-        Knob(0x009A0902, "Exposure Time, Absolute", abi.TYPE_INTEGER, 1, 5000, 1, 157),
+        Knob(0x009A0902, "Exposure Time, Absolute", abi.V4L2.type_integer, 1, 5000, 1, 157),
         Knob(0x009A0903, "Exposure, Dynamic Framerate", *off_on, 1),
     ]
 
@@ -104,13 +104,13 @@ class Camera:
     real_rate_hz: float | None = None
     keeps_rate: bool = False
     stepwise: tuple[int, int, int, int, int, int] | None = None
-    capabilities: int = abi.CAP_CAPTURE | abi.CAP_STREAMING
-    stamp_flags: int = abi.STAMP_MONOTONIC | abi.STAMP_START_OF_EXPOSURE
+    capabilities: int = abi.V4L2.cap_capture | abi.V4L2.cap_streaming
+    stamp_flags: int = abi.V4L2.stamp_monotonic | abi.V4L2.stamp_start_of_exposure
     stamp_zero_ns: int = field(default_factory=lambda: time.monotonic_ns() - 2_000_000_000)
     counts: bool = True
     queue: int = 1
     padding: int = 0
-    quantization: int = abi.DEFAULT_RANGE
+    quantization: int = abi.V4L2.default_range
     low_words: bool = False
     pictures: Sequence[np.ndarray] = ()
     skip: frozenset[int] = frozenset()
@@ -218,7 +218,7 @@ class FakeDevice:
 
     def _querycap(self, found: abi.Capability) -> None:
         found.card, found.driver = b"Fake Cam", b"uvcvideo"
-        found.capabilities = abi.CAP_DEVICE_CAPS | abi.CAP_CAPTURE | abi.CAP_STREAMING
+        found.capabilities = abi.V4L2.cap_device_caps | abi.V4L2.cap_capture | abi.V4L2.cap_streaming
         found.device_caps = self.camera.capabilities
 
     def _enum_fmt(self, entry: abi.FormatDescription) -> None:
@@ -232,7 +232,7 @@ class FakeDevice:
             entry.size[:] = self.camera.stepwise
             return
         size = _nth(list(self.camera.formats[abi.fourcc_text(entry.pixel_format)]), entry.index)
-        entry.type = abi.DISCRETE
+        entry.type = abi.V4L2.discrete
         entry.size[0], entry.size[1] = size
 
     def _enum_intervals(self, entry: abi.FrameIntervals) -> None:
@@ -243,7 +243,7 @@ class FakeDevice:
             entry.type = 2
             entry.interval[:] = (1, round(max(rates)), 1, round(min(rates)), 1, 1)
             return
-        entry.type = abi.DISCRETE
+        entry.type = abi.V4L2.discrete
         entry.interval[0], entry.interval[1] = 1000, round(1000 * _nth(list(rates), entry.index))
 
     def _s_fmt(self, asked: abi.Format) -> None:
@@ -266,8 +266,8 @@ class FakeDevice:
         asked.numerator, asked.denominator = round(1e7 / self._rate_hz), 10_000_000  # UVC counts 100 ns
 
     def _query_control(self, query: abi.QueryControl) -> None:
-        assert query.id & abi.CTRL_NEXT
-        after = query.id & ~abi.CTRL_NEXT
+        assert query.id & abi.V4L2.ctrl_next
+        after = query.id & ~abi.V4L2.ctrl_next
         knob = _nth(
             [knob for knob in sorted(self.camera.knobs, key=lambda k: k.number) if knob.number > after], 0
         )
@@ -322,7 +322,7 @@ class FakeDevice:
         buffer.index, buffer.bytesused = index, used
         buffer.sequence = number if self.camera.counts else 0
         buffer.tv_sec, buffer.tv_usec = divmod(stamp_us, 1_000_000)
-        buffer.flags = self.camera.stamp_flags | (abi.BUF_ERROR if number in self.camera.damaged else 0)
+        buffer.flags = self.camera.stamp_flags | (abi.V4L2.buf_error if number in self.camera.damaged else 0)
 
     def _streamon(self, _kind: c.c_int) -> None:
         self._streaming = True

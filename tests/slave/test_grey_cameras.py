@@ -163,7 +163,7 @@ def test_luma_of_the_full_range_is_not_stretched() -> None:
     np.testing.assert_array_equal(luma(data, "YUYV", (2, 1), 4, full_range=True), [[16, 235]])
     limited, full = (
         usb(Camera(formats={"YUYV": {SIZE: (RATE_HZ,)}}, quantization=coded), Pixels.LUMA).read()
-        for coded in (abi.DEFAULT_RANGE, abi.FULL_RANGE)
+        for coded in (abi.V4L2.default_range, abi.V4L2.full_range)
     )
     assert limited is not None
     assert full is not None

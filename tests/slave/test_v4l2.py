@@ -306,12 +306,12 @@ def test_frames_handed_over_are_never_written_again() -> None:
 @pytest.mark.parametrize(
     ("flags", "middle_ns"),
     [
-        (abi.STAMP_MONOTONIC | abi.STAMP_START_OF_EXPOSURE, 2_500_000),
+        (abi.V4L2.stamp_monotonic | abi.V4L2.stamp_start_of_exposure, 2_500_000),
         (
-            abi.STAMP_MONOTONIC,
+            abi.V4L2.stamp_monotonic,
             -(480 * 30_000) - 2_500_000,
         ),  # end of frame: all rows and half an exposure earlier
-        (abi.STAMP_START_OF_EXPOSURE, 2_500_000),  # clock not said: found by its value
+        (abi.V4L2.stamp_start_of_exposure, 2_500_000),  # clock not said: found by its value
     ],
 )
 def test_a_frame_has_the_time_of_the_middle_of_row_zero(flags: int, middle_ns: int) -> None:

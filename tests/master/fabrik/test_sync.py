@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.messages import MarkerDetections
-from master.fabrik.propagate import HISTORY
+from master.fabrik.propagate import SETTINGS
 from master.fabrik.sync import SILENT_FRAMES, FrameSet, FrameSync
 from tests.hand_helpers import camera_models, detections, rig_file
 
@@ -359,7 +359,7 @@ def test_what_was_emitted_stays_as_it_was() -> None:
 
 def test_an_instant_older_than_all_that_is_held_has_no_frame() -> None:
     machine = sync()
-    for k in range(2 * HISTORY):
+    for k in range(2 * SETTINGS.history):
         machine.push(frame("left", k, k * PERIOD))
     found = machine.at(0)
     assert found.missing.all()

@@ -13,7 +13,7 @@ import pytest
 from common.messages import Health, MarkerDetections, Message, encode
 from common.messages.parts import MAX_TIME_NS
 from common.messages.streams import sender_of
-from common.recording.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
+from common.recording.mcap_bounds import BOUNDS, CHUNK_RECORDS
 from master.recording.files import carried_files
 from master.rig.files import RigFiles
 from tests.commands import command
@@ -176,7 +176,7 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "channels without end": (lambda _: many_channels(), {INFO: "more than 1024 channels"}),
     "64 MiB of tiny messages": (
         lambda _: bomb(HostileMcap().about(DESK), tiny_messages(63 << 20)).ended({1: 1}),
-        {INFO: rf"chunk at byte \d+: 660\d+ bytes unpacked, at most {CHUNK_BYTES}"},
+        {INFO: rf"chunk at byte \d+: 660\d+ bytes unpacked, at most {BOUNDS.chunk_bytes}"},
     ),
     "64 MiB of tiny messages, cut": (
         lambda _: bomb(HostileMcap().about(DESK), tiny_messages(63 << 20)).cut(),

@@ -18,7 +18,7 @@ from common.errors import PhalanxError
 from common.messages import MAX_STILL_BYTES, Backlog, MarkerDetections, Message, Still, encode
 from common.messages.parts import MAX_TIME_NS
 from common.messages.streams import STREAMS, sender_of
-from common.recording.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
+from common.recording.mcap_bounds import BOUNDS, CHUNK_RECORDS
 from common.recording.messages import MessageWriter, open_messages
 from master.recording.export.run import Wanted, export
 from master.recording.files import recorded_setups
@@ -169,7 +169,7 @@ def test_what_we_write_ourselves_is_within_all_bounds(tmp_path: Path) -> None:
 def test_a_chunk_at_a_bound_is_read_and_one_beyond_is_lost(tmp_path: Path) -> None:
     row = Channel(1, "topic", "msgpack", {"stream": "health", "name": "master"}, 0)
     first = record(row) + record(message(encode(report(1))))
-    room = CHUNK_BYTES - len(first) - RECORD.size
+    room = BOUNDS.chunk_bytes - len(first) - RECORD.size
     for more, read in (
         (RECORD.pack(99, room) + bytes(room), 1),
         (RECORD.pack(99, room + 1) + bytes(room + 1), 0),

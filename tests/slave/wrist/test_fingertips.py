@@ -23,7 +23,7 @@ from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import laser_lines
-from slave.wrist.outline import DIRECTIONS, fitted
+from slave.wrist.outline import SETTINGS, fitted
 from slave.wrist.postures import APEX, END, MCP_RAD, postures_of
 from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
@@ -198,7 +198,7 @@ def test_the_outline_of_a_disk_is_found_to_parts_of_a_pixel(radius: float) -> No
     image = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
     for off in ((0.0, 0.0), (0.3, -0.2), (-0.2, 0.35)):
         guess = true + radius * np.array(off)
-        circle = fitted(image, guess[None], np.array([1.05 * radius]), np.ones((1, DIRECTIONS)))
+        circle = fitted(image, guess[None], np.array([1.05 * radius]), np.ones((1, SETTINGS.directions)))
         np.testing.assert_allclose(circle.middle[0], true, atol=0.04 * radius)
         assert abs(circle.radius[0] - radius) < 0.08 * radius + 1.0
         assert circle.shown[0] > 0.9
@@ -206,7 +206,7 @@ def test_the_outline_of_a_disk_is_found_to_parts_of_a_pixel(radius: float) -> No
 
 def test_nothing_is_no_outline() -> None:
     image = np.full((480, 640), 80, dtype=np.uint8)
-    circle = fitted(image, np.array([[300.0, 200.0]]), np.array([20.0]), np.ones((1, DIRECTIONS)))
+    circle = fitted(image, np.array([[300.0, 200.0]]), np.array([20.0]), np.ones((1, SETTINGS.directions)))
     assert circle.shown[0] == 0.0
     np.testing.assert_allclose(circle.middle, [[300.0, 200.0]])
 

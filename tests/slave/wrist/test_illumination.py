@@ -10,7 +10,7 @@ import pytest
 
 from bench.wrist.strobe import Shown, rendered
 from common.arrays import Bool, Image
-from slave.wrist.illumination import LED_LEAST, Evidence, brighter, coarse, evidence, unlit
+from slave.wrist.illumination import SETTINGS, Evidence, brighter, coarse, evidence, unlit
 
 LIGHTS = ("dark", "indoor", "bright")
 
@@ -131,4 +131,4 @@ def test_colour_and_grey_pictures_are_alike() -> None:
 def test_the_margin_is_that_of_the_weakest() -> None:
     assert Evidence(3.0, 1.0, np.inf, 2.0).margin == 1.0
     assert Evidence(3.0, 1.0, -0.5, 2.0).margin == -0.5
-    assert 0.0 < LED_LEAST < 1.0
+    assert 0.0 < SETTINGS.led_least < 1.0

@@ -7,7 +7,7 @@ import pytest
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.geometry.camera_model import CameraModel
-from common.sim.board import HELD_S, MOVED_S, BoardRenderer
+from common.sim.board import BOARD, BoardRenderer
 from common.sim.card import DISTANCES_M, MARKER, CardScene
 from master.calibrate.depth.fit import FITS
 from master.calibrate.depth.source import pair_of, parse_target, straightened
@@ -35,7 +35,7 @@ def sweep() -> Sweep:
             LightAdaptiveDetector(CAMERAS[name], RIG.markers, Inline()),
         )
         for k in places:
-            t_s = k * (HELD_S + MOVED_S)
+            t_s = k * (BOARD.held_s + BOARD.moved_s)
             found = detector.push(renderer.render(t_s), round(t_s * 1e9))
             uv[c, k], area[c, k], sigma[c, k] = found.uv[index], found.area[index], found.sigma_px[index]
     return Sweep(
