@@ -22,11 +22,10 @@ from bench.report import Row, datasets, rms, skipped
 from common.arrays import Bool, Float
 from common.calibration import ImuCalibration
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
-from common.imu.fusion import OrientationFilter
-from common.imu_score import TiltErrors
+from common.imu.fusion import OrientationFilter, TiltErrors
 from common.messages import ImuSample
-from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 from common.sim.motion import HandState
+from common.sim.sensors import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 
 _NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}

@@ -16,10 +16,10 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from slave.markers.detector import Detections
-from slave.markers.light_adaptive import detector_for
-from slave.markers.workers import Inline
+from slave.markers.reloadable import detector_for
+from slave.markers.white_balance import Inline
 
 START_NS = 1_000_000_000  # scene time 0 on the clock of the messages
 HOLD_S, MOVE_S = 0.8, 0.7  # of a motion that holds poses

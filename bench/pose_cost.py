@@ -31,12 +31,10 @@ from bench.both.shown import shown
 from bench.report import ROOT, Row
 from bench.rigs.rooms import ROOM, detections, in_order, room
 from common.messages import ImuSample, encode
-from master.rig.files import load_setups
-from master.rig.setup import RigSetup
-from master.run.app import result_at
+from master.rig.setup import RigSetup, load_setups
+from master.run.app import StageTimes, result_at
 from master.run.dispatcher import Dispatcher
 from master.run.link import MasterLink
-from master.run.stages import StageTimes
 from master.run.tuning import LivePipeline
 from slave.link import SlaveLink
 
@@ -69,7 +67,7 @@ began_s = process_time()
 import numba
 spent_s = process_time() - began_s
 from pathlib import Path
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 from master.run.dispatcher import new_dispatcher
 setup, began_s = load_setup(Path("calib_json"), "desk"), process_time()
 new_dispatcher([setup])

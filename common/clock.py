@@ -1,7 +1,11 @@
-"""Time: monotonic clock, simulated foreign clock, and a drift-free loop tick.
+"""Clocks give monotonic time; a ticker keeps a loop's rate, a bucket limits it.
+
+Time: monotonic clock, simulated foreign clock, and a drift-free loop tick.
 
 Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never
 asked, and setting it moves nothing. How the clock of another machine runs is `common.link.clock_offset`.
+
+Limit how often something may happen: a token bucket.
 """
 
 import time
@@ -104,3 +108,26 @@ class Ticker:
         while (left_ns := self._next_ns - self._clock.now_ns()) > 0:
             time.sleep(left_ns * 1e-9)
         return self._next_ns
+
+
+class TokenBucket:
+    """Token bucket that bounds how many messages are taken.
+
+    Holds how many may come now, and when it was last asked.
+    """
+
+    def __init__(self, per_s: float, at_once: float) -> None:
+        """So many a second, of which `at_once` may come together."""
+        self._per_s = per_s
+        self._most = self._left = at_once
+        self._t_ns: int | None = None
+
+    def take(self, t_ns: int) -> bool:
+        """Whether a message that came at `t_ns` [ns] is within the rate."""
+        elapsed_ns = 0 if self._t_ns is None else max(t_ns - self._t_ns, 0)
+        self._t_ns = t_ns
+        self._left = min(self._left + self._per_s * elapsed_ns * 1e-9, self._most)
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True

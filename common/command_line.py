@@ -1,18 +1,29 @@
-"""Command-line program of several commands.
+"""A command line parses options, runs one of several commands and prints.
+
+Terminal output: results on standard output, remarks on standard error.
+
+The lines are for whoever started the program.
+
+Command-line program of several commands.
 
 A table of names, and modules that are imported only when a command is requested.
 
 Each command has two functions, named as `module:function`. One adds its options to a parser; its docstring is the help,
 with the examples behind a line `Examples:`. It is imported for the help and to read the options, so its module imports
 nothing heavy. The other does the work: it takes the options, and returns the exit code, or None for 0.
+
+Types of command-line options: numbers with bounds, and ports.
+
+Their errors name the value and what is expected.
 """
 
 import difflib
 import logging
+import math
 import os
 import re
 import sys
-from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -20,9 +31,20 @@ from textwrap import dedent
 from typing import Any, NoReturn, cast
 
 from common.errors import PhalanxError
-from common.service_manager import ServiceManager, one_line
-from common.supervisor import supervised_threads
-from common.terminal import echo
+from common.supervisor import ServiceManager, one_line, supervised_threads
+
+
+def echo(text: str = "", *, end: str = "\n", error: bool = False) -> None:
+    """Write a line at once, to standard error if asked to."""
+    stream = sys.stderr if error else sys.stdout
+    stream.write(text + end)
+    stream.flush()
+
+
+def remark(text: str) -> None:
+    """Write a line to standard error at once."""
+    echo(text, error=True)
+
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 _EXAMPLES = "Examples:"
@@ -253,3 +275,92 @@ def help_of(declare: Callable[..., object]) -> tuple[str, str]:
 def _function(place: str) -> Callable[..., Any]:
     module, _, name = place.partition(":")
     return cast("Callable[..., Any]", getattr(import_module(module), name))
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A finite number, or a whole one, between two bounds.
+
+    Attributes:
+        low, high: Bounds; None: there is none.
+        whole: Whether it has to be an integer.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    whole: bool = False
+
+    def __call__(self, text: str) -> float | int:
+        """Read it.
+
+        Raises:
+            ArgumentTypeError: It is no such number.
+        """
+        try:
+            value = int(text) if self.whole else float(text)
+        except ValueError as error:  # argparse would print the name of the class
+            kind = "a whole number" if self.whole else "a number"
+            raise ArgumentTypeError(f"{text}: must be {kind}") from error
+        if not math.isfinite(value):
+            raise ArgumentTypeError(f"{text}: must be a finite number")
+        if self.low is not None and value < self.low:
+            raise ArgumentTypeError(f"{text}: must be at least {self.low:g}")
+        if self.high is not None and value > self.high:
+            raise ArgumentTypeError(f"{text}: must be at most {self.high:g}")
+        return value
+
+
+def number(low: float | None = None, high: float | None = None) -> Number:
+    """A finite number between these bounds."""
+    return Number(low, high)
+
+
+def whole(low: int | None = None, high: int | None = None) -> Number:
+    """A whole number between these bounds."""
+    return Number(low, high, whole=True)
+
+
+def positive(text: str) -> float:
+    """A number above 0.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    value = Number()(text)
+    if not value > 0.0:
+        raise ArgumentTypeError(f"{text}: must be positive")
+    return value
+
+
+def megabytes(text: str) -> float:
+    """A number from 0 on.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    value = Number()(text)
+    if value < 0.0:
+        raise ArgumentTypeError(f"{text}: must not be negative")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentTypeError(f"{text}: must be a whole number, at least 1")
+    return int(text)
+
+
+def port(text: str) -> int:
+    """A port of UDP or TCP.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    if not text.isdecimal() or not 0 < int(text) < 65536:
+        raise ArgumentTypeError(f"{text}: must be a port, 1 to 65535")
+    return int(text)

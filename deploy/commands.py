@@ -1,22 +1,158 @@
-"""Commands `phalanx demo` and those of `phalanx fleet status` for other machines.
+"""Commands run the demo, or deploy, roll back and uninstall slaves.
+
+What the options of `phalanx fleet deploy`, `rollback` and `uninstall` mean.
+
+Keys for a dry run.
+
+As if the keys folder had what it lacks, while nothing is written into it.
+
+Commands `phalanx demo` and those of `phalanx fleet status` for other machines.
 
 The latter are the commands that reach other machines.
 """
 
+import argparse
+import contextlib
 import functools
 import json
+import socket
 import sys
+import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
-from deploy.demo import DemoSettings, run_demo, stop_on_signals
-from deploy.deployment import Lines, deploy, roll_back, uninstall
-from deploy.host_options import ears_of, reached_of, rig_of, wish_of
-from deploy.keys import prepared_keys
-from deploy.sensors import DemoError, best_rigs
-from deploy.targets import DeployError, Target, targets_of
-from deploy.wheelhouse import Kind, export
+from deploy.arguments import check_reach, check_wish
+from deploy.demo import DemoError, DemoSettings, best_rigs, run_demo, stop_on_signals
+from deploy.deployment import Lines, Reached, Wish, deploy, make_keys, reach_of, roll_back, uninstall
+from deploy.payload import Kind, export
+from deploy.sender_check import Ears
+from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
+
+_EVERYWHERE = "255.255.255.255"  # of the network that --master is in
+
+
+def rig_of(options: argparse.Namespace) -> RigFile:
+    """Return the rig, which must have the requested role.
+
+    Raises:
+        DeployError: It is not, or lacks an option.
+    """
+    rig = read_rig(options.calibration, options.rig)
+    if options.role is not None and (options.role == "wrist") != (rig.kind == "wrist"):
+        raise DeployError(f"--role {options.role}: rig {rig.name!r} is of kind {rig.kind!r}")
+    return rig
+
+
+def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
+    """What is wanted on the machines."""
+    check_wish(options, rig)
+    handed = [
+        word
+        for name in ("camera", "options", "overlay")
+        for one in getattr(options, name)
+        for word in (f"--{name}={one}",)
+    ]
+    handed += [
+        f"--{name}={value}"
+        for name in ("role", "imu", "lights")
+        if (value := getattr(options, name)) is not None
+    ]
+    return Wish(
+        options.master,
+        rig,
+        options.calibration,
+        options.keys,
+        tuple(handed),
+        tuple(options.camera),
+        options.wheelhouse,
+        not options.no_apt,
+        options.dry_run,
+        options.ready_s,
+    )
+
+
+def ears_of(options: argparse.Namespace) -> Ears | None:
+    """Return how first datagrams are received.
+
+    Here, or at the master of another machine.
+    """
+    if options.no_wait:
+        return None
+    address = _here(options.master)
+    bus_host = "127.0.0.1" if address else options.master
+    words = ["--rig", options.rig, "--calibration", str(options.calibration)]
+    beacon_port, data_port, bus_port = 47800, 47801, 47802
+    words += ["--bus", options.bus or f"tls/{bus_host}:{bus_port}"]
+    words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{data_port}"]
+    default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
+    words += ["--beacon", options.beacon or f"{default}:{beacon_port}"]
+    return Ears(tuple(words), options.keys, options.wait_s)
+
+
+def reached_of(options: argparse.Namespace) -> Reached:
+    """How the machines are reached."""
+    check_reach(options)
+    return Reached(
+        reach_of(options.user, options.port, options.identity, options.ssh_option), options.deadline
+    )
+
+
+def _here(master: str) -> str | None:
+    """The address of `--master`, if it is one of this machine's.
+
+    Raises:
+        DeployError: The name is not known.
+    """
+    try:
+        address = str(socket.getaddrinfo(master, None, socket.AF_INET)[0][4][0])
+    except OSError as error:
+        raise DeployError(f"--master {master}: {error.strerror}; give its address") from error
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, 0))
+        except OSError:
+            return None
+    return address
+
+
+Notify = Callable[[str], None]
+
+
+@contextlib.contextmanager
+def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Notify) -> Generator[Path]:
+    """A keys folder that has all that these senders need.
+
+    Args:
+        folder: That of the user; what it lacks is made.
+        names: Senders.
+        dry_run: Nothing is made there. A private folder takes its place for as long as this lasts, so that the rest of
+            the way can be looked at: links to what is there, and what is lacking, made for nobody.
+        notify: Called with what is made.
+
+    Raises:
+        DeployError: They cannot be made.
+    """
+    if not dry_run:
+        make_keys(folder, names, notify)
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="phalanx-keys-") as private:
+        keys = Path(private) / "keys"
+        make_keys(keys, names, lambda _line: None)
+        lacking = 0
+        for file in [path for path in keys.rglob("*") if path.is_file()]:
+            there = folder / file.relative_to(keys)
+            if there.is_file():
+                file.unlink()
+                file.symlink_to(there.resolve())
+            else:
+                lacking += 1
+        if lacking:
+            notify(f"would make keys in {folder}")
+        yield keys
+
 
 Work = Callable[[Namespace], int]
 

@@ -1,7 +1,16 @@
-"""Names of the drivers as the help and the errors list them.
+"""Name the drivers and the engines that options choose from.
+
+Names of the drivers as the help and the errors list them.
 
 They are those behind `--camera`, `--imu`, `--tracker` and `--lights`.
+
+Engines of the inner loops.
+
+OpenCV and numpy, or machine code that does the same. The engine is chosen by name alone.
 """
+
+from collections.abc import Callable
+from typing import TypeVar
 
 REAL_CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 CAMERAS = f"{REAL_CAMERAS} | synthetic | replay:FOLDER"
@@ -12,10 +21,33 @@ TRACKERS = f"{REAL_TRACKERS} | synthetic"
 SWITCHED_LIGHTS = "gpio:CHIP:LASER,LED | i2c:BUS[:ADDRESS]"
 LIGHTS = f"{SWITCHED_LIGHTS} | camera | external"
 SCANS = ("auto", "full", "windows")
-# The units of a table of an IMU, by what is measured; a test compares them with `common.imu.csv_columns`.
+# The units of a table of an IMU, by what is measured; a test compares them with `common.imu.csv_table`.
 IMU_UNITS = {
     "time": ("s", "ms", "us", "ns"),
     "gyro": ("rad/s", "deg/s", "mdeg/s"),
     "accel": ("m/s^2", "g", "mg"),
     "mag": ("uT", "T", "mT", "nT", "gauss", "mgauss"),
 }
+
+
+ENGINES = ("numpy", "numba")
+_Engine = TypeVar("_Engine")
+
+
+def engine_of(name: str, numpy: _Engine, numba: Callable[[], _Engine]) -> _Engine:
+    """The engine of a name of `ENGINES`.
+
+    Args:
+        name: What the user chose.
+        numpy: The engine that is always there.
+        numba: Loads the other one: an optional package, which only who asks for it loads.
+
+    Raises:
+        PhalanxError: numba is asked for and not installed; the message states how to install it.
+        ValueError: No such name.
+    """
+    if name == "numpy":
+        return numpy
+    if name == "numba":
+        return numba()
+    raise ValueError(f"engine {name!r}, not one of {', '.join(ENGINES)}")

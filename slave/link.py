@@ -2,7 +2,7 @@
 
 It runs from the first beacon to data, as a push machine.
 
-`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
+`common.link.session.RULES` defines what follows from each event; this file classifies datagrams as events.
 - While the master of the session is received, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
@@ -21,20 +21,35 @@ from hmac import compare_digest
 
 from common.bus.endpoints import reached_at
 from common.clock import Clock
-from common.link.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
-from common.link.handshake import RULES, WELL_NS, Event, Role, Rule, State
-from common.link.link_key import LinkKey
+from common.link.datagram import (
+    HEADER,
+    OVERHEAD,
+    Address,
+    Header,
+    Kind,
+    LinkKey,
+    Opener,
+    Refusal,
+    Sealer,
+    parse,
+)
 from common.link.session import (
     NONCE_BYTES,
+    RULES,
+    WELL_NS,
     Beacon,
     EchoAnswer,
     EchoAsk,
+    Event,
     Hello,
     Random,
     RigKeys,
+    Role,
+    Rule,
     SessionKeys,
     Start,
     Started,
+    State,
     Unproven,
     Welcome,
     new_process_id,

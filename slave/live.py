@@ -1,35 +1,179 @@
-"""Send what a camera shows: detector, settings and previews around it."""
+"""Send what a camera shows, with what its picture says of light and colours.
+
+Marker colour from a click on the picture of a running slave.
+
+It finds the frame, the light and the other colours.
+
+Report of how the light affects the colours.
+
+Counts, metrics, and a log line before it costs a marker.
+
+Send what a camera shows: detector, settings and previews around it.
+"""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration
+from common.calibration.camera_settings import ColourPick
+from common.errors import CameraError
 from common.hand.model import FINGERS
-from slave.colour_sampler import ColourSampler
-from slave.counters import DetectionCounters
-from slave.light_report import LightReport
-from slave.markers.ambiguity import ambiguity_counts, ambiguity_metrics
-from slave.markers.calibrated import CalibratedDetector
+from slave.markers.colours import SampledColours
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
-from slave.markers.light_adaptive import can_adapt, detector_for
-from slave.markers.null_detector import NullDetector
-from slave.markers.reloadable import AnyDetector, ReloadableDetector, marker_changes
-from slave.markers.scan_choice import Scan, ScanChoice
-from slave.overlay import MarkerOverlay, WristOverlay
-from slave.preview import Previews
+from slave.markers.group import ambiguity_counts, ambiguity_metrics
+from slave.markers.reloadable import (
+    AnyDetector,
+    CalibratedDetector,
+    NullDetector,
+    ReloadableDetector,
+    can_adapt,
+    detector_for,
+    marker_changes,
+)
+from slave.markers.scan import Scan, ScanChoice
+from slave.markers.white_balance import ColourWarning
+from slave.preview import MarkerOverlay, Previews, WristOverlay
 from slave.raw import RawFrames, RawSettings
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, Sender, WristPipeline
-from slave.sources import FrameSource
+from slave.sources import Frame, FrameSource, Reporting
 from slave.tags.live import LiveTags, finder_of
 from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
-from slave.wrist.detector import WristDetector
+from slave.wrist.detector import NullWristDetector, WristDetector, view_of, wrist_changes
 from slave.wrist.engine import Engine as WristEngine
-from slave.wrist.null_detector import NullWristDetector
-from slave.wrist.reloadable import view_of, wrist_changes
+
+
+class ColourSampler:
+    """Holds what was picked since the start. Its callers take turns."""
+
+    def __init__(
+        self, detector: ReloadableDetector, shown: Callable[[int], Frame | None], markers: tuple[str, ...]
+    ) -> None:
+        """Pick colours of `markers`, those of the rig.
+
+        Args:
+            detector: Has the newest frame, and knows the light.
+            shown: Time of a preview [ns] -> its frame, if that is still there.
+            markers: Others in a camera file belong to other rigs, and collide with nothing here.
+        """
+        self._detector, self._shown, self._markers = detector, shown, markers
+        self._picked = SampledColours()
+
+    def pick(
+        self, wish: ColourPick, camera: CameraCalibration
+    ) -> tuple[CameraCalibration, Mapping[str, float]]:
+        """Return the camera file with the colour at the clicked position.
+
+        Also returns how many pixels it has, and what its range holds.
+
+        Raises:
+            CameraError: No frame was read yet.
+            FitError: As `SampledColours.sample`.
+        """
+        every = camera.markers or {}
+        ranges = {name: every[name] for name in self._markers if name in every}
+        light = self._detector.log_gains
+        done = self._picked.sample(self._image(wish.t_ns), light, wish.marker, wish.uv, ranges)
+        report = {
+            "pick.pixels": float(done.row.pixels),
+            "pick.own_share": done.row.own,
+            "pick.skin_share": done.row.skin,
+            "pick.background_px": done.row.background_px,
+        }
+        return replace(camera, markers=every | done.ranges), report
+
+    def _image(self, t_ns: int | None) -> Image:
+        """The picture that was clicked on, or else the newest one."""
+        if t_ns is not None and (frame := self._shown(t_ns)) is not None:
+            return frame.image
+        newest = self._detector.newest
+        if newest is None:
+            raise CameraError(
+                "pick: no frame was read yet: the camera is away, or the slave waits for a master"
+            )
+        return newest[0]
+
+
+ALL = "light"  # the subject of what concerns every marker
+_LOG = logging.getLogger(__name__)
+
+
+class LightReport:
+    """Counts warnings and logs them, and adds the light to what `others` report.
+
+    Holds the subjects warned of in the last frame, how often each was, and when each was last logged. The loop
+    writes, the health thread reads.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        detector: ReloadableDetector,
+        others: Reporting,
+        markers: tuple[str, ...],
+        show: Callable[[Frame], None] = lambda _frame: None,
+    ) -> None:
+        """Report on the `detector` of camera `name`; every frame is handed on to `show`."""
+        self._name, self._detector, self._others, self._show = name, detector, others, show
+        self._warned = dict.fromkeys((ALL, *markers), 0)
+        self._now: set[str] = set()
+        self._logged_ns: dict[str, int] = {}
+
+    def offer(self, frame: Frame) -> None:
+        """Take note after a frame, and hand it on."""
+        self._show(frame)
+        warnings = self._detector.warnings
+        if not warnings and not self._now:
+            return
+        now = {ALL if warning.marker is None else warning.marker for warning in warnings}
+        for subject in now - self._now:
+            self._warned[subject] += 1
+        self._now = now
+        for warning in warnings:
+            subject = ALL if warning.marker is None else warning.marker
+            last_ns = self._logged_ns.get(subject)
+            if last_ns is None or frame.t_ns - last_ns >= 10_000_000_000:  # the same one no more often
+                self._logged_ns[subject] = frame.t_ns
+                _LOG.warning("%s: %s", self._name, warning.text)
+
+    def counts(self) -> dict[str, int]:
+        """Return the counts of the other reports and of the light.
+
+        The light's are warnings.light, warnings.<marker>, refused.light, colour_tables.
+        """
+        warned = {f"warnings.{subject}": count for subject, count in self._warned.items()}
+        own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
+        return {**self._others.counts(), **warned, **own}
+
+    def metrics(self) -> dict[str, float]:
+        """Return the metrics of the other reports and of the light.
+
+        While the light is followed, its metrics compare it with calibration.
+
+        That is red and blue relative to green, and green. Of markers that look alike
+        alike.<one>..<other>, the hues between them.
+        """
+        if not self._detector.adapts:
+            return dict(self._others.metrics())
+        blue, green, red = np.exp(self._detector.log_gains).tolist()
+        light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
+        return {**self._others.metrics(), **light, **_ambiguous(self._detector.warnings)}
+
+
+def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
+    # A name in `Health` has 64 characters
+    return {
+        f"alike.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
+    }
+
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -40,7 +184,7 @@ NO_COLOUR = (
     "{}: markers: no colour for {} yet, which cannot be seen: pick them in the console, or calibrate them with "
     "`phalanx-slave colours`"
 )
-_LOG = logging.getLogger(__name__)
+_LIVE_LOG = logging.getLogger(__name__)
 
 
 def send_detections(
@@ -211,11 +355,11 @@ def _maker(
 
     def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:
-            _LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
+            _LIVE_LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
             return CalibratedDetector(camera, rig.markers, engine, rig.free_markers)
         if colours == "follow":
             if not can_adapt(camera, rig.markers):
-                _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
+                _LIVE_LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
             return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
         return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
 

@@ -2,7 +2,7 @@
 
 Begun and ended by commands on the bus.
 
-    raw         begin a recording of raw frames (body: `common.messages.raw_wish.RawWish`), or ask for it to go on
+    raw         begin a recording of raw frames (body: `common.messages.command_bodies.RawWish`), or ask for it to go on
     raw_stop    end it; the answer comes when every frame that waited is written
 
 What is written is a folder as `phalanx-slave record` makes it, by the same recorder. The loop hands a frame over when
@@ -22,10 +22,9 @@ from pathlib import Path
 from common.calibration import CameraCalibration, load
 from common.clock import Clock
 from common.errors import CalibrationError, RecordingError
-from common.messages.raw_wish import RawWish
+from common.messages.command_bodies import RawWish
 from common.recording.frame_recording import Manifest
-from slave.progress import Length, megabytes
-from slave.recorder import ENCODERS, RESERVE_BYTES, Recorder, clock_of
+from slave.recorder import ENCODERS, RESERVE_BYTES, Length, Recorder, clock_of, megabytes
 from slave.sources import Frame, FrameSource
 from slave.tuning import CameraFiles
 

@@ -25,8 +25,7 @@ from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock
 from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections, Message, TagDetections, TrackerPose
-from slave.counters import Counters, DetectionCounters, imu_counters, pose_counters
-from slave.report import Reporter
+from slave.report import Counters, DetectionCounters, Reporter, imu_counters, pose_counters
 from slave.service import Service
 from slave.sources import Frame, ImuSource, Reporting, Source, TrackerSource
 from slave.uplink import Uplink

@@ -1,4 +1,6 @@
-"""Notifications from a slave to the system's service manager.
+"""Run as a service: notify the system's manager, and stop on its signals.
+
+Notifications from a slave to the system's service manager.
 
 Ready, what it does now, and that its loop goes round.
 
@@ -8,13 +10,20 @@ long and is no hang reports so: for the master it comes round again and again; a
 
 It is fed four times in a period, not twice: of a slave that is stopped for 3 s with a watchdog of 5 s, up to 3.75 s may
 have passed since it was asked to live, and it goes on; fed every 2.5 s it might be ended.
+
+Ctrl-C and a stop by the system as an event.
+
+For commands that run until they are requested to end.
 """
 
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from typing import Protocol
 
-from common.service_manager import WATCHDOG, ServiceManager, one_line
+from common.supervisor import WATCHDOG, ServiceManager, one_line
 
 LOST_PATIENCE_S = (
     90.0  # opening a camera again, all settings checked, takes seconds; one that hangs is given up
@@ -149,3 +158,25 @@ class Service:
         if not self._period_us:
             return ""
         return f"\n{WATCHDOG}={period_us}\nWATCHDOG=1" if period_us else "\nWATCHDOG=1"
+
+
+_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that either sets, from now until the process ends."""
+    stop = threading.Event()
+    for number in _NUMBERS:
+        signal.signal(number, lambda _number, _frame: stop.set())
+    return stop
+
+
+@contextmanager
+def stop_by_signal() -> Generator[threading.Event, None, None]:
+    """An event that either sets, for as long as the block runs."""
+    before = [signal.getsignal(number) for number in _NUMBERS]
+    try:
+        yield stop_on_signals()
+    finally:
+        for number, handler in zip(_NUMBERS, before, strict=True):
+            signal.signal(number, handler)

@@ -16,8 +16,7 @@ from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock
 from common.errors import BusError
-from common.link.datagram import Address
-from common.link.link_key import LinkKey
+from common.link.datagram import Address, LinkKey
 from common.link.session import Random
 from common.link.udp import READ_TIMEOUT_S, UdpSocket
 from common.messages import Message

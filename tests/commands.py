@@ -14,9 +14,9 @@ _FORKED = multiprocessing.get_context("forkserver")
 _FORKED.set_forkserver_preload(
     [
         "master.__main__",
-        "master.replay.detect",
+        "master.replay.offline",
         "slave.__main__",
-        "slave.offline",
+        "slave.commands.offline",
         "master.recording.export.run",
     ]
 )

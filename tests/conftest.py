@@ -39,8 +39,7 @@ OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py
 
 _KERNELS = (
     "common/kernels.py",
-    "common/messages/records.py",
-    "common/hand/capsule_gaps.py",
+    "common/hand/skin.py",
     "master/fabrik/*.py",
     "master/estimator/*.py",
     "master/gestures/*.py",

@@ -17,14 +17,12 @@ from common.calibration import (
     RigCalibration,
     load,
 )
-from common.calibration.hand_presets import preset_limits, without_tolerance
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, HandJoints, HandModel
-from common.hand.profiles import generated_profile
+from common.hand.profiles import generated_profile, preset_limits, without_tolerance
 from common.messages import MarkerDetections
-from master.fabrik.cap_views import seen_shift
-from master.fabrik.caps import CapTables
+from master.fabrik.caps import CapTables, seen_shift
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 

@@ -15,8 +15,7 @@ from common.geometry.transforms import invert, matrix_to_quaternion, rigid, tran
 from common.messages import MarkerDetections, TagDetections, TrackerPose
 from common.sim.scene import Scene
 from master.evaluation.report import Played
-from master.rig.files import load_setups
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setups
 
 PERIOD_NS = 16_666_667
 START_NS = 1_000_000_000

@@ -128,7 +128,7 @@ class SlavesRig(Rig):
         _put(self.system / "disk_free_mb", f"{free_mb:g}\n")
 
     def fault(self, camera: str, **faults: object) -> None:
-        """Put a camera wrong (`slave.cameras.faulty.Faults`); nothing: it is well again."""
+        """Put a camera wrong (`slave.cameras.synthetic.Faults`); nothing: it is well again."""
         _put(self.faults[camera], json.dumps(faults))
 
     def _tracking(self) -> bool:

@@ -30,7 +30,7 @@ FORBIDDEN: dict[str, frozenset[str]] = {
 ONLY_IN: dict[str, tuple[str, ...]] = {
     "zenoh": (
         "common/bus/zenoh_bus.py",
-        "master/outputs/network/ros2_link.py",
+        "master/outputs/network/ros2.py",
     ),  # the second: ROS 2's own network
     "nicegui": ("master/console/*.py",),
     "rerun": ("master/outputs/rerun*.py",),
@@ -61,9 +61,7 @@ SYSTEM = frozenset({"picamera2", "libcamera"})
 PC_ONLY = {
     "common/kernels.py": frozenset({"numba"}),
     "common/recording/messages.py": frozenset({"mcap"}),
-    "common/recording/parts.py": frozenset({"mcap"}),
-    "common/recording/mcap_file.py": frozenset({"mcap"}),
-    "common/recording/mcap_chunk.py": frozenset({"mcap", "zstandard"}),
+    "common/recording/mcap_file.py": frozenset({"mcap", "zstandard"}),
 }
 # Words of version 0.1 for what estimation, vision, robotics and networking have words for.
 PRIVATE = frozenset(
@@ -366,7 +364,7 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (undeclared, "slave/app.py", "import starlette", "import cv2, numpy, msgspec"),
     (undeclared, "master/run/app.py", "import pandas", "import starlette, rerun, scipy.optimize"),
     (undeclared, "slave/markers/centroid.py", "import numba", "import cv2"),
-    (undeclared, "slave/markers/fast_scan.py", "import scipy", "import numba"),
+    (undeclared, "slave/markers/fast.py", "import scipy", "import numba"),
     (relative_imports, "slave/app.py", "from . import cameras", "from slave import cameras"),
     (
         bare_excepts,

@@ -12,10 +12,10 @@ from common.calibration.gesture_settings import GestureSettings
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.output_settings import OutputSettings
 from common.errors import MessageError
-from common.link.handshake import state_pages
+from common.link.session import state_pages
 from common.messages import AnyMessage, HandPose, Health, decode, encode
-from common.messages.metrics import METRICS, is_known, metrics_page
 from common.messages.schema import bounds_table, bus_schema
+from common.messages.state import METRICS, is_known, metrics_page
 from common.recording.frame_recording import Manifest
 
 MESSAGES = "messages.json"

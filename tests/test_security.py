@@ -8,7 +8,7 @@ from common.bus.endpoints import default_bus
 from common.calibration.output_settings import OutputSettings
 from master.commands.options import CALIB_JSON, HERE_BEACON, HERE_BIND
 from master.console.state import ConsoleSettings
-from master.outputs.rerun_process import viewer_arguments
+from master.outputs.rerun import viewer_arguments
 from slave.uplink import ANYWHERE
 from tests.sockets import PAGE, Listener, rows, undocumented
 

@@ -16,11 +16,11 @@ WALL |= {"datetime": {"now", "utcnow", "today"}, "date": {"today"}}
 # Beside the line: what people set up, look at and keep, and what is sent on in the time of other programs.
 NOT_LIVE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/outputs/network/",
           "master/recording/export/",
-          "master/commands/keys.py", "master/commands/keys_folder.py", "master/outputs/web/listening.py",
-          "common/bus/certificates.py")  # fmt: skip
+          "master/commands/keys.py", "master/commands/keys.py", "master/outputs/web/listening.py",
+          "common/bus/keys.py")  # fmt: skip
 REASONS = {
-    "common/bus/refusal.py": "what the validity of certificates is judged by, in words about a refused connection",
-    "common/calibration/parts.py": "the date of a measurement, in its file",
+    "common/bus/endpoints.py": "what the validity of certificates is judged by, in words about a refused connection",
+    "common/calibration/files.py": "the date of a measurement, in its file",
     "common/recording/messages.py": "the date of a recording, in its file",
     "slave/recorder.py": "what the wall clock said when a recording began, in its file",
     "slave/clocks.py": "drivers that stamp frames so: moved to the monotonic clock frame by frame",

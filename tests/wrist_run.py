@@ -12,8 +12,7 @@ from common.hand.profiles import mirrored_profile
 from common.messages import HandPose, Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 from master.rig.wrist import WristSetup
 
 CYCLE_NS = 33_333_333

@@ -24,10 +24,10 @@ from bench.aarch64.parts import counted_parts
 from bench.markers import published
 from common.messages import Message, WristDetections, encode
 from master.run.link import MasterLink
-from slave.counters import DetectionCounters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.wrist import engine as wrist_engine

@@ -10,12 +10,11 @@ from bench.report import CALIBRATION
 from common.arrays import Bool, Float, Int
 from common.imu.fusion import OrientationFilter
 from common.messages import ImuSample, MarkerDetections, WristDetections
-from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene, SceneTruth
 from common.sim.scenes import scene_by_name
+from common.sim.sensors import SimulatedImu
 from common.sim.wrist.scene import WristScene
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 SCENES = ("both-poses", "both-curl", "both-travel", "grasp")
 MARKER_RIG, WRIST_RIG = "desk", "wrist"

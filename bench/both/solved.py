@@ -19,7 +19,7 @@ from common.messages import HandPose, ImuSample, MarkerDetections
 from master.outputs.poses import Poses
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 
 _FOLLOWS_S = 0.1  # poses farther apart are a new beginning, not a step
 _SETTLED_S = 1.0  # of every scene's beginning: filters and IMU find their feet

@@ -10,8 +10,8 @@ from common.arrays import Bool, Float
 from common.sim.render import Renderer
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
-from slave.markers.light_adaptive import detector_for
-from slave.markers.workers import Inline
+from slave.markers.reloadable import detector_for
+from slave.markers.white_balance import Inline
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView

@@ -23,13 +23,12 @@ from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from master.calibrate.depth.fit import fit_affine_disparity, fit_power_law, ideal_of, relative_error
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.depth import AffineDisparity
 from master.fabrik.intersection import triangulate
-from master.rig.files import load_setup
 from master.rig.pipeline import build_pipeline, line_of
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_setup
+from master.run.app import StageTimes
 from slave.markers.detector import MarkerDetector
 
 AWAY_M = 0.60

@@ -22,8 +22,7 @@ from common.calibration import CameraCalibration, HandProfile, Matrix4, RigCalib
 from common.hand.model import HandModel
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 PAIR, FOUR = ("left", "right"), ("left", "right", "left2", "right2")
 SEEN = 0.15

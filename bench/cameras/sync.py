@@ -21,8 +21,7 @@ from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.scene import Scene, view_centre
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 RATES_HZ = (30.0, 60.0, 90.0)
 _OFFSETS_MS = (0.0, 2.0, 4.2, 6.2, 8.3, 10.4, 12.5, 16.7)

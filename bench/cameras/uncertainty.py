@@ -19,10 +19,9 @@ from common.messages import HandPose, MarkerDetections
 from common.sim.motion import POSES, REST, HandMotion, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from master.rig.files import load_setup
 from master.rig.pipeline import build_pipeline
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_setup
+from master.run.app import StageTimes
 from slave.markers.detector import MarkerDetector
 
 _WHOLE = 0.97  # of a cap visible in both cameras; less is partly hidden

@@ -16,10 +16,10 @@ from bench.report import CALIBRATION, inside
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.intersection import triangulate
 from master.fabrik.sync import FrameSet, FrameSync
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 DEPTH_M, SPEED_M_S = 0.5, 1.0
 SIGMA_PX = 0.08

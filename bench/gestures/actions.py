@@ -33,8 +33,7 @@ from common.sim.gestures import Gestures
 from common.sim.motion import HandMotion
 from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 RATE_HZ = 60.0
 _FUSED, _WRIST_PEOPLE = "desk-back3+wrist-back3", "wrist"

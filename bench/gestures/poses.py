@@ -32,13 +32,11 @@ from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandModel
 from common.messages import HandPose
-from common.sim.motion import POSES
-from common.sim.poses import StudyPoses
+from common.sim.motion import POSES, StudyPoses
 from common.sim.scene import Scene, view_centre
 from common.sim.together import FlexedWrist
 from common.sim.wrist.scene import WristScene
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 PEOPLE = (20,)  # a minute or two each; more by the command line
 _RATE_HZ, _SECONDS = 30.0, 15.0  # one round of the six poses

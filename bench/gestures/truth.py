@@ -11,8 +11,8 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration.gesture_settings import GestureSettings
-from common.hand.capsule_gaps import TaperedCapsules, gaps_between
 from common.hand.model import CHAINS, FINGERS, TIPS, HandModel
+from common.hand.skin import TaperedCapsules, gaps_between
 from common.sim.gestures import Annotation, Gestures
 
 RATE_HZ = 240.0

@@ -19,12 +19,10 @@ from bench.report import CALIBRATION, Row, datasets, inside, rms, skipped
 from common.arrays import Bool, Float
 from common.calibration import Couplings, HandProfile, load
 from common.hand.model import CHAINS, TIPS, HandModel
-from common.sim.leap import load_leap
-from common.sim.motion import HandMotion, ScriptedMotion
-from common.sim.poses import StudyPoses
+from common.sim.motion import HandMotion, ScriptedMotion, StudyPoses
+from common.sim.people import load_leap
 from common.sim.scenes import scene_by_name
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 HAND = CALIBRATION / "hands/default-right.json"
 NOISE_M = {"1 mm": (1e-3, 1e-3, 1e-3), "depth 4.5 mm": (0.3e-3, 0.3e-3, 4.5e-3)}

@@ -12,11 +12,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile
-from common.calibration.hand_presets import preset_limits, without_tolerance
 from common.geometry.transforms import rotation_vector_to_matrix
-from common.hand.limits import ABDUCTION, FLEXION
 from common.hand.model import HandModel
-from common.hand.profiles import generated_profile
+from common.hand.profiles import ABDUCTION, FLEXION, generated_profile, preset_limits, without_tolerance
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 BACK = 5

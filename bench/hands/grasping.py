@@ -32,8 +32,8 @@ from common.geometry.transforms import fit_rigid
 from common.hand.fitting import profile_from_joints
 from common.hand.model import CHAINS, TIPS, HandModel
 from common.hand.profiles import generated_profile
-from common.recording.npz import read_npz
-from master.calibrate.hand.palm import find_palm
+from common.recording.recorded_files import read_npz
+from master.calibrate.hand.motion import find_palm
 from master.mocap.compare import joint_track
 from master.mocap.read import Reading, read_motion
 

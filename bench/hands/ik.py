@@ -23,8 +23,8 @@ from bench.hands.peers import (
 from bench.report import Row, rms
 from common.hand.model import HandModel
 from master.fabrik.fabrik import Fabrik
-from master.fabrik.finger import Finger, FingerSolver
-from master.fabrik.rotations import Vector
+from master.fabrik.linear_algebra import Vector
+from master.fabrik.solver import Finger, FingerSolver
 
 HANDS = 2000
 CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"

@@ -19,7 +19,7 @@ from common.arrays import Float
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from common.hand.model import JOINTS
 from master.mocap.read import Reading
-from master.outputs.files import PosesFile
+from master.outputs.poses import PosesFile
 from master.recording.export.truth import Wanted, compare_source
 
 SECONDS = 10.0

@@ -26,10 +26,10 @@ from common.geometry.transforms import matrix_to_rotation_vector, rigid
 from common.hand.fitting import profile_from_joints
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.hand.profiles import generated_profile
-from common.recording.npz import read_npz
-from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
+from common.recording.recorded_files import read_npz
+from common.sim.people import KEYS, RIG_FROM_LEAP, palm_rotation
 from master.estimator.epoch import FittedHand
-from master.estimator.smooth import HandOneEuro
+from master.estimator.smoothing import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
 
 SIGMA_M = 1e-3
@@ -98,7 +98,7 @@ def rows() -> Iterator[Row]:
 
 
 def wide_limits() -> Limits:
-    """Return limits D (`common.calibration.hand_presets`), wide enough for the hands that the Leap reports."""
+    """Return limits D (`common.hand.profiles`), wide enough for the hands that the Leap reports."""
 
     def limits(*spans_deg: tuple[float, float]) -> FingerLimits:
         a, f, p, d = ((float(np.radians(low)), float(np.radians(high))) for low, high in spans_deg)

@@ -19,10 +19,9 @@ from common.hand.model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT
-from master.fabrik.chain import Pose
-from master.fabrik.fabrik import Fabrik
-from master.fabrik.finger import FingerSolver
-from master.fabrik.rotations import Vector, as_vector
+from master.fabrik.fabrik import Fabrik, Pose
+from master.fabrik.linear_algebra import Vector, as_vector
+from master.fabrik.solver import FingerSolver
 
 Angles = Sequence[Sequence[float]]  # (5, 4) [rad]
 Fingers = Callable[[Sequence[Vector]], Angles]  # five tips [m] in the palm frame -> angles

@@ -21,10 +21,10 @@ from common.messages import MarkerDetections, ObjectPose, TagDetections
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from master.objects.features import Features
 from master.objects.line import ObjectLine
-from slave.markers.light_adaptive import detector_for
-from slave.markers.workers import Inline
+from master.objects.surface import Features
+from slave.markers.reloadable import detector_for
+from slave.markers.white_balance import Inline
 from slave.tags.finder import TagFinder
 
 OBJECTS = {"wand": "beads", "cube": "tags"}

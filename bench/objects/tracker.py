@@ -25,8 +25,8 @@ from common.geometry.transforms import (
 )
 from common.messages import ObjectPose, TrackerPose
 from common.sim.scene import view_centre
+from common.sim.sensors import WANDER_M, WANDER_RAD, WHITE_M, WHITE_RAD
 from common.sim.tracked import facing
-from common.sim.tracker import WANDER_M, WANDER_RAD, WHITE_M, WHITE_RAD
 from master.calibrate.tracker.registration import Registration, register
 from master.objects.line import ObjectLine
 

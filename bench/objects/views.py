@@ -10,7 +10,7 @@ from common.calibration.object_profile import ObjectProfile
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.messages import MarkerDetections, TagDetections
-from master.objects.features import Features
+from master.objects.surface import Features
 
 Where = Callable[[float], Float]
 """Time [s] -> `T_rig_object` (4, 4)."""

@@ -31,11 +31,11 @@ from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, HandModel
 from common.messages.sensed import MarkerDetections
 from common.recording.frame_recording import open_recording
-from common.recording.npz import read_npz
+from common.recording.recorded_files import read_npz
 from common.sim.motion import HandState
 from common.sim.scene import Scene, view_centre
 from master.replay.recorded import recorded_detections
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 RENDERED = {
     "stills": ("calib_colors", "lights_0_warm", "poses_left"),

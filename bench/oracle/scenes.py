@@ -21,7 +21,7 @@ from common.messages import MarkerDetections
 from common.sim.motion import HandState, ScriptedMotion, smooth_step
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 SCENES = ("standard", "grasp", "both-travel")
 SEEDS = (11, 12, 13)

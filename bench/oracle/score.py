@@ -10,7 +10,7 @@ import numpy.typing as npt
 from bench.oracle.truth import STEP_NS, Truth
 from common.arrays import Bool, Float, Int
 from common.hand.model import FINGER_JOINTS
-from common.recording.npz import read_npz
+from common.recording.recorded_files import read_npz
 
 CHI2_95 = 7.814727903
 """95 % of a chi-square of 3 degrees of freedom."""

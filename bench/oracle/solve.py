@@ -19,10 +19,9 @@ import numpy as np
 
 from common.messages import HandPose, ImuSample
 from common.recording.messages import open_messages
-from master.rig.files import load_setup
 from master.rig.pipeline import pipeline_of
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_setup
+from master.run.app import StageTimes
 
 FROZEN = "frozen"
 KEPT = ("position_m", "angles_rad", "cov_m2", "valid", "tracked", "source")

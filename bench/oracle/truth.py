@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.recording.npz import read_npz, write_npz
+from common.recording.recorded_files import read_npz, write_npz
 
 FROZEN = "frozen"
 _MATCH_NS = 1_000_000

@@ -27,7 +27,7 @@ from common.errors import RecordingError
 from common.hand.model import FINGERS
 from common.messages import WristDetections
 from common.recording.frame_recording import open_recording
-from common.recording.npz import read_npz
+from common.recording.recorded_files import read_npz
 from master.evaluation.wrist_score import load_wrist_truth
 from master.replay.recorded import recorded_cycles
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from bench.rigs.local import UP_S, Rig, free_port
 from common.bus.bus import Subscription
-from common.bus.certificates import MASTER, OPERATOR
-from common.bus.keys import access_of
+from common.bus.keys import MASTER, OPERATOR, access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.messages import Gesture

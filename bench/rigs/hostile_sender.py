@@ -29,8 +29,7 @@ from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
 from common.link.session import EchoAnswer, Hello, RigKeys, Started
 from common.messages import Health, Preview, Still
 from common.messages.streams import key_of
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 from slave.uplink import Uplink
 
 _START_S = 60.0

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from bench.report import ROOT
 from common.bus.bus import ANY, Subscription
-from common.bus.certificates import OPERATOR
-from common.bus.keys import FOLDER, access_of
+from common.bus.keys import FOLDER, OPERATOR, access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError, PhalanxError
 from common.messages import Command, Health

@@ -32,9 +32,9 @@ from common.link.datagram import OVERHEAD
 from common.link.session import MAX_CAMERAS
 from common.messages import HandPose, encode
 from common.messages.streams import MASTER
-from master.rig.files import load_setup, load_setups
+from master.rig.setup import load_setup, load_setups
+from master.run.app import StageTimes
 from master.run.dispatcher import Dispatcher
-from master.run.stages import StageTimes
 from master.run.tuning import LivePipeline
 
 BUILDING = "building"

@@ -28,7 +28,7 @@ from bench.rigs.rooms import LOOP_S, detections
 from common.bus.keys import rig_key
 from common.clock import SkewedClock, SystemClock
 from common.messages import WIRE_VERSION, MarkerDetections
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 from slave.uplink import Uplink
 
 WAY_S = 10.0  # of the scene, forth and back with `--way`: nothing ever leaps

@@ -34,10 +34,10 @@ from bench.rigs.soak_verdict import (
     steps_of,
     warm_up_s,
 )
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.messages import HandPose, Health
 from common.messages.streams import MASTER
-from master.run.stopping import stop_on_signals
+from master.run.process import stop_on_signals
 
 RIGS = ("desk", "wrist")
 DEVICES = {"left": "desk", "right": "desk", "wrist": "wrist", "imu": "wrist"}  # -> rig

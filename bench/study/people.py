@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, RestJoint, RigCalibration
-from common.calibration.parts import Matrix4
+from common.calibration.files import Matrix4
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import FINGER_JOINTS, FINGERS, JOINTS
 from master.calibrate.tree_files import provenance

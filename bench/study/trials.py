@@ -27,10 +27,9 @@ from common.sim.wrist.record import record_wrist
 from common.sim.wrist.scene import WristScene
 from master.calibrate.wrist.subject import calibrate_subject
 from master.evaluation.wrist_score import WristTruth, at_rows, clear_line, load_wrist_truth, rows_at
-from master.outputs.files import load_poses
-from master.outputs.poses import Poses
+from master.outputs.poses import Poses, load_poses
+from master.replay.offline import solve
 from master.replay.recorded import recorded_cycles
-from master.replay.solve import solve
 from master.rig.setup import RigSetup
 
 SolverMode = Literal["fk", "ik", "auto"]

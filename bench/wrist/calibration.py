@@ -1,6 +1,6 @@
 """Errors of the calibration of a wrist device against exact truth: its laser plane, palm and knuckles of the subject.
 
-Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
+Boards are rendered before the wrist camera by `common.sim.wrist.board`, each seed another laser and other places of the
 board. Wearers are those of `bench.wrist.wearers`, each seed another person.
 """
 
@@ -13,16 +13,16 @@ from bench.report import Row, rig_files, rms
 from bench.wrist.wearers import Person
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration
-from common.calibration.wrist import LaserPlane
+from common.calibration.rig import LaserPlane
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.recording.frame_recording import Illumination
-from common.sim.wrist_board import WristBoardRenderer, WristBoardScene, board_poses
+from common.sim.wrist.board import WristBoardRenderer, WristBoardScene, board_poses
 from master.calibrate.cameras.boards import Checkerboard
+from master.calibrate.wrist.device import LitView
 from master.calibrate.wrist.laser_command import lines_of
-from master.calibrate.wrist.lit_views import LitView
 from master.calibrate.wrist.plane import PlaneFit, fit_plane
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline

@@ -10,16 +10,15 @@ from msgspec.structs import replace
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.calibration.parts import Matrix4
+from common.calibration.files import Matrix4
 from common.recording.frame_recording import open_recording
-from common.recording.npz import read_npz
+from common.recording.recorded_files import read_npz
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
-from slave.wrist.background import lit
-from slave.wrist.strobe import StrobeCycle
+from slave.wrist.strobe import StrobeCycle, lit
 from slave.wrist.view import WristView
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")

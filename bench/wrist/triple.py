@@ -25,7 +25,7 @@ from common.messages import WristDetections, encode
 from common.sim.wrist.scene import WristScene
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.wrist import WristSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from slave.sources import Frame
 from slave.wrist.detector import WristFound, find
 from slave.wrist.engine import NUMPY, Engine, engine_named

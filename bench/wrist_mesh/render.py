@@ -17,7 +17,7 @@ from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.geometry.camera_model import CameraModel
 from common.hand.model import HandModel
-from common.hand.wrist_joint import forearm_palm
+from common.hand.wrist import forearm_palm
 from common.recording.frame_recording import Illumination, Manifest
 
 ORDER = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)

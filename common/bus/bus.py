@@ -19,8 +19,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from common.clock import TokenBucket
 from common.errors import BusError, MessageError, PhalanxError
-from common.link.token_bucket import TokenBucket
 from common.messages import AnyMessage, Command, Health, Message, decode, encode
 from common.messages.streams import STREAMS, Path, key_of, sender_of
 

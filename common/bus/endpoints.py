@@ -1,15 +1,27 @@
-"""Bus endpoints: which may leave the machine, and which one a program uses.
+"""Endpoints say where a bus is, and a diagnosis says why one refuses.
+
+Bus endpoints: which may leave the machine, and which one a program uses.
 
 Also where a listener can be reached.
 
 `tls/HOST:PORT` (or `quic/`) is encrypted, and both sides prove who they are. `tcp/` is neither: it stays on a loopback
 address, which other machines cannot reach, unless `--open` is given.
+
+Diagnosis of why an encrypted bus cannot be established.
+
+zenoh does not report that a certificate was refused.
 """
 
-from collections.abc import Mapping
+import logging
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from ipaddress import AddressValueError, IPv4Address, ip_address
 
-from common.bus.keys import OPEN, keys_folder
+from common.bus.keys import CLOCK_FIX, OPEN, Identity, Shown, keys_folder, shown
 from common.errors import BusError
 
 SCHEMES = ("tcp", "tls", "quic")
@@ -87,3 +99,138 @@ def reached_at(endpoint: str, address: str) -> str:
     except AddressValueError:
         return endpoint
     return endpoint.replace(ANYWHERE, address, 1)
+
+
+_PATIENCE_S = 0.5
+_LOG = logging.getLogger(__name__)
+
+
+def why_refused(endpoint: str, identity: Identity) -> str:
+    """Try a handshake by hand and return what went wrong, as text for the user.
+
+    Empty: nothing went wrong.
+
+    Takes up to a second. An answer that comes after the handshake is read, too: with TLS 1.3 the side that listens
+    refuses a certificate only then.
+
+    Args:
+        endpoint: As `tls/192.168.1.2:47802`; for `quic/` no cause can be determined.
+        identity: Own certificate.
+    """
+    if not endpoint.startswith("tls/"):
+        return ""
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname = False  # addresses change; who signed is what counts
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.load_verify_locations(identity.authority)
+        context.load_cert_chain(identity.certificate, identity.key)
+    except (OSError, ssl.SSLError) as error:
+        return f"the keys of {identity.name!r} do not fit together ({error})"
+    try:
+        with (
+            socket.create_connection((host_of(endpoint), port_of(endpoint)), _PATIENCE_S) as plain,
+            context.wrap_socket(plain) as sealed,
+        ):
+            sealed.settimeout(_PATIENCE_S)
+            sealed.recv(1)
+    except TimeoutError:
+        return ""  # accepted: whoever refuses reports it at once
+    except ssl.SSLCertVerificationError as error:
+        # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
+        not_yet_valid, expired = 9, 10
+        if error.verify_code in (not_yet_valid, expired):
+            return _why_invalid(endpoint, identity)
+        return (
+            f"who listens there has no certificate of this rig's master ({error.verify_message}): another rig's, or"
+            " somebody who plays the master"
+        )
+    except ssl.SSLError as error:
+        message = (error.reason or str(error)).lower().replace("_", " ")
+        if "certificate expired" in message:
+            return _why_expired_there(identity)
+        return (
+            f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({message}): keys of"
+            " another rig?"
+        )
+    except OSError as error:
+        return f"nobody listens there ({error.strerror or error}). Is the master running?"
+    return ""
+
+
+def _why_invalid(endpoint: str, identity: Identity) -> str:
+    """Return which certificate is not valid by the clock of this machine.
+
+    It is that of the rig, or that of who listens.
+    """
+    now = datetime.now(UTC)
+    named = {"the certificate of this rig (ca.pem)": shown(identity.authority.read_bytes())}
+    if (there := _shown_there(endpoint)) is not None:
+        named[f"the certificate of who listens there ({there.name!r})"] = there
+    faults = [fault for whose, one in named.items() if (fault := one.invalid_at(now, whose))]
+    unknown = (
+        "the certificate of who listens there is not valid now: the clock of this machine says "
+        f"{now:%Y-%m-%d %H:%M} UTC"
+    )
+    return f"{faults[0] if faults else unknown}. Is that the time? If not, {CLOCK_FIX}"
+
+
+def _why_expired_there(identity: Identity) -> str:
+    """Return why the listener refused our certificate as not valid now.
+
+    By our clock it is not valid either, or the clock there is wrong.
+    """
+    now, own = datetime.now(UTC), shown(identity.certificate.read_bytes())
+    whose = f"the certificate of {identity.name!r}"
+    if fault := own.invalid_at(now, whose):
+        return f"who listens there refused it, and {fault}. Is that the time? If not, {CLOCK_FIX}"
+    return (
+        f"who listens there refused {whose} as no longer, or not yet, valid: it is valid from "
+        f"{own.since:%Y-%m-%d} to {own.until:%Y-%m-%d}, and the clock of this machine says {now:%Y-%m-%d %H:%M} UTC. "
+        f"Is the clock of the machine there wrong? There, {CLOCK_FIX}"
+    )
+
+
+def _shown_there(endpoint: str) -> Shown | None:
+    """The certificate of who listens, whatever its validity.
+
+    None: it could not be read.
+    """
+    try:
+        pem = ssl.get_server_certificate((host_of(endpoint), port_of(endpoint)), timeout=_PATIENCE_S)
+        return shown(pem.encode("ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def log_why_alone(
+    peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
+) -> threading.Thread:
+    """Log, on a thread, why no peer is connected.
+
+    It logs once this has lasted two seconds, and again when the reason changes.
+
+    Args:
+        peers: How many are connected.
+        reason: Why nobody is, for a person; may take a second.
+        where: Whom the text is about.
+        closing: Ends the thread.
+    """
+
+    def monitor() -> None:
+        message, since = "", time.monotonic()
+        poll_s = 0.25
+        while not closing.wait(poll_s):
+            now = time.monotonic()
+            alone_s = 2.0  # without anybody for so long, a process logs why
+            if peers():
+                message, since = "", now
+            elif now - since > alone_s:
+                why, since = reason(), now
+                if why and why != message and not closing.is_set():
+                    _LOG.warning("bus (%s): %s", where, why)
+                message = why
+
+    thread = threading.Thread(target=monitor, name="bus alone", daemon=True)
+    thread.start()
+    return thread

@@ -24,10 +24,8 @@ from typing import Protocol
 import zenoh
 
 from common.bus.bus import ANY, Handler, Inbox, Subscription, decoded, payload_of, stream_key
-from common.bus.certificates import MASTER, OPERATOR
-from common.bus.endpoints import check, encrypted, loopback
-from common.bus.keys import Access, access_of
-from common.bus.refusal import log_why_alone, why_refused
+from common.bus.endpoints import check, encrypted, log_why_alone, loopback, why_refused
+from common.bus.keys import MASTER, OPERATOR, Access, access_of
 from common.bus.settings import settings
 from common.errors import BusError, PhalanxError
 from common.messages import Command, Health, Message, encode

@@ -16,6 +16,16 @@ import msgspec
 from msgspec import Struct
 
 from common.calibration.camera import CameraCalibration, HsvRange, Intrinsics, RoiMargin, check_camera
+from common.calibration.files import (
+    Matrix4,
+    Positive,
+    Provenance,
+    Quaternion,
+    Vector3,
+    decode_json,
+    read_bytes,
+    replacing,
+)
 from common.calibration.gesture_settings import GestureSettings, check_gestures
 from common.calibration.hand import (
     Couplings,
@@ -30,22 +40,19 @@ from common.calibration.hand import (
     RestJoint,
     check_hand,
 )
-from common.calibration.json_file import decode_json, read_bytes
 from common.calibration.object_profile import ObjectProfile, check_object
 from common.calibration.output_settings import OutputSettings, check_outputs
-from common.calibration.parts import Matrix4, Positive, Provenance, Quaternion, Vector3
-from common.calibration.replacing import replacing
 from common.calibration.rig import (
     UNIT_WITHIN,
     AffineDisparityCalibration,
     FilterCalibration,
     ImuCalibration,
+    Laser,
     PowerLawCalibration,
     RigCalibration,
     Volume,
     check_rig,
 )
-from common.calibration.wrist import Laser
 from common.errors import CalibrationError
 
 __all__ = [

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration.parts import Part, Provenance
+from common.calibration.files import Part, Provenance
 from common.errors import CalibrationError
 from common.geometry.lens import Lens, fold_of
 from common.messages import Name

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration.parts import Part, Provenance, Quaternion
+from common.calibration.files import Part, Provenance, Quaternion
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
 

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from common.arrays import Float
-from common.calibration.parts import Matrix4, Part, Provenance, StampOffset, Vector3
+from common.calibration.files import Matrix4, Part, Provenance, StampOffset, Vector3
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, MAX_TAGS, Name
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from msgspec import Meta
 
-from common.calibration.parts import Part, Quaternion
+from common.calibration.files import Part, Quaternion
 from common.errors import CalibrationError
 from common.messages import Name
 

@@ -1,16 +1,56 @@
-"""Hand profiles generated from one number, the length of the hand.
+"""Profiles describe a hand; its length, presets and limits fill what is open.
+
+Hand profiles generated from one number, the length of the hand.
 
 A quick start before a hand is measured.
 
 Bone lengths are the shares of hand length published by Buchholz, Armstrong & Goldstein (1992); the layout of
 the palm is a plain fan. Left profiles are the exact mirror image of right ones.
+
+Joint limits of a hand: a range per angle.
+
+The range of abduction narrows with flexion.
+
+Spread fingers cannot stay spread in a fist: the collateral ligaments of the MCP tighten, because the head of the
+metacarpal is a cam. With f the flexion, F the highest and s what is left there, the range of the abduction is
+multiplied by
+
+    1 - (1 - s) (min(max(f, 0), F) / F)^2
+
+the parabolic limit Kalbfleisch wished for. It narrows towards 0, so 0 lies in the range.
+
+Defaults for what a hand profile may omit.
+
+Joint limits and couplings as given in the two papers, and radii.
+
+How far abduction narrows in a fist is in neither paper. Fingers pushed aside by a known force give way by 24
+degrees at a straight MCP and by 15 at 90 degrees of flexion, the mean of all fingers of 100 people (Lutsky, Matzon,
+Walinchus, Ross & Beredjiklian, J. Hand Surg. Am. 39, 2014). Their ratio is taken: a limit is where the ligaments
+stop a finger. Of their own force people spread a fist even less.
+
+Nor do the papers state how people differ from their limits. Active ranges of young adults have standard deviations
+of 5 to 12 degrees, and knuckles reach 20 degrees beyond the straight finger (Mallon, Brown & Nunley, "Digital ranges
+of motion: normal values in young adults", J. Hand Surg. Am. 16, 1991). So a preset is a prior with a width.
 """
+
+from math import radians
+from typing import TypeVar
 
 import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import HandProfile, MarkerMount, RestJoint, Vector3
+from common.calibration import (
+    Couplings,
+    FingerLimits,
+    HandProfile,
+    Limits,
+    MarkerMount,
+    Preset,
+    RestJoint,
+    Vector3,
+)
+from common.errors import CalibrationError
 from common.geometry.transforms import matrix_to_quaternion
 
 # Share of hand length. Fingers: MCP place (x, y, z), heading in the palm plane [deg, positive to the thumb],
@@ -188,3 +228,135 @@ def _radii() -> dict[str, float]:
             radius[f"{stem}-phalanx-intermediate"] = 1.2 * tip
         radius |= {f"{stem}-phalanx-distal": 1.1 * tip, f"{stem}-tip": tip}
     return radius
+
+
+ABDUCTION, FLEXION = 0, 1  # columns of the angles
+_FINGERS = Limits.__struct_fields__  # thumb ... little
+_ANGLES = ("abduction", "flexion", "pip", "dip")
+
+FloatOrArray = TypeVar("FloatOrArray", float, Float)
+
+
+def spread_left(flexed: FloatOrArray, at_full_flexion: FloatOrArray) -> FloatOrArray:
+    """Return the share of the abduction range that remains at a flexion.
+
+    A parabola from 1 down to `at_full_flexion`.
+
+    Args:
+        flexed: Flexion as a share of the highest, 0 ... 1.
+        at_full_flexion: Share left where `flexed` is 1.
+    """
+    return 1.0 - (1.0 - at_full_flexion) * flexed * flexed
+
+
+def limit_table(limits: Limits, where: str) -> Float:
+    """Low and high (5, 4, 2) [rad] of every angle, where nothing narrows them.
+
+    Raises:
+        CalibrationError: A low is above its high.
+    """
+    table = np.array(
+        [[getattr(getattr(limits, finger), f"{angle}_rad") for angle in _ANGLES] for finger in _FINGERS]
+    )
+    crossed = np.argwhere(table[..., 0] > table[..., 1])
+    if len(crossed):
+        finger, angle = crossed[0]
+        raise CalibrationError(
+            f"{where}: limits_rad.{_FINGERS[finger]}.{_ANGLES[angle]}_rad: low is above high"
+        )
+    return table
+
+
+def tolerance_table(limits: Limits) -> Float:
+    """Standard deviations (5, 4) [rad] by which people differ from the limits."""
+    return np.array([getattr(limits, finger).tolerance_rad for finger in _FINGERS])
+
+
+def spread_table(limits: Limits, where: str) -> Float:
+    """Share (5,) of the abduction range left at the highest flexion.
+
+    Raises:
+        CalibrationError: A range that does not contain 0 cannot narrow towards it.
+    """
+    shares: list[float] = []
+    for finger in _FINGERS:
+        of: FingerLimits = getattr(limits, finger)
+        low, high = of.abduction_rad
+        if of.spread_at_full_flexion < 1.0 and not low <= 0.0 <= high:
+            raise CalibrationError(
+                f"{where}: limits_rad.{finger}.spread_at_full_flexion: below 1 it narrows abduction_rad towards 0,"
+                f" which {low} ... {high} does not contain"
+            )
+        shares.append(of.spread_at_full_flexion)
+    return np.array(shares)
+
+
+# Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
+_RADIUS_SHARE = {
+    "palm": 0.3,
+    "wrist": 0.5,
+    "metacarpal": 0.3,
+    "proximal": 0.2,
+    "intermediate": 0.175,
+    "distal": 0.16,
+    "tip": 0.145,
+}
+
+_TOLERANCE_RAD = (radians(5.0), radians(6.0), radians(4.0), radians(4.0))
+
+
+def preset_limits(preset: Preset) -> Limits:
+    """Joint limits of Kalbfleisch (K) or Digits (D), relative to the rest pose."""
+    k = preset == "K"
+    abduction = 15.0 if k else 20.0
+    thumb = _degrees((-20.0, 50.0), (-15.0, 50.0), (-10.0, 60.0), (-15.0, 85.0))
+
+    def finger(spread: float) -> FingerLimits:
+        flexion, pip, dip = (90.0, 110.0, 90.0) if k else (100.0, 120.0, 101.0)
+        spread_at_full_flexion = 15.0 / 24.0
+        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip), spread_at_full_flexion)
+
+    side = finger(abduction)
+    return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
+
+
+def without_tolerance(limits: Limits) -> Limits:
+    """The same limits as walls."""
+    walls = {
+        name: replace(getattr(limits, name), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
+        for name in Limits.__struct_fields__
+    }
+    return Limits(**walls)
+
+
+def preset_couplings(preset: Preset) -> Couplings:
+    """Return the couplings of a preset.
+
+    DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion.
+    """
+    return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
+
+
+def _degrees(
+    abduction: tuple[float, float],
+    flexion: tuple[float, float],
+    pip: tuple[float, float],
+    dip: tuple[float, float],
+    spread_at_full_flexion: float = 1.0,
+) -> FingerLimits:
+    def span(value: tuple[float, float]) -> tuple[float, float]:
+        return float(np.radians(value[0])), float(np.radians(value[1]))
+
+    return FingerLimits(
+        abduction_rad=span(abduction),
+        flexion_rad=span(flexion),
+        pip_rad=span(pip),
+        dip_rad=span(dip),
+        spread_at_full_flexion=spread_at_full_flexion,
+        tolerance_rad=_TOLERANCE_RAD,
+    )
+
+
+def radius_share(joint: str) -> float:
+    """Radius of an OpenXR joint, as a share of the middle finger's proximal bone."""
+    return _RADIUS_SHARE[joint.rsplit("-", 1)[-1]]

@@ -1,4 +1,42 @@
-"""Orientation from raw IMU samples.
+"""A Kalman filter estimates orientation and its covariance from IMU samples.
+
+Covariance of an error-state Kalman filter for the IMU orientation.
+
+States how uncertain an integrated orientation is, and how it is corrected.
+
+Eleven errors, after Sola 2017 ("Quaternion kinematics for the error-state Kalman filter", ch. 5) with the global error
+of its ch. 7: attitude t (3,) [rad] in the world's axes, the gyroscope's bias b (3,) [rad/s] and scale s (3,) [1] in
+the sensor's, level velocity v (2,) [m/s]. With R sensor -> world and w the rate,
+
+    t' = -R (b + s w) + noise,      v' = g (t_y, -t_x).
+
+Gravity is seen through the velocity: an arm gains none for long, so that the velocity which a tilted gravity sums up is
+measured as zero. Velocity in the world's axes is where accelerations cancel (the almost inertial frame of Laidig, Seel
+2023, section 4); here it is a state, so that the memory of the mean is the filter's own, and holds at any rate of
+samples. Rest measures the bias. Neither moves the heading, of which they know nothing: its gain is zero, its covariance
+that of a considered parameter (Schmidt 1966).
+
+The figures are those of parts and arms, not of recordings:
+
+- bias when switched on, 2.5 deg/s: +-5 deg/s of an ICM-20948 (DS-000189, table 1), taken as two sigma; LSM6DSO: +-1;
+- its walk, 0.1 deg/s in 100 s, and how well rest shows it, to 0.03 deg/s within about 9 s: the defaults of VQF (Laidig,
+  Seel 2023);
+- noise, 0.015 deg/s/sqrt(Hz): the same part; LSM6DSO (DS12140, table 2) has a quarter of it;
+- scale, 1 %: LSM6DSO +-1 %; what is wrong otherwise (across axes, not linear), 0.3 % of the rate, half a second long;
+- velocity, 0.35 m/s along each axis for 0.6 s: fingertips of recorded hands have 0.5 m/s (p99) where they are gentle,
+  1 to 2 where they are brisk, and come back;
+- accelerometer, 5 mg after calibration; the zero of one that is not calibrated belongs to `orientation_sigma_rad`.
+
+Stillness detection of an inertial sensor.
+
+It is still when rate and force have stayed near their own mean for a while.
+
+A constant cannot be separated from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
+off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
+VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by half a degree,
+seen by gravity, or half a degree per second more or less is a motion.
+
+Orientation from raw IMU samples.
 
 Rates are integrated, the tilt is corrected towards gravity, and the bias is estimated at rest.
 
@@ -18,19 +56,206 @@ VQF (Laidig, Seel 2023) is what this is measured against (`python -m bench imu`)
 for the Pi's processor, expects a fixed period, and estimates no covariance of the tilt.
 
 Magnetometers are not used: steel in a desk turns them by more than a gyroscope drifts in minutes.
+
+Accuracy of an IMU's tilt against a truth.
+
+Also how consistent the stated standard deviation is with the errors.
+
+The error is that of the vertical: the turn about a level axis that takes the found one to the true one. Headings do not
+count, since both worlds may lie anywhere to each other but for their z axes, which are up.
 """
 
 from collections import Counter
-from math import cos, nan, radians, sin, sqrt
+from dataclasses import dataclass
+from math import cos, hypot, nan, pi, radians, sin, sqrt
 
 import numpy as np
 from msgspec.structs import replace
 
-from common.arrays import Float
-from common.geometry.transforms import Wxyz, matrix_of, quaternion_product
-from common.imu.error_state import ATTITUDE, BIAS, BIAS_RAD_S, SCALE, VELOCITY, ErrorState
-from common.imu.stillness import Stillness
+from common.arrays import Bool, Float
+from common.geometry.transforms import Wxyz, matrix_of, quaternion_product, quaternion_to_matrix
 from common.messages import ImuSample
+
+ATTITUDE, BIAS, SCALE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
+BIAS_RAD_S = radians(2.5)
+_SIZE, _HEADING = 11, 2
+_BIAS_PROCESS_NOISE = radians(0.01)  # [rad/s per root second]
+_REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
+_NOISE = radians(0.015)  # [rad per root second]
+_VELOCITY_M_S = 0.35
+_FIRST_RAD = radians(60.0)
+_ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
+
+
+class ErrorState:
+    """Push machine. Holds the covariance (11, 11) of the errors."""
+
+    def __init__(self) -> None:
+        """Know nothing yet, but where up is roughly."""
+        scale = 0.01
+        first = [_FIRST_RAD, _FIRST_RAD, 0.0, *[BIAS_RAD_S] * 3, *[scale] * 3, *[_VELOCITY_M_S] * 2]
+        self._cov = np.diag(np.square(first))
+        self._variance = self._cov.reshape(-1)[:: _SIZE + 1]  # a view of its diagonal
+        self._transition = np.eye(_SIZE)
+
+    @property
+    def tilt_rad(self) -> float:
+        """Standard deviation of the tilt, per axis."""
+        accelerometer_rad = 0.005
+        return hypot(sqrt(0.5 * float(self._variance[0] + self._variance[1])), accelerometer_rad)
+
+    @property
+    def bias_rad_s(self) -> float:
+        """Standard deviation of the bias, that of its worst axis."""
+        return sqrt(float(self._variance[BIAS].max()))
+
+    @property
+    def heading_rad(self) -> float:
+        """Standard deviation of the heading against that of the beginning."""
+        return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
+
+    def propagate(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
+        """Propagate the covariance over one integration step.
+
+        The sensor rotated at this rate (3,), in this orientation (3, 3), with a force measured or without.
+        """
+        g_m_s2 = 9.80665
+        change, fallen = -step_s * world_sensor, step_s * g_m_s2 if felt else 0.0
+        self._transition[ATTITUDE, BIAS] = change
+        self._transition[ATTITUDE, SCALE] = change * rate_rad_s
+        self._transition[9, 1], self._transition[10, 0] = fallen, -fallen
+        np.matmul(self._transition @ self._cov, self._transition.T, out=self._cov)
+        other, other_s = 0.003, 0.5
+        noise = _NOISE**2 + other**2 * other_s * float(rate_rad_s @ rate_rad_s)
+        self._variance[ATTITUDE] += noise * step_s
+        self._warmed(step_s)
+
+    def silent(self, gap_s: float) -> bool:
+        """Inflate the covariance over a gap without samples.
+
+        The sensor may have rotated meanwhile. Returns whether the tilt is now unknown.
+        """
+        unseen_rad_s = 3.0  # as fast as a forearm turns unseen
+        attitude = self._variance[ATTITUDE] + (unseen_rad_s * gap_s) ** 2
+        for block in (ATTITUDE, VELOCITY):
+            self._cov[block] = self._cov[:, block] = 0.0
+        most = np.square([_FIRST_RAD, _FIRST_RAD, _ANYWHERE_RAD])
+        self._variance[ATTITUDE] = np.minimum(attitude, most)
+        self._variance[VELOCITY] = _VELOCITY_M_S**2
+        self._warmed(gap_s)
+        return bool(attitude[0] >= most[0])
+
+    def level(self, step_s: float, velocity_m_s: Float) -> Float:
+        """Correct with a zero level velocity.
+
+        Forces were integrated for a step to this level velocity (2,), which is zero in truth; returns all corrections
+        (11,).
+        """
+        velocity_s = 0.6
+        noise = 2.0 * velocity_s * _VELOCITY_M_S**2 / step_s
+        return self._measured(VELOCITY, -velocity_m_s, noise)
+
+    def rest(self, step_s: float, off_rad_s: Float) -> Float:
+        """Correct the bias with a step at rest.
+
+        The rate (3,) is what remains beyond the bias; returns all corrections (11,).
+        """
+        return self._measured(BIAS, off_rad_s, _REST**2 / step_s)
+
+    def contradicted(self, heading_rad: float) -> None:
+        """Reset the bias covariance after two rest periods gave different biases.
+
+        One of them was a rotation, so the heading may be off by `heading_rad`.
+        """
+        heading = float(self._variance[_HEADING])
+        self._cov[BIAS] = self._cov[:, BIAS] = 0.0
+        self._variance[BIAS] = BIAS_RAD_S**2
+        self._variance[_HEADING] = min(heading + heading_rad**2, _ANYWHERE_RAD**2)
+
+    def _measured(self, block: slice, innovation: Float, noise: float) -> Float:
+        """Apply a measurement of a block of errors, one scalar after the other.
+
+        Returns corrections (11,) of all but the heading.
+        """
+        found = np.zeros(_SIZE)
+        heading = float(self._variance[_HEADING])
+        for k, value in enumerate(innovation.tolist(), block.start):
+            row = self._cov[k].copy()
+            gain = row / (row[k] + noise)
+            found += (value - found[k]) * gain
+            self._cov -= gain[:, None] * row
+        self._variance[_HEADING] = heading
+        found[_HEADING] = 0.0
+        return found
+
+    def _warmed(self, step_s: float) -> None:
+        self._variance[BIAS] = np.minimum(
+            self._variance[BIAS] + _BIAS_PROCESS_NOISE**2 * step_s, BIAS_RAD_S**2
+        )
+
+
+_SAMPLE_RAD_S = radians(2.0)
+_SHORT_RAD_S = radians(0.5)
+_BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias (`Doubt`)
+
+
+class Stillness:
+    """Push-driven stillness detector.
+
+    Holds means of rate and force: a short one, and one since the sensor may have come to rest.
+    """
+
+    def __init__(self) -> None:
+        """Know of no rest."""
+        self.moved()
+
+    @property
+    def still(self) -> bool:
+        """Whether it lay still until now."""
+        for_s = 1.5
+        return self._since_s >= for_s
+
+    def moved(self) -> None:
+        """Begin anew: what happened is not known."""
+        self._since_s = 0.0
+        self._rate: _Means | None = None
+        self._force: _Means | None = None
+
+    def push(self, step_s: float, gyro_rad_s: Float, accel_m_s2: Float) -> None:
+        """Take rate and specific force (3,), so long after the last ones."""
+        if self._rate is None or self._force is None:
+            self._rate, self._force = _Means(gyro_rad_s), _Means(accel_m_s2)
+            return
+        self._since_s += step_s
+        sample_m_s2 = 0.5
+        short_m_s2 = 0.1
+        if (
+            self._rate.left(self._since_s, step_s, gyro_rad_s, _SAMPLE_RAD_S, _SHORT_RAD_S)
+            or self._force.left(self._since_s, step_s, accel_m_s2, sample_m_s2, short_m_s2)
+            or np.abs(self._rate.long).max() > _BIAS_RAD_S
+        ):
+            self.moved()
+
+
+class _Means:
+    """A vector's (3,) mean over a short and a long time."""
+
+    def __init__(self, value: Float) -> None:
+        self.short = self.long = value
+
+    def left(self, since_s: float, step_s: float, value: Float, sample: float, short: float) -> bool:
+        """Add a value and return whether it departed from the long mean.
+
+        True where the value is farther from it than `sample`, or the short mean farther than `short`.
+        """
+        off = value - self.long
+        short_s = 0.3
+        self.short = self.short + step_s / min(since_s + step_s, short_s) * (value - self.short)
+        long_s = 4.0
+        self.long = self.long + step_s / min(since_s + step_s, long_s) * off
+        apart = self.short - self.long
+        return bool(off @ off > sample**2 or apart @ apart > short**2)
+
 
 _SETTLED_RAD = radians(6.0)  # reached nine tenths of a second after the first sample
 _BIAS_MOST_RAD_S = 3.0 * BIAS_RAD_S  # three sigma of what they begin with
@@ -200,3 +425,49 @@ def _unit(q: Wxyz) -> Wxyz:
     w, x, y, z = q
     size = sqrt(w * w + x * x + y * y + z * z)
     return w / size, x / size, y / size, z / size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiltErrors:
+    """Tilt errors about both level axes (N, 2), and their stated sigma (N,).
+
+    Per axis [rad], of every sample whose tilt and truth are known.
+    """
+
+    error_rad: Float
+    sigma_rad: Float
+
+    @classmethod
+    def of(cls, found_wxyz: Float, truth_wxyz: Float, sigma_rad: Float) -> "TiltErrors":
+        """Return the tilt errors of orientations (T, 4); sigma is (T,).
+
+        Orientations map sensor axes to a world whose z axis is up, NaN where not known.
+        """
+        known = (
+            np.isfinite(found_wxyz).all(axis=1) & np.isfinite(truth_wxyz).all(axis=1) & np.isfinite(sigma_rad)
+        )
+        found, truth = (quaternion_to_matrix(q[known]) for q in (found_wxyz, truth_wxyz))
+        up: Float = (found @ truth[:, 2, :, None])[..., 0]  # the true vertical in the world that was found
+        sine = np.hypot(up[:, 0], up[:, 1])
+        angle = np.arctan2(sine, up[:, 2]) / np.maximum(sine, 1e-12)
+        return cls(np.column_stack((-up[:, 1], up[:, 0])) * angle[:, None], sigma_rad[known])
+
+    @property
+    def rms_deg(self) -> float:
+        """Root mean square of the inclination's error, both axes together."""
+        return float(np.degrees(np.sqrt(np.vecdot(self.error_rad, self.error_rad).mean())))
+
+    @property
+    def stated_deg(self) -> float:
+        """What that would be if the stated sigmas were exact."""
+        return float(np.degrees(np.sqrt(2.0 * np.mean(np.square(self.sigma_rad)))))
+
+    @property
+    def within(self) -> float:
+        """Share of samples in their 95 % regions."""
+        region = 5.991  # chi square, two degrees of freedom, 95 %
+        return float((np.vecdot(self.error_rad, self.error_rad) < region * np.square(self.sigma_rad)).mean())
+
+    def where(self, rows: Bool) -> "TiltErrors":
+        """Those of some samples (N,)."""
+        return TiltErrors(self.error_rad[rows], self.sigma_rad[rows])

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.errors import RecordingError
 from common.messages import ImuSample
 from common.recording.recorded_files import read_table

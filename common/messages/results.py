@@ -98,7 +98,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             vertical. NaN: not known, or no such device.
         palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
         wrist_angles_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
-            (`common.hand.wrist_joint`). NaN: no such device, or nothing measures them.
+            (`common.hand.wrist`). NaN: no such device, or nothing measures them.
         wrist_angles_sigma_rad: (2,) their standard deviations.
     """
 

@@ -1,16 +1,25 @@
-"""State of processes and requests to them.
+"""Processes publish their state and metrics and receive requests.
+
+Table of the metrics that processes publish in `Health`.
+
+A `Health` with a metric that is not in it is refused, where it is made and where it is received. `<...>` in a name
+stands for a name of the rig (a camera, a marker, a sender) or of a device's control. docs/metrics.md is made of it.
+
+State of processes and requests to them.
 
 Health, checklist, commands, and pictures for people.
 """
 
+import re
+from collections.abc import Iterable
+from functools import lru_cache
 from math import isfinite
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
 from common.errors import PictureError
-from common.messages.metrics import unknown
 from common.messages.parts import (
     MAX_COUNT,
     MAX_NAME_CHARACTERS,
@@ -25,6 +34,149 @@ from common.messages.parts import (
     printable,
 )
 from common.recording.picture_size import MAX_PIXELS, jpeg_size
+
+
+class Metric(NamedTuple):
+    """One published metric.
+
+    Attributes:
+        name: As in `Health.metrics`, with `<...>` where names of the rig stand.
+        unit: SI or as the name says; "1": a ratio or a count; "0/1": a truth.
+        process: Who publishes it: master, camera, imu, tracker, slave (all three), sender, recorder, player.
+        text: What it is.
+    """
+
+    name: str
+    unit: str
+    process: str
+    text: str
+
+
+METRICS = (
+    Metric("rate_hz", "1/s", "slave", "frames, samples or poses per second since the last report"),
+    Metric("away_s", "s", "slave", "for how long the device has been lost; 0: it is there"),
+    Metric("<device>.away_s", "s", "slave", "the same of a further device"),
+    Metric("temperature_c", "°C", "slave", "of the hottest zone of the machine, or of the IMU"),
+    Metric("temperature_limit_c", "°C", "slave", "at which that zone is throttled"),
+    Metric(
+        "throttled",
+        "bits",
+        "slave",
+        "flags of the firmware that hold now: undervoltage, capped, throttled, hot",
+    ),
+    Metric("disk_free_mb", "MB", "slave", "free where the slave writes"),
+    Metric("detect_us", "µs", "camera", "mean time of a detection"),
+    Metric("detect_worst_us", "µs", "camera", "longest since the last report"),
+    Metric("exposure_us", "µs", "camera", "exposure time as the camera has it"),
+    Metric("analogue_gain", "1", "camera", "as the camera has it"),
+    Metric("digital_gain", "1", "camera", "as the camera has it"),
+    Metric("red_gain", "1", "camera", "white balance, relative to green"),
+    Metric("blue_gain", "1", "camera", "white balance, relative to green"),
+    Metric("frame_rate_hz", "1/s", "camera", "as the camera has it"),
+    Metric("focus_dioptres", "1/m", "camera", "lens position"),
+    Metric("sensor_celsius", "°C", "camera", "of the image sensor"),
+    Metric("row_time_us", "µs", "camera", "readout time of a row"),
+    Metric("control.<control>", "code", "camera", "a control of a USB camera, in codes of its maker"),
+    Metric("sync_locked", "0/1", "camera", "it runs in step with the other Pi cameras"),
+    Metric("sync_error_us", "µs", "camera", "last correction of a camera that follows; 0: below 50 µs"),
+    Metric("wanted.<setting>", "as the setting", "camera", "what the camera file in use says of it"),
+    Metric("roi_margin", "1", "camera", "margin of the windows in which markers are searched"),
+    *(
+        Metric(f"marker.<marker>.{channel}_{end}", "code", "camera", "bound of the colour range in use")
+        for channel in "hsv"
+        for end in ("low", "high")
+    ),
+    Metric("width_px", "px", "camera", "of the camera file in use"),
+    Metric("height_px", "px", "camera", "of the camera file in use"),
+    Metric("colour.<marker>", "code", "camera", "checksum of the colour range in use"),
+    Metric("overlap.<marker>..<marker>", "hues", "camera", "how many hues two colour ranges share"),
+    Metric("alike.<marker>..<marker>", "hues", "camera", "between two markers that look alike"),
+    Metric("ambiguous.<marker>.u", "px", "camera", "where something else of the marker's colour was last"),
+    Metric("ambiguous.<marker>.v", "px", "camera", "where something else of the marker's colour was last"),
+    Metric("pick.pixels", "px", "camera", "answer to a click: pixels of that colour"),
+    Metric("pick.own_share", "1", "camera", "answer to a click: share of them within the range"),
+    Metric("pick.skin_share", "1", "camera", "answer to a click: share of the skin within the range"),
+    Metric("pick.background_px", "px", "camera", "answer to a click: background within the range, per frame"),
+    Metric("light_red", "1", "camera", "red against green, relative to calibration"),
+    Metric("light_blue", "1", "camera", "blue against green, relative to calibration"),
+    Metric("light_exposure", "1", "camera", "green, relative to calibration"),
+    Metric("raw.megabytes", "MB", "camera", "written of the raw frames of this recording"),
+    Metric("raw.on", "0/1", "camera", "raw frames are kept now"),
+    Metric("battery_percent", "%", "imu", "of the IMU"),
+    Metric("bias_x_rad_s", "rad/s", "imu", "estimated bias of the gyroscope"),
+    Metric("bias_y_rad_s", "rad/s", "imu", "estimated bias of the gyroscope"),
+    Metric("bias_z_rad_s", "rad/s", "imu", "estimated bias of the gyroscope"),
+    Metric("heading_sigma_rad", "rad", "imu", "standard deviation of the drift about the vertical"),
+    Metric("at_rest", "0/1", "imu", "the IMU does not move"),
+    Metric("tracked", "0/1", "tracker", "the device knows where it is"),
+    Metric("poses_per_s", "1/s", "master, player", "hands published per second"),
+    Metric("latency_p50_ms", "ms", "master", "hand-over of the last frame to publication, median"),
+    Metric("latency_p99_ms", "ms", "master", "the same, 99th percentile"),
+    Metric("object_latency_p50_ms", "ms", "master", "the same of objects that were tracked, median"),
+    Metric("object_latency_p99_ms", "ms", "master", "the same, 99th percentile"),
+    Metric("camera_hz.<camera>", "1/s", "master", "rate of a camera, by its time stamps"),
+    Metric("<sender>.clock_offset_us", "µs", "master", "its clock against the master's"),
+    Metric("<sender>.clock_sigma_us", "µs", "master", "standard deviation of that"),
+    Metric("<sender>.clock_drift_ppm", "ppm", "master", "how much faster its clock runs"),
+    Metric("<camera>.phase_us", "µs", "master", "when it exposes against the other cameras"),
+    Metric("<camera>.phase_spread_us", "µs", "master", "spread of that"),
+    Metric(
+        "<camera>.residual_offset_us",
+        "µs",
+        "master",
+        "how much later its frames are than stamped, by the tracks",
+    ),
+    Metric("<camera>.residual_sigma_us", "µs", "master", "standard deviation of that"),
+    Metric("open_bus", "0/1", "master", "anybody in the network may read the bus"),
+    Metric("on.<output>", "0/1", "sender", "this output is switched on"),
+    Metric("open.<output>", "0/1", "sender", "somebody takes what it sends"),
+    Metric("recorder.seconds", "s", "recorder", "length so far"),
+    Metric("recorder.megabytes", "MB", "recorder", "written so far"),
+    Metric("recorder.megabytes_per_s", "MB/s", "recorder", "written per second"),
+    Metric("recorder.free_gb", "GB", "recorder", "free on its disk"),
+    Metric("play.position_s", "s", "player", "where it is"),
+    Metric("play.length_s", "s", "player", "of the recording"),
+    Metric("play.speed", "1", "player", "1: as recorded"),
+    Metric("play.paused", "0/1", "player", "it stands still"),
+)
+
+
+def _pattern(name: str) -> str:
+    return "".join(
+        "[^\\x00-\\x1f]+" if part.startswith("<") else re.escape(part) for part in re.split(r"(<\w+>)", name)
+    )
+
+
+_KNOWN = re.compile("|".join(f"(?:{_pattern(metric.name)})" for metric in METRICS))
+_CUT = tuple(metric.name.partition("<")[0] for metric in METRICS if "<" in metric.name)
+
+
+@lru_cache(maxsize=4096)
+def is_known(name: str) -> bool:
+    """Return whether a metric of this name is in the table.
+
+    A name of the full length may have been cut.
+    """
+    if _KNOWN.fullmatch(name):
+        return True
+    return len(name) == MAX_NAME_CHARACTERS and any(head and name.startswith(head) for head in _CUT)
+
+
+def unknown(names: Iterable[str]) -> list[str]:
+    """Return the names that are not in the table."""
+    return [name for name in names if not is_known(name)]
+
+
+def metrics_page() -> str:
+    """Return docs/metrics.md: one row per published metric."""
+    head = (
+        "# Metrics\n\nWhat processes publish in `Health.metrics` once a second (`phalanx/health/<name>`). A metric "
+        "that is not in this table is refused.\n\n`<...>` stands for a name of the rig, of a device's control or of an "
+        "output. A name has at most 64 characters; a longer one is cut.\n\nThis page is made by `make schema`.\n\n"
+        "| metric | unit | published by | what it is |\n|---|---|---|---|\n"
+    )
+    return head + "".join(f"| `{one.name}` | {one.unit} | {one.process} | {one.text} |\n" for one in METRICS)
+
 
 MAX_PREVIEW_BYTES = 256 * 1024
 MAX_STILL_BYTES = 900 * 1024
@@ -67,7 +219,7 @@ class Health(Message, frozen=True, eq=False, tag=True):
         session: Random id of the process.
         t_ns: Moment of the report [ns], clock of the source.
         counts: Event name -> how often (frames, dropped, refused by reason, ...).
-        metrics: Quantity -> value now, by the table of `common.messages.metrics`; others are refused.
+        metrics: Quantity -> value now, by the table of `common.messages.state`; others are refused.
         host: Name of the machine that the process runs on; empty: not reported.
         version: Of the program; empty: not reported.
     """

@@ -22,8 +22,8 @@ from msgspec import Struct
 
 from common.calibration import CameraCalibration, RigCalibration, check, load
 from common.calibration.camera import Pixel
+from common.calibration.files import PLAIN, is_plain
 from common.calibration.object_profile import ObjectProfile
-from common.calibration.plain_names import PLAIN, is_plain
 from common.errors import CalibrationError, RecordingError
 from common.messages import TimeNs
 from common.messages.parts import MAX_TIME_NS
@@ -132,7 +132,7 @@ class FrameRow:
         seq: Its frame counter.
         t_ns: Middle of the exposure of row 0 [ns].
         illumination: What lit the frame.
-        file: A picture, FOLDER/NAME, or a frame of a video, VIDEO/NUMBER (`common.recording.frame_pictures`).
+        file: A picture, FOLDER/NAME, or a frame of a video, VIDEO/NUMBER (`common.recording.pictures`).
     """
 
     camera: str

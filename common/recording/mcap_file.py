@@ -1,4 +1,17 @@
-"""Contents of an MCAP file: its chunks, channels, attachments and metadata.
+"""A reader opens an MCAP file chunk by chunk, within bounds.
+
+Bounds of an MCAP file: what a recording of ours can hold.
+
+What is beyond them is lost, and counted with its cause.
+
+A few bytes can claim any size, and zstd packs 4 MiB of zeros into 400 bytes. So each part is bounded, and so is what
+one pass over a file unpacks, by the size of the file: a writer of ours leaves 16 bytes of index for each message.
+
+One chunk of an MCAP file, opened within bounds.
+
+Its sizes are checked before anything is unpacked.
+
+Contents of an MCAP file: its chunks, channels, attachments and metadata.
 
 The file may be whole or cut anywhere.
 
@@ -9,6 +22,7 @@ are read by the `mcap` library from bytes that were cut out here, never from the
 What is beyond a bound is a loss as what is broken is: it is counted with its cause, and the rest is read.
 """
 
+import io
 import os
 import struct
 import zlib
@@ -16,13 +30,17 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
     ChunkIndex,
     Footer,
     Header,
@@ -33,16 +51,199 @@ from mcap.records import (
 
 from common.errors import RecordingError
 from common.messages.parts import MAX_TIME_NS
-from common.recording.mcap_bounds import BOUNDS, Losses, WorkBudget
-from common.recording.mcap_chunk import (
-    BROKEN,
-    HEAD,
-    ChunkMessage,
-    OpenedChunk,
-    open_chunk,
-    read_channel,
-    stream,
-)
+
+
+class McapBounds(NamedTuple):
+    """Most bytes and entries of each part of a recording."""
+
+    # Unpacked: a writer closes a chunk with the message that takes it past its target. Ours is 512 KiB, that of the
+    # tools for MCAP that cut and convert files up to 4 MiB; a message has less than 1 MiB.
+    chunk_bytes: int = (4 << 20) + (1 << 20)
+    channel_bytes: int = 4096
+    channels: int = 1024
+    attachment_bytes: int = 4 << 20  # of one file of calibration
+    attached_bytes: int = 64 << 20  # of all
+    attachments: int = 256
+    metadata_bytes: int = 16 << 10  # of one; the names of 32 cameras and of their folders take 6 KiB
+    metadata: int = 16
+    summary_bytes: int = 64 << 20  # a day of chunks takes 26 MiB
+    around_bytes: int = 1024  # of a record, beside its content; and all that a header may have
+
+
+BOUNDS = McapBounds()
+CHUNK_RECORDS = BOUNDS.chunk_bytes // 70  # 74,898: a message of ours takes 70 bytes or more
+
+BEYOND = "more than a file of this size can hold"
+
+
+class WorkBudget:
+    """What one pass over a file may still read and unpack.
+
+    Holds the bytes and records that are left.
+    """
+
+    def __init__(self, file_bytes: int) -> None:
+        """Of a file of that size."""
+        free_bytes = 16 << 20  # that a pass may unpack of the smallest file
+        # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
+        ratio = 256
+        self._bytes = free_bytes + ratio * file_bytes
+        index_bytes = 16  # of the file, for each message in it
+        self._records = CHUNK_RECORDS + file_bytes // index_bytes
+
+    def holds(self, records: int) -> bool:
+        """Whether there may be so many records more."""
+        return records <= self._records
+
+    def take_records(self, count: int) -> None:
+        """Use up so many records, or what is left."""
+        self._records = max(self._records - count, 0)
+
+    def take(self, size: int) -> None:
+        """Use up so many bytes.
+
+        Raises:
+            RecordingError: There are not so many left.
+        """
+        if size > self._bytes:
+            raise RecordingError(BEYOND)
+        self._bytes -= size
+
+
+@dataclass(slots=True)
+class Losses:
+    """What of a file cannot be read.
+
+    Attributes:
+        count: Chunks, attachments, metadata and messages, as far as they were met.
+        named: The first few, with the cause; printable.
+    """
+
+    count: int = 0
+    named: list[str] = field(default_factory=list[str])
+
+    def add(self, what: str) -> None:
+        """Count one."""
+        self.count += 1
+        named = 5
+        if len(self.named) < named:
+            text = what[:200]
+            if not text.isprintable():
+                text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in text)
+            self.named += [text] if text not in self.named else []
+
+
+HEAD = struct.Struct("<BQ")  # of every record: what it is, and the length of what follows
+BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, MemoryError, OverflowError, RuntimeError)
+_MESSAGE = struct.Struct("<HIQQ")
+
+
+class ChunkMessage(NamedTuple):
+    """A message as it stands in a chunk: its channel, its log time [ns], its bytes."""
+
+    channel_id: int
+    log_time: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedChunk:
+    """What is in a chunk, in the order of writing.
+
+    Attributes:
+        channels: By their number, as they stand there: a chunk repeats them, and only who wants them reads them.
+        messages: All of them.
+    """
+
+    channels: dict[int, bytes] = field(default_factory=dict[int, bytes])
+    messages: list[ChunkMessage] = field(default_factory=list[ChunkMessage])
+
+
+def stream(data: bytes) -> ReadDataStream:
+    """Bytes as the library reads them."""
+    return ReadDataStream(io.BytesIO(data))
+
+
+def open_chunk(data: bytes, budget: WorkBudget) -> OpenedChunk:
+    """Unpack the content of a chunk record.
+
+    Raises:
+        RecordingError: It is broken, or beyond a bound; the message states why, not where.
+    """
+    try:
+        return _traversed(_unpacked(Chunk.read(stream(data)), budget), budget)
+    except BROKEN as error:
+        raise RecordingError(f"broken: {error or type(error).__name__}") from error
+
+
+def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
+    if chunk.compression not in ("", "zstd"):  # not ours; the library unpacks lz4 without any bound
+        raise RecordingError(f"compression {chunk.compression[:16]!r}: must be zstd or none")
+    packed, claimed = chunk.compression == "zstd", chunk.uncompressed_size
+    size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
+    if max(size, claimed) > BOUNDS.chunk_bytes:
+        raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {BOUNDS.chunk_bytes}")
+    if size not in (
+        claimed,
+        -1,
+    ):  # -1: the frame does not state it, as of a writer that packs while it writes
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {size}")
+    budget.take(claimed)
+    content = zstandard.decompress(chunk.data, max_output_size=claimed) if packed and claimed else chunk.data
+    if len(content) != claimed:
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {len(content)}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
+        raise RecordingError("its check sum does not fit")
+    return content
+
+
+def _traversed(content: bytes, budget: WorkBudget) -> OpenedChunk:
+    opened, at, count = OpenedChunk(), 0, 0
+    try:
+        while at < len(content):
+            opcode, length = HEAD.unpack_from(content, at)
+            at, count = at + HEAD.size, count + 1
+            if length > len(content) - at:
+                raise RecordingError("a record is longer than the chunk")
+            if count > CHUNK_RECORDS or not budget.holds(count):
+                raise RecordingError(
+                    BEYOND if count <= CHUNK_RECORDS else f"more than {CHUNK_RECORDS} records"
+                )
+            if opcode == Opcode.MESSAGE:
+                opened.messages.append(_message(content, at, length))
+            elif opcode == Opcode.CHANNEL:
+                number = int.from_bytes(content[at : at + min(length, 2)], "little")
+                opened.channels.setdefault(number, content[at : at + length])
+                if len(opened.channels) > BOUNDS.channels:
+                    raise RecordingError(f"more than {BOUNDS.channels} channels")
+            at += length
+    finally:
+        budget.take_records(count)  # also of a chunk that is refused: it was work
+    return opened
+
+
+def _message(content: bytes, at: int, length: int) -> ChunkMessage:
+    if length < _MESSAGE.size:
+        raise RecordingError("a message is cut")
+    channel_id, _, log_time, _ = _MESSAGE.unpack_from(content, at)
+    if log_time > MAX_TIME_NS:
+        raise RecordingError(f"log time {log_time}: at most {MAX_TIME_NS}")
+    return ChunkMessage(channel_id, log_time, content[at + _MESSAGE.size : at + length])
+
+
+def read_channel(data: bytes) -> Channel:
+    """Read the content of a channel record.
+
+    Raises:
+        RecordingError: It is too long or broken.
+    """
+    if len(data) > BOUNDS.channel_bytes:
+        raise RecordingError(f"a channel of {len(data)} bytes, at most {BOUNDS.channel_bytes}")
+    try:
+        return Channel.read(stream(data))
+    except BROKEN as error:
+        raise RecordingError(f"broken: {error or type(error).__name__}") from error
+
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<QQI")

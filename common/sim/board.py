@@ -20,8 +20,7 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
-from common.sim.desk import LENS_SIGMA_PX, NoiseTiles
-from common.sim.light import Float32, SrgbTables
+from common.sim.light import LENS_SIGMA_PX, Float32, NoiseTiles, SrgbTables
 
 
 class BoardSettings(NamedTuple):

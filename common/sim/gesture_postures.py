@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
-from common.hand.capsule_gaps import TaperedCapsules, gaps_between
 from common.hand.model import CHAINS, TIPS, HandModel
+from common.hand.skin import TaperedCapsules, gaps_between
 from common.sim.motion import POSES, angles_of
 
 PAD_DEG = ((18, 8, 14), (2, 68, 34), (0, 68, 34), (-1, 68, 34), (-2, 68, 34))

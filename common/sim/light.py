@@ -1,9 +1,30 @@
-"""Colours of the simulated scene.
+"""Light gives a simulated scene its illuminant, colours, desk and noise.
+
+Colours of the simulated scene.
 
 Reflectances, light, and the step between linear light and sRGB bytes.
 
 Marker reflectances are those of the rendered recordings (truth_meta.json, paint_reflectance_linear_srgb), so that
 colours learnt here and there agree.
+
+Changing illumination and its effect on the picture.
+
+A lamp of another colour temperature, or another exposure.
+
+The camera's white balance is fixed, set under the light that the colours were calibrated in. Another light multiplies
+every channel in linear light (von Kries' law of coefficients, with the channels of linear sRGB as receptors):
+
+    gain = exposure * white(kelvin) / white(calibrated kelvin)
+
+where `white` is the linear sRGB colour of a Planckian radiator of luminance 1, its chromaticity from the cubic splines
+of Kang et al. 2002 (J. Korean Phys. Soc. 41, 865), 1667-25000 K. Equal luminance: exposure is the only change of
+brightness.
+
+Image background and sensor noise.
+
+The desk as one camera sees it behind the hand, and tiles of noise.
+
+Both are made once and only copied afterwards: cameras do not move.
 """
 
 from dataclasses import dataclass
@@ -13,8 +34,10 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.errors import CalibrationError
+from common.errors import CalibrationError, PhalanxError
+from common.geometry.camera_model import CameraModel
 from common.geometry.srgb import to_linear, to_srgb
+from common.geometry.transforms import transform
 
 Float32 = npt.NDArray[np.float32]
 
@@ -116,3 +139,223 @@ def marker_colour(marker: str) -> tuple[float, float, float]:
             f"marker {marker!r}: the simulator has no such paint; it has {', '.join(known)}"
         )
     return known[marker]
+
+
+CALIBRATED_KELVIN = 4300.0  # the middle of 3000-6500 K in reciprocal temperature, in which steps look equal
+KELVINS = (1667.0, 25000.0)  # domain of Kang's splines
+# XYZ -> linear sRGB (IEC 61966-2-1).
+RGB_OF_XYZ = np.array(
+    [
+        [3.2404542, -1.5371385, -0.4985314],
+        [-0.9692660, 1.8760108, 0.0415560],
+        [0.0556434, -0.2040259, 1.0572252],
+    ]
+)
+
+
+def planckian_xy(kelvin: float) -> tuple[float, float]:
+    """CIE 1931 chromaticity x, y of a Planckian radiator, by Kang's splines.
+
+    Raises:
+        PhalanxError: Outside 1667-25000 K, where they do not hold.
+    """
+    if not KELVINS[0] <= kelvin <= KELVINS[1]:
+        raise PhalanxError(f"light of {kelvin:g} K: from {KELVINS[0]:g} to {KELVINS[1]:g} K are possible")
+    k = 1e3 / kelvin
+    if kelvin <= 4000.0:
+        x = ((-0.2661239 * k - 0.2343589) * k + 0.8776956) * k + 0.179910
+    else:
+        x = ((-3.0258469 * k + 2.1070379) * k + 0.2226347) * k + 0.240390
+    if kelvin <= 2222.0:
+        y = ((-1.1063814 * x - 1.34811020) * x + 2.18555832) * x - 0.20219683
+    elif kelvin <= 4000.0:
+        y = ((-0.9549476 * x - 1.37418593) * x + 2.09137015) * x - 0.16748867
+    else:
+        y = ((3.0817580 * x - 5.87338670) * x + 3.75112997) * x - 0.37001483
+    return x, y
+
+
+def white(kelvin: float) -> Float:
+    """Return the linear sRGB (3,) of a Planckian radiator of luminance 1.
+
+    Below about 1900 K its blue would be negative: 0.
+
+    Raises:
+        PhalanxError: As `planckian_xy`.
+    """
+    x, y = planckian_xy(kelvin)
+    return np.maximum(RGB_OF_XYZ @ np.array([x / y, 1.0, (1.0 - x - y) / y]), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """One light: its colour temperature [K], and the brightness of the picture.
+
+    The brightness is relative to calibration.
+    """
+
+    kelvin: float = CALIBRATED_KELVIN
+    exposure: float = 1.0
+
+    def gains_bgr(self, calibrated_kelvin: float = CALIBRATED_KELVIN) -> Float:
+        """Return the factors (3,) of the channels in linear light, blue first.
+
+        Relative to the calibrated light.
+
+        Raises:
+            PhalanxError: A temperature outside 1667-25000 K.
+        """
+        return (self.exposure * white(self.kelvin) / white(calibrated_kelvin))[::-1]
+
+
+@dataclass(frozen=True, slots=True)
+class LightSchedule:
+    """Schedule of a scene's light: knots (time [s], kelvin, exposure).
+
+    Straight lines between the knots.
+
+    Two knots at one time are a jump. Before the first knot and after the last nothing changes.
+
+    Attributes:
+        knots: In order of time.
+        calibrated_kelvin: The light under which the camera's white balance was set.
+    """
+
+    knots: tuple[tuple[float, float, float], ...]
+    calibrated_kelvin: float = CALIBRATED_KELVIN
+
+    def __post_init__(self) -> None:
+        times = [t for t, _, _ in self.knots]
+        if not self.knots or times != sorted(times):
+            raise PhalanxError(
+                f"light course: knots must be in order of time, at least one; got times {times}"
+            )
+        for _, kelvin, exposure in self.knots:
+            planckian_xy(kelvin)
+            if not exposure > 0.0:
+                raise PhalanxError(f"light course: exposure {exposure:g} must be above 0")
+        white_then = white(self.calibrated_kelvin)
+        if not (white_then > 0.0).all():
+            raise PhalanxError(
+                f"light course: calibrated_kelvin {self.calibrated_kelvin:g} has no blue at all"
+            )
+
+    def at(self, t_s: float) -> Light:
+        """The light at scene time `t_s` [s]; of a jump at that very time, the new light."""
+        times, kelvins, exposures = (list(column) for column in zip(*self.knots, strict=True))
+        after = int(np.searchsorted(times, t_s, side="right"))
+        if after == 0 or after == len(times):
+            i = max(after - 1, 0)
+            return Light(kelvins[i], exposures[i])
+        t0, t1 = times[after - 1], times[after]
+        share = (t_s - t0) / (t1 - t0)
+        return Light(
+            kelvins[after - 1] + share * (kelvins[after] - kelvins[after - 1]),
+            exposures[after - 1] + share * (exposures[after] - exposures[after - 1]),
+        )
+
+    def gains_bgr(self, t_s: float) -> Float:
+        """Factors (3,) of the channels at scene time `t_s` [s], blue first."""
+        return self.at(t_s).gains_bgr(self.calibrated_kelvin)
+
+
+# One minute of a room: dusk under a lamp, then the lamp is dimmed, a cloud, noon; back at the end, so that it repeats.
+ROOM = LightSchedule(
+    (
+        (2.0, CALIBRATED_KELVIN, 1.0),
+        (12.0, 3000.0, 1.0),
+        (18.0, 3000.0, 0.7),
+        (24.0, 3000.0, 1.3),
+        (36.0, 6500.0, 1.3),
+        (42.0, 6500.0, 0.7),
+        (48.0, 6500.0, 1.0),
+        (58.0, CALIBRATED_KELVIN, 1.0),
+    )
+)
+
+
+SIDE = 1536
+NOISE_MARGIN = 96
+LENS_SIGMA_PX = 0.62
+
+
+def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
+    """Return the image (H, W, 3) BGR of a worn dark grey desk.
+
+    At rig depth `depth_m` [m], fixed in the rig frame.
+    """
+    height, width = optics.height_px, optics.width_px
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
+    along = (depth_m - optics.centre[2]) / np.where(rays[:, 2] > 0.05, rays[:, 2], 0.05)
+    points = transform(np.eye(4), optics.centre + along[:, None] * rays)
+    texel_m = 0.001
+    texel = (points[:, :2] / texel_m + SIDE / 2).reshape(height, width, 2).astype(np.float32)
+    wear = cv2.remap(
+        _wear(seed), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+    radius2 = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / (width / 2) ** 2
+    lamp = 1.05 - 0.10 * radius2 - 0.06 * (v / height - 0.5)
+    linear = np.array(DESK_LINEAR_RGB)[::-1] * (wear * lamp[..., None])
+    image = np.round(255.0 * to_srgb(linear)).astype(np.uint8)
+    return np.asarray(cv2.GaussianBlur(image, (3, 3), LENS_SIGMA_PX), dtype=np.uint8)
+
+
+def _wear(seed: int) -> npt.NDArray[np.float32]:
+    """Return the relative brightness (SIDE, SIDE, 3) of wear, about 1.
+
+    Blotches, grain and brushed streaks.
+
+    Single precision and one plane for what has no colour: a slave that starts again waits for this.
+    """
+    rng = np.random.default_rng([seed, 1])
+    grey = np.ones((SIDE, SIDE), dtype=np.float32)
+    tinted = np.zeros((SIDE // 4, SIDE // 4, 3), dtype=np.float32)
+    for cell, depth in ((256, 0.06), (64, 0.045), (16, 0.04), (4, 0.05), (1, 0.07)):
+        n = SIDE // cell
+        coarse = depth * rng.standard_normal((n, n), dtype=np.float32)
+        grey += coarse if cell == 1 else cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+        if cell > 1:
+            tint = 0.12 * depth * rng.standard_normal((n, n, 3), dtype=np.float32)
+            tinted += cv2.resize(tint, tinted.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    grey += 0.18 * cv2.blur(rng.standard_normal((SIDE, SIDE), dtype=np.float32), (61, 1))
+    wear = cv2.resize(tinted, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR)
+    wear += grey[..., None]
+    return np.asarray(np.clip(wear, 0.5, 1.6, out=wear), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseTiles:
+    """Sensor noise, drawn once.
+
+    What to add and what to subtract (2 x H + margin, W + margin, 3).
+    """
+
+    plus: tuple[Image, ...]
+    minus: tuple[Image, ...]
+
+    @classmethod
+    def make(cls, height: int, width: int, seed: int, tiles: int = 2) -> "NoiseTiles":
+        """Draw the pool."""
+        rng = np.random.default_rng([seed, 2])
+        plus: list[Image] = []
+        minus: list[Image] = []
+        for _ in range(tiles):
+            white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3))
+            # A colour filter array mixes neighbours.
+            mixed: Float = np.asarray(cv2.GaussianBlur(white, (3, 3), 0.45), dtype=np.float64)
+            noise_sigma = 1.7  # in sRGB levels: gamma turns shot noise into a nearly constant amplitude
+            level = np.rint(mixed * (noise_sigma * np.array([1.25, 0.85, 1.1]) / float(mixed.std())))
+            plus.append(np.clip(level, 0, 255).astype(np.uint8))
+            minus.append(np.clip(-level, 0, 255).astype(np.uint8))
+        return cls(tuple(plus), tuple(minus))
+
+    def add_to(self, image: Image, key: int) -> None:
+        """Add noise in place; the same key adds the same noise."""
+        height, width = image.shape[:2]
+        mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
+        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+        tile = mixed % len(self.plus)
+        y, x = (mixed >> 4) % NOISE_MARGIN, (mixed >> 14) % NOISE_MARGIN
+        cv2.add(image, self.plus[tile][y : y + height, x : x + width], dst=image)
+        cv2.subtract(image, self.minus[tile][y : y + height, x : x + width], dst=image)

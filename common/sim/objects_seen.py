@@ -1,17 +1,35 @@
-"""Tracked objects in one image: outlines, shading and depth of each part.
+"""One image shows tracked objects: outlines, shading, depth, printed tags.
+
+Tracked objects in one image: outlines, shading and depth of each part.
 
 The depth is how far away each part is behind a pixel.
+
+Tracked objects as one camera sees them.
+
+From key points in space to outlines and shading (`objects_seen`).
+
+Printed tags in an image: ink on paper, in linear light, blurred by motion.
+
+The appearance is that over a box of pixels while the tag moves.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from common.arrays import Float
-from common.sim import raster
-from common.sim.object_surface import Ball, Sheet
+from common.arrays import Float, Image
+from common.calibration.object_profile import TagFamily
+from common.geometry.tag_family import tag_image
+from common.geometry.transforms import cross
+from common.sim import light, raster
+from common.sim.light import AMBIENT
 from common.sim.raster import Shape
+from common.sim.surface import LAYER_SINES, rim, unit
+from common.sim.tracked import BLOCK_FACES, PAPER_CELLS, Ball, Block, ObjectSurface, Rod, Sheet
 
 Colour = tuple[int, int, int]
 
@@ -179,3 +197,212 @@ def _share(uv: Float, start: Float, stop: Float) -> Float:
 
 
 NOTHING = SeenObjects.of((), (), ())
+
+
+Project = Callable[[Float], Float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Key points of the objects at their times.
+
+    (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s].
+    """
+
+    at: Float
+    uv: Float
+    speed_uv: Float
+    t_s: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appearances:
+    """Viewing parameters of one camera.
+
+    Direction towards the light (3,), camera frame; `unit_circle`; points (..., 3) [m] to pixels.
+    """
+
+    to_light: Float
+    circle: Float
+    focal_px: float
+    project: Project
+    thing: tuple[Colour, ...] = field(default_factory=lambda: light.shades(light.THING_LINEAR_RGB))
+    faces: tuple[Colour, ...] = field(default_factory=lambda: _faces())
+
+    def seen(self, surface: ObjectSurface, points: Points) -> SeenObjects:
+        """What a camera sees of the objects whose key points are there."""
+        if not surface.local.size:
+            return NOTHING
+        rods = [part for part in surface.parts if isinstance(part, Rod)]
+        balls = [*(part for part in surface.parts if isinstance(part, Ball)), *surface.beads]
+        rod_rims, (edges, lit, shine) = self._rims(rods, points), self._ball_points(balls, points)
+        uv = self._project_all((rod_rims, edges, lit, shine))
+        round_parts: dict[int, SeenPart] = {}
+        for k, rod in enumerate(rods):
+            round_parts[id(rod)] = self._rod(rod, uv[0][k], points)
+        bands = self._bands(balls, uv[1], uv[2], points)
+        for k, ball in enumerate(balls):
+            fills = () if ball.marker is not None else tuple(zip(bands[k], self.thing, strict=True))
+            round_parts[id(ball)] = _whole(ball.middle.start, uv[1][k], fills, points)
+        parts = [
+            self._block(part, points) if isinstance(part, Block) else round_parts[id(part)]
+            for part in surface.parts
+        ]
+        first = len(balls) - len(surface.beads)
+        beads = [
+            SeenBead(
+                bead,
+                points.at[bead.middle][0],
+                round_parts[id(bead)],
+                bands[first + k],
+                uv[3][first + k],
+                float(self.focal_px * bead.radius_m / points.at[bead.middle, 2][0]),
+                float(points.t_s[bead.middle][0]),
+            )
+            for k, bead in enumerate(surface.beads)
+        ]
+        return SeenObjects.of(parts, beads, [self._sheet(sheet, points) for sheet in surface.sheets])
+
+    def _rims(self, rods: Sequence[Rod], points: Points) -> Float:
+        """Return the shading edges of all rods at their ends.
+
+        Shape (R, 2, LAYERS, n, 3) [m]; see `things.tube_rims`.
+        """
+        ends = np.array([points.at[rod.ends] for rod in rods]).reshape(-1, 2, 3)
+        radius = np.array([rod.radius_m for rod in rods])
+        axis = unit(ends[:, 1] - ends[:, 0])
+        across = self.to_light - (axis @ self.to_light)[:, None] * axis
+        middle = (radius[:, None] * light.LAYER_COSINES)[..., None] * across[:, None]
+        layers = np.broadcast_to(axis[:, None], middle.shape)
+        rims = middle[:, :, None] + rim(layers, radius[:, None] * LAYER_SINES, self.circle)
+        return ends[:, :, None, None] + rims[:, None]
+
+    def _ball_points(self, balls: Sequence[Ball], points: Points) -> tuple[Float, Float, Float]:
+        """Return the edges, shading centres and lamp reflections of balls.
+
+        Edges (B, n, 3) [m] of the balls, centres (B, LAYERS, 3) of their shading, points (B, 3) where they mirror the
+        lamp.
+        """
+        middle = np.array([points.at[ball.middle][0] for ball in balls]).reshape(-1, 3)
+        radius = np.array([ball.radius_m for ball in balls])
+        d2 = (middle * middle).sum(axis=1)
+        shrink = 1.0 - radius**2 / d2  # the circle in which the rays touch the ball
+        towards = unit(middle)
+        edge = (middle * shrink[:, None])[:, None] + rim(towards, radius * np.sqrt(shrink), self.circle)
+        lit = middle[:, None] + (radius[:, None] * light.LAYER_COSINES)[..., None] * self.to_light
+        return edge, lit, middle + radius[:, None] * unit(self.to_light - towards)
+
+    def _bands(self, balls: Sequence[Ball], edges_uv: Float, lit_uv: Float, points: Points) -> Float:
+        """Shading (B, LAYERS, n, 2) [px] of balls, the first their outlines."""
+        size = np.array([self.focal_px * ball.radius_m / points.at[ball.middle, 2][0] for ball in balls])
+        bands = lit_uv[:, :, None] + (size[:, None] * LAYER_SINES)[..., None, None] * self.circle
+        bands[:, 0] = edges_uv
+        return bands
+
+    def _rod(self, rod: Rod, rims_uv: Float, points: Points) -> SeenPart:
+        ends = points.at[rod.ends]
+        axis = unit(ends[1] - ends[0])
+        layers = [raster.hull(rims_uv[:, k].reshape(-1, 2)) for k in range(rims_uv.shape[1])]
+        front = 0 if float(axis @ ends[0]) > 0.0 else 1  # whose outward normal points to the camera
+        cosine = float(axis @ self.to_light) * (1.0 if front else -1.0)
+        face = rims_uv[front, 0], self._face(cosine)
+        fills = (*zip(layers, self.thing, strict=True), face)
+        return SeenPart(layers[0], fills, points.uv[rod.ends], ends[:, 2], points.speed_uv[rod.ends])
+
+    def _face(self, cosine: float) -> Colour:
+        """Colour of a dark flat face whose normal has that cosine to the light."""
+        return self.faces[round(max(cosine, 0.0) * (len(self.faces) - 1))]
+
+    def _block(self, block: Block, points: Points) -> SeenPart:
+        corners, uv = points.at[block.corners], points.uv[block.corners]
+        middle, rings = corners.mean(axis=0), corners[np.array(BLOCK_FACES)]
+        normal = unit(cross(rings[:, 1] - rings[:, 0], rings[:, 3] - rings[:, 0]))
+        out = normal * np.sign(np.vecdot(normal, rings.mean(axis=1) - middle))[:, None]
+        fills = tuple(
+            (uv[list(face)], self._face(float(side @ self.to_light)))
+            for face, side, corner in zip(BLOCK_FACES, out, rings[:, 0], strict=True)
+            if float(side @ corner) < 0.0
+        )
+        at, speed = uv.mean(axis=0), points.speed_uv[block.corners].mean(axis=0)
+        depth = np.full(2, middle[2])
+        return SeenPart(raster.hull(uv), fills, np.stack([at, at]), depth, np.stack([speed, speed]))
+
+    def _sheet(self, sheet: Sheet, points: Points) -> SeenSheet:
+        at, uv = points.at[sheet.corners], points.uv[sheet.corners]
+        middle = at[:4].mean(axis=0)
+        out = unit(cross(at[3] - at[0], at[1] - at[0]))  # the corners go clockwise as it is printed
+        facing_least = 0.02  # cosine to the line of sight from which on a sheet shows its front
+        return SeenSheet(
+            sheet,
+            middle,
+            uv[:4],
+            uv[4:],
+            points.speed_uv[sheet.corners].mean(axis=0),
+            -float(out @ middle) / float(np.linalg.norm(middle)) > facing_least,
+            float(out @ self.to_light),
+            float(points.t_s[sheet.corners].mean()),
+        )
+
+    def _project_all(self, parts: tuple[Float, ...]) -> list[Float]:
+        """Project arrays of points (..., 3) in one call."""
+        uv = self.project(np.concatenate([part.reshape(-1, 3) for part in parts]))
+        ends = np.cumsum([part.size // 3 for part in parts])[:-1]
+        return [
+            flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)
+        ]
+
+
+def _whole(point: int, outline: Float, fills: tuple[tuple[Float, Colour], ...], points: Points) -> SeenPart:
+    """A ball: it has no ends, its middle stands for both."""
+    place = [point, point]
+    return SeenPart(outline, fills, points.uv[place], points.at[place, 2], points.speed_uv[place])
+
+
+def _faces() -> tuple[Colour, ...]:
+    """Colours of dark faces by the cosine to the light, from 0 to 1."""
+    return tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))
+
+
+Float32 = npt.NDArray[np.float32]
+INK, PAPER = 0.035, 0.72  # reflectance of toner and of office paper
+PAPER_BGR = np.array([0.97, 1.0, 1.0])
+TEXELS = 8  # of a cell, when the tag is near
+_BLEED = 4  # texels of paper beyond its edge: what covers it decides where it ends
+
+
+@cache
+def printed(family: TagFamily, number: int) -> Image:
+    """Reflectance (n, n) of a tag with its paper, 255 = 1, `TEXELS` a cell."""
+    cells = tag_image(family, number, round(PAPER_CELLS)) / 255.0
+    ink = np.kron(INK + (PAPER - INK) * cells, np.ones((TEXELS, TEXELS)))
+    return np.pad(np.rint(255.0 * ink), _BLEED, mode="edge").astype(np.uint8)
+
+
+def sheet_appearance(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int, int]) -> Float32:
+    """Return the linear light of a tag over a box of pixels, as if it filled it.
+
+    Shape (h, w, 3), blue first; box x0, y0, x1, y1.
+
+    Args:
+        seen: The tag.
+        moments_s: Moments (n,) of the exposure, relative to its middle [s].
+        box: The pixels.
+    """
+    x0, y0, x1, y1 = box
+    texture = printed(seen.sheet.family, seen.sheet.number)
+    own = len(texture) - 2 * _BLEED
+    edge = _BLEED - 0.5 + own * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    fine = 4  # rays per pixel and axis
+    size = (fine * (x1 - x0), fine * (y1 - y0))
+    total = np.zeros(size[::-1], np.float32)
+    for moment in moments_s:
+        # A pixel's middle is a whole number, its rays lie evenly about it.
+        uv = (seen.paper_uv + moment * seen.speed - [x0, y0] + 0.5) * fine - 0.5
+        way = cv2.getPerspectiveTransform(edge.astype(np.float32), uv.astype(np.float32))
+        drawn = cv2.warpPerspective(
+            texture, way, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        cv2.accumulate(drawn, total)
+    grey = cv2.resize(total, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    light = (AMBIENT + (1.0 - AMBIENT) * max(seen.lit, 0.0)) / (255.0 * len(moments_s))
+    return (grey[..., None] * (light * PAPER_BGR)).astype(np.float32)

@@ -21,12 +21,12 @@ from common.hand.model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu.recording import write_imu
 from common.recording.frame_recording import Illumination, Manifest
 from common.recording.frame_writing import RecordingWriter, encode_png
-from common.recording.npz import write_npz
-from common.sim.imu import SimulatedImu
+from common.recording.recorded_files import write_npz
 from common.sim.light import marker_colour
 from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene, SceneTruth
+from common.sim.sensors import SimulatedImu
 
 TRUTH = "truth.npz"
 TRUTH_META = "truth_meta.json"

@@ -20,13 +20,12 @@ import numpy as np
 from common.arrays import Float, Image
 from common.geometry.srgb import gain_tables
 from common.sim import light, raster
-from common.sim.desk import LENS_SIGMA_PX, NoiseTiles, desk_image
+from common.sim.light import LENS_SIGMA_PX, NoiseTiles, desk_image
 from common.sim.objects_seen import SeenPart
 from common.sim.painter import Covered, MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.sim.surface import CAPSULES, PALM_HULL
-from common.sim.things import SeenThing
+from common.sim.surface import CAPSULES, PALM_HULL, SeenThing
 from common.sim.view import LAYERS, Snapshot, View
 
 Box = tuple[int, int, int, int]

@@ -15,9 +15,8 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.hand.model import HandJoints, HandModel
-from common.sim.held import Cylinder
-from common.sim.illuminant import LightSchedule
-from common.sim.motion import HandMotion, HandState, ScriptedMotion
+from common.sim.light import LightSchedule
+from common.sim.motion import Cylinder, HandMotion, HandState, ScriptedMotion
 from common.sim.tracked import TrackedObjects
 
 STANDARD_SEED = 7
@@ -37,7 +36,7 @@ class SceneTruth:
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
         markers_m: (M, 3) centroids of the painted surfaces [m], rig frame; middles of the beads of objects.
-        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.hand.wrist_joint`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.hand.wrist`).
         things: What stands about, or is held, and is not tracked.
         objects: Tracked object -> `T_rig_object` (4, 4) [m].
     """

@@ -3,7 +3,7 @@
 Fusion is measured on them, and extrinsics are calibrated from them.
 
 All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
-device sits on the forearm (`common.hand.wrist_joint`; limits of the bend as flexion / deviation):
+device sits on the forearm (`common.hand.wrist`; limits of the bend as flexion / deviation):
 
     grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 3 degrees flexed, +-7 / +-8 about that
     both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
@@ -29,12 +29,12 @@ from common.sim.motion import (
     Drift,
     HandMotion,
     HandState,
+    StudyPoses,
     Waves,
     angles_of,
     base_pose,
     window,
 )
-from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])

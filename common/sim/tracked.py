@@ -1,21 +1,38 @@
-"""Tracked objects of a scene: poses, detectable points and ground truth.
+"""Tracked objects of a scene have poses, ground truth and a surface.
+
+Tracked objects of a scene: poses, detectable points and ground truth.
 
 Where each object is at a given time, and which of its points a camera can find.
 
 The first object of a rig is what the motion moves: the one that travels (`travel`), or the thing that the hand takes,
 in whose place it then is. Any other, and all of them in a scene that moves none, stand still beside the hand.
+
+Surface of a tracked object, as few points as a fast renderer can live with.
+
+Rods, blocks, balls, beads, tags.
+
+All places are key points of one array, as those of the hand (`surface`), so that a camera brings each to the moment at
+which its own row is exposed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.calibration import RigCalibration
-from common.calibration.object_profile import ObjectProfile
+from common.calibration.object_profile import (
+    BoxShape,
+    CylinderShape,
+    ObjectProfile,
+    Shape,
+    TagFamily,
+    tag_corners,
+)
 from common.errors import CalibrationError
-from common.geometry.transforms import axis_rotation, rigid
+from common.geometry.tag_family import GRIDS
+from common.geometry.transforms import axis_rotation, invert, rigid, transform
 from common.sim.motion import HandState
 
 RESTING_M = np.array([0.19, 0.13, 0.12])  # of an object that nothing moves, against the middle of the view
@@ -90,3 +107,170 @@ def resting_pose(which: int, centre_m: Float) -> Float:
     """
     side = np.array([-1.0 if which % 2 == 0 else 1.0, 1.0 if which % 4 < 2 else -1.0, 1.0])
     return rigid(facing(TILT_RAD), centre_m + side * RESTING_M)
+
+
+PAPER_CELLS = 1.0  # of white about the black square of a tag
+
+
+@dataclass(frozen=True, slots=True)
+class Rod:
+    """A closed dark cylinder: key points of the middles of its ends, radius [m]."""
+
+    ends: slice
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A dark box: its eight key points, in the order of `BLOCK_CORNERS`."""
+
+    corners: slice
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """Ball, given by the key point of its centre and its radius.
+
+    The key point is a slice of one, the radius is in [m]; a painted bead also has its marker (index in the rig).
+    """
+
+    middle: slice
+    radius_m: float
+    marker: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """Printed tag: four key points of its paper, then the four of its black square.
+
+    The order is that of `tag_corners`.
+
+    Attributes:
+        on: Place of the block that it is stuck on among the parts; None: on nothing that could be before it.
+    """
+
+    corners: slice
+    family: TagFamily
+    number: int
+    on: int | None
+
+
+Part = Rod | Block | Ball
+BLOCK_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+# Faces as corners in ring order, seen from outside counter-clockwise.
+BLOCK_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectSurface:
+    """Which points the tracked objects of a scene have, and how they move.
+
+    Attributes:
+        parts: Dark parts of all objects.
+        beads: Painted balls; sheets: tags.
+        beads_of, sheets_of: Object -> its beads and its tags, in the order of its file.
+        local: (K, 3) key points [m], each in the frame of its object; owner: (K,) whose they are.
+    """
+
+    parts: tuple[Part, ...]
+    beads: tuple[Ball, ...]
+    sheets: tuple[Sheet, ...]
+    beads_of: tuple[slice, ...]
+    sheets_of: tuple[slice, ...]
+    local: Float
+    owner: Int
+
+    @classmethod
+    def of(cls, tracked: TrackedObjects, markers: Sequence[str]) -> "ObjectSurface":
+        """Lay out the key points of all objects; `markers` are those of the rig."""
+        layout = _Layout()
+        parts: list[Part] = []
+        beads: list[Ball] = []
+        sheets: list[Sheet] = []
+        beads_of: list[slice] = []
+        sheets_of: list[slice] = []
+        for profile in tracked.profiles:
+            first, bead, sheet = len(parts), len(beads), len(sheets)
+            parts += [_part(shape, layout) for shape in profile.shape]
+            for name, ball in profile.markers.items():
+                beads.append(
+                    Ball(layout.add(np.array([ball.position_m])), ball.radius_m, markers.index(name))
+                )
+            sheets += _sheets(profile, first, layout)
+            beads_of.append(slice(bead, len(beads)))
+            sheets_of.append(slice(sheet, len(sheets)))
+            layout.which += 1
+        local = np.concatenate([np.zeros((0, 3)), *layout.points])
+        owner = np.array(layout.owner, dtype=np.intp)
+        return cls(tuple(parts), tuple(beads), tuple(sheets), tuple(beads_of), tuple(sheets_of), local, owner)
+
+    def key_points(self, poses: Float) -> Float:
+        """Key points (..., K, 3) [m], rig frame, of poses (..., O, 4, 4) of the objects."""
+        own = poses[..., self.owner, :, :]
+        return np.einsum("...kij,kj->...ki", own[..., :3, :3], self.local) + own[..., :3, 3]
+
+
+class _Layout:
+    """Collects key points. Holds them, whose they are, and whose come next."""
+
+    def __init__(self) -> None:
+        self.points: list[Float] = []
+        self.owner: list[int] = []
+        self.which = 0
+
+    def add(self, points: Float) -> slice:
+        """Add points to the key points and return their slice.
+
+        Points (n, 3) [m] in the frame of the present object.
+        """
+        start = len(self.owner)
+        self.points.append(points)
+        self.owner += [self.which] * len(points)
+        return slice(start, len(self.owner))
+
+
+def _part(shape: Shape, layout: _Layout) -> Part:
+    pose = np.eye(4) if shape.T_object_part is None else np.array(shape.T_object_part, dtype=np.float64)
+    if isinstance(shape, BoxShape):
+        return Block(layout.add(transform(pose, BLOCK_CORNERS * np.array(shape.size_m))))
+    if isinstance(shape, CylinderShape):
+        half = 0.5 * shape.length_m
+        return Rod(
+            layout.add(transform(pose, np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]))), shape.radius_m
+        )
+    return Ball(layout.add(pose[None, :3, 3]), shape.radius_m)
+
+
+def _sheets(profile: ObjectProfile, first: int, layout: _Layout) -> list[Sheet]:
+    """The tags of an object whose first part is number `first`."""
+    if profile.tags is None:
+        return []
+    family = profile.tags.family
+    margin = 1.0 + 2.0 * PAPER_CELLS / (GRIDS[family].cells + 2)
+    sheets: list[Sheet] = []
+    for tag in profile.tags.tags:
+        pose = np.array(tag.T_object_tag, dtype=np.float64)
+        paper, square = (transform(pose, tag_corners(tag.edge_m * size)) for size in (margin, 1.0))
+        on = _block_under(profile.shape, pose[:3, 3])
+        place = layout.add(np.vstack([paper, square]))
+        sheets.append(Sheet(place, family, tag.id, None if on is None else first + on))
+    return sheets
+
+
+def _block_under(shapes: Sequence[Shape], point: Float) -> int | None:
+    """Return the index of the box on whose surface a point of the object lies.
+
+    The point is (3,); the index is the box's place among the shapes.
+    """
+    for k, shape in enumerate(shapes):
+        if isinstance(shape, BoxShape):
+            own = (
+                point
+                if shape.T_object_part is None
+                else transform(invert(np.array(shape.T_object_part)), point)
+            )
+            beyond = np.abs(own) - 0.5 * np.array(shape.size_m)
+            on_m = 0.003  # a tag as near as this to a block's surface is stuck on it
+            if abs(float(beyond.max())) < on_m:
+                return k
+    return None

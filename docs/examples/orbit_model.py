@@ -27,7 +27,7 @@ from common.errors import PhalanxError
 from common.geometry.transforms import axis_rotation
 from common.messages import Gesture
 from common.messages.streams import MASTER
-from master.outputs.rerun_process import ViewerProcess
+from master.outputs.rerun import ViewerProcess
 
 TAKE_NS, UNDO_NS, SILENT_NS = 200_000_000, 200_000_000, 1_000_000_000
 GAIN = np.array([12.0, 12.0, math.log(2.0) / 0.007])  # 13 cm turn it a quarter, 7 mm of gap double it

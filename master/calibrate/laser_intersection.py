@@ -2,7 +2,7 @@
 
 This is the forward function of a pose.
 
-The skin (`common.hand.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first, the
+The skin (`common.hand.skin`) is cut by a fan of rays from the laser; each lights what it meets first, the
 nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the image is
 put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are ignored.
 
@@ -22,8 +22,8 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry.tapered_capsules import Capsules, first_hits, terms
 from common.geometry.transforms import transform
-from common.hand.palmar_surface import ROOT, PalmarSurface
-from master.estimator.laser_plane import PlaneAxes
+from common.hand.skin import ROOT, PalmarSurface
+from master.estimator.sensors import PlaneAxes
 from master.rig.wrist import WristSetup
 
 

@@ -6,11 +6,11 @@ The exit code states whether all is well.
 from argparse import Namespace
 
 from common.bus.bus import Subscription
+from common.command_line import echo
 from common.errors import BusError
 from common.messages import CheckItem, Checklist
 from common.messages.streams import MASTER
-from common.terminal import echo
-from master.run.master_bus import join_bus
+from master.run.process import join_bus
 
 ANSWER_S = 3.0  # a master reports once a second
 

@@ -1,14 +1,25 @@
-"""Inputs of the checklist: the plan and the present state.
+"""Facts of the checklist: plan, present state, slaves' reports, recent counts.
+
+Inputs of the checklist: the plan and the present state.
 
 How things were planned (the files), and how the master finds them at one look.
+
+Counter increments over the last second or so.
+
+The counters only rise; the increments show what happens now, not since the start.
+
+Reports of a slave about itself.
+
+Its last reports, and what happened between two of them.
 """
 
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from common.messages import CheckCode, CheckItem
+from common.messages import CheckCode, CheckItem, Health
 from master.rig.setup import RigSetup
-from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.run.link_senders import MarkerCounts, RejectedPeer
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,3 +162,124 @@ def plan_of(setups: Iterable[RigSetup]) -> Plan:
             markers = tuple(dict.fromkeys((*known, *setup.markers)))
             cameras[name] = CameraPlan(name, file.frame_rate_hz, size, wrist, hands, markers)
     return Plan(tuple(cameras.values()), tuple(imus), tuple(groups))
+
+
+class Window:
+    """Push machine that holds recent snapshots of counters.
+
+    It keeps the snapshots of the last `span_ns` and one before.
+    """
+
+    def __init__(self, span_ns: int) -> None:
+        """Look back so far [ns]."""
+        self._span_ns = span_ns
+        self._looks: deque[tuple[int, tuple[int, ...]]] = deque()
+
+    def push(self, t_ns: int, *counters: int) -> None:
+        """Add a snapshot of the counters.
+
+        A counter that has fallen belongs to another process, so the window then starts again.
+        """
+        if self._looks and any(now < old for now, old in zip(counters, self._looks[-1][1], strict=True)):
+            self._looks.clear()
+        self._looks.append((t_ns, counters))
+        while len(self._looks) > 2 and t_ns - self._looks[1][0] >= self._span_ns:
+            self._looks.popleft()
+
+    def clear(self) -> None:
+        """Forget: what comes next has nothing to do with it."""
+        self._looks.clear()
+
+    @property
+    def full(self) -> bool:
+        """Whether it reaches back as far as it is to."""
+        return bool(self._looks) and self._looks[-1][0] - self._looks[0][0] >= self._span_ns
+
+    @property
+    def seconds(self) -> float:
+        """How far it reaches back [s]."""
+        return 1e-9 * (self._looks[-1][0] - self._looks[0][0]) if self._looks else 0.0
+
+    def increase(self) -> tuple[int, ...]:
+        """By how much each counter rose in it; () before the first look."""
+        if not self._looks:
+            return ()
+        return tuple(now - old for now, old in zip(self._looks[-1][1], self._looks[0][1], strict=True))
+
+    @property
+    def moved(self) -> bool:
+        """Whether the first counter rose since the look before."""
+        return len(self._looks) > 1 and self._looks[-1][1][0] > self._looks[-2][1][0]
+
+
+class SlaveReports:
+    """Push machine over the reports of one process.
+
+    Holds the newest report, and the one that it is compared with.
+
+    Attributes:
+        number: How many comparisons there were: a rule looks at each once.
+    """
+
+    def __init__(self) -> None:
+        """Start with no report received."""
+        self._now: Health | None = None
+        self._before: Health | None = None
+        self._came_ns = 0
+        self.number = 0
+
+    def push(self, health: Health, t_ns: int) -> None:
+        """Take a report that came at `t_ns` [ns]."""
+        now = self._now
+        self._came_ns = t_ns
+        # between two reports that are compared: an answer to a command may come just after one
+        least_ns = 400_000_000
+        if now is None or health.session != now.session:
+            self._before = None
+        elif health.t_ns - now.t_ns < least_ns:
+            return
+        else:
+            self._before = now
+            self.number += 1
+        self._now = health
+
+    def is_recent(self, t_ns: int) -> bool:
+        """Return true if the newest report is recent."""
+        stale_ns = 3_000_000_000  # reports come twice a second; of an older one nothing is concluded
+        return self._now is not None and t_ns - self._came_ns < stale_ns
+
+    @property
+    def session(self) -> int | None:
+        """Return the session of the process that sent the newest report."""
+        return None if self._now is None else self._now.session
+
+    @property
+    def t_ns(self) -> int:
+        """When the newest report was made, on the slave's clock [ns]; 0: there is none."""
+        return 0 if self._now is None else self._now.t_ns
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Quantity -> value, of the newest report."""
+        return {} if self._now is None else self._now.metrics
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Event -> how often, of the newest report."""
+        return {} if self._now is None else self._now.counts
+
+    def increase(self, event: str) -> int | None:
+        """Return how often an event happened between the last two reports.
+
+        None: it is not reported, or there are no two.
+        """
+        if self._now is None or self._before is None or event not in self._now.counts:
+            return None
+        return max(self._now.counts[event] - self._before.counts.get(event, 0), 0)
+
+    @property
+    def seconds(self) -> float:
+        """Between the last two reports, on the slave's clock [s]; 0: there are no two."""
+        return (
+            0.0 if self._now is None or self._before is None else 1e-9 * (self._now.t_ns - self._before.t_ns)
+        )

@@ -11,8 +11,7 @@ from typing import TypeVar
 from msgspec import Struct
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.calibration.file_monitor import MonitoredFiles
-from common.calibration.parts import Provenance
+from common.calibration.files import MonitoredFiles, Provenance
 from common.errors import CalibrationError
 from common.messages import CheckItem
 from master.checklist.facts import CameraPlan, Plan

@@ -6,9 +6,16 @@ Senders that are away, lost datagrams, clocks, rates.
 from collections.abc import Iterator
 
 from common.messages import WIRE_VERSION
-from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow, Verdict, beyond
-from master.checklist.slave_reports import SlaveReports
-from master.checklist.window import Window
+from master.checklist.facts import (
+    CameraPlan,
+    MasterNow,
+    Plan,
+    SenderNow,
+    SlaveReports,
+    Verdict,
+    Window,
+    beyond,
+)
 
 SETTLED_NS = 2_000_000_000  # a sender that has just come has a clock, and frames, after that
 

@@ -1,28 +1,187 @@
-"""Publisher of the checklist of a running master.
+"""Publisher sends the checklist that a monitor derives from all rules.
+
+Checklist as a push machine.
+
+Reports and counts in, current problems out. No clock, no socket.
+
+Four things keep it quiet:
+
+- *Bounds*: what is wrong above one bound is well only below a lower one (`facts.beyond`).
+- *Time*: what may be the consequence of something else is reported `HOLD_NS` later than that would be.
+- *Causes*: while one thing is wrong, what follows from it is not reported, nor for `AFTER_NS` (`BACK_NS`) after, while
+  windows still hold what was. A camera that is away is not slow, loses nothing, sees nothing; its table is `_FOLLOWS`.
+- *Coming up*: a sender that has just come, or the master, is given the time that its first numbers take.
+
+Publisher of the checklist of a running master.
 
 Feeds it and publishes it five times a second, on a thread of its own, since the one that reports stands still while
 changed files are read.
 """
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 from common.bus.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
 from common.link.clock_offset import ClockEstimate
 from common.machine import Machine
-from common.messages import CheckItem, Checklist, Health
+from common.messages import MAX_CHECKS, CheckCode, CheckItem, Checklist, Health
 from common.messages.streams import MASTER
-from master.checklist.facts import MasterNow, SenderNow, plan_of
+from master.checklist.facts import MasterNow, Plan, SenderNow, SlaveReports, Verdict, plan_of
 from master.checklist.files import FileMonitor
-from master.checklist.monitor import ChecklistMonitor
+from master.checklist.link_rules import LinkRules
+from master.checklist.slave_rules import MovedRule, SlaveRules
 from master.rig.setup import RigSetup
-from master.run.quarantine import Quarantine
-from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.run.link_senders import MarkerCounts, Quarantine, RejectedPeer
 from master.run.sequence import CameraCounts
+
+CODES: tuple[CheckCode, ...] = get_args(CheckCode)
+HOLD_NS: dict[CheckCode, int] = {
+    "exposure_drift": 300_000_000,
+    "background_in_range": 300_000_000,
+    "marker_unseen": 300_000_000,
+    "camera_moved": 400_000_000,
+    "clock_unsynchronised": 500_000_000,
+}
+_ABSENT: frozenset[CheckCode] = frozenset(("camera_absent", "imu_silent"))
+_COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_range"))
+_LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
+_MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
+_NOT_TAKEN: frozenset[CheckCode] = frozenset(("duplicate_sender", "version_mismatch", "secret_mismatch"))
+_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN - {"marker_mismatch"}
+# Cause -> what is not reported of the same camera, its markers, or a group with it in it.
+_FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
+    "camera_absent": _OF_SENDER,
+    "imu_silent": _OF_SENDER,
+    "auto_mode": _COLOURS | _LIGHT | _MOVED,
+    "exposure_drift": _COLOURS | _MOVED,
+    "colour_collision": _COLOURS | _MOVED,
+    "calibration_absent": _COLOURS | _LIGHT | _MOVED,
+    "background_in_range": frozenset[CheckCode](("marker_unseen", "camera_moved")),
+    "clock_unsynchronised": _MOVED,
+    "strobe_slipped": frozenset[CheckCode](("rate_low",)),
+    "too_hot": frozenset[CheckCode](("rate_low",)),
+    "version_mismatch": _ABSENT,
+    "secret_mismatch": _ABSENT,
+    "marker_mismatch": _ABSENT | _COLOURS | frozenset[CheckCode](("rate_low", "packet_loss", "camera_moved")),
+}
+
+
+class _Latch:
+    """Latch that decides if one thing is wrong.
+
+    Holds since when it seems to be, and what was last reported of it.
+    """
+
+    def __init__(self) -> None:
+        self.since_ns: int | None = None
+        self.shown = False
+        self.verdict: Verdict | None = None
+
+    def push(self, verdict: Verdict, t_ns: int) -> None:
+        if verdict.wrong is None:
+            return  # as before, with the words of before
+        if not verdict.wrong:
+            self.since_ns, self.shown = None, False
+            return
+        self.since_ns = t_ns if self.since_ns is None else self.since_ns
+        self.verdict = verdict
+        self.shown |= t_ns - self.since_ns >= HOLD_NS.get(verdict.code, 0)
+
+
+class ChecklistMonitor:
+    """Monitor that evaluates all checklist rules.
+
+    Holds the state of each rule, what is wrong, and until when each cause silences what follows from it.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Watch who is to be there by `plan`."""
+        self._links = LinkRules()
+        self._reports: dict[str, SlaveReports] = {}
+        self._latches: dict[tuple[CheckCode, str], _Latch] = {}
+        self._causes: dict[tuple[CheckCode, str], tuple[Verdict, int]] = {}
+        self._now: MasterNow | None = None
+        self.follow(plan)
+
+    def follow(self, plan: Plan) -> None:
+        """Continue with other files of the same senders.
+
+        What slaves report is judged anew.
+        """
+        self._plan = plan
+        cameras = {camera.name: camera for camera in plan.cameras}
+        self._slaves = {name: SlaveRules(cameras.get(name)) for name in (*cameras, *plan.imus)}
+        self._moved = [MovedRule() for _ in plan.groups]
+
+    def push_health(self, health: Health, t_ns: int) -> None:
+        """Take the report of a slave that came at `t_ns` [ns].
+
+        Reports of anybody else are ignored.
+        """
+        if health.source in self._slaves:
+            self._reports.setdefault(health.source, SlaveReports()).push(health, t_ns)
+
+    def push(self, now: MasterNow) -> None:
+        """Take what the master counted by now."""
+        self._now = now
+
+    def look(self, t_ns: int) -> tuple[CheckItem, ...]:
+        """Return the current problems at `t_ns` [ns], which rises.
+
+        Each code and subject once, in the codes' order.
+        """
+        if self._now is None:
+            return ()
+        judged: set[tuple[CheckCode, str]] = set()
+        for verdict in self._verdicts(self._now, t_ns):
+            latch = self._latches.setdefault(verdict.key, _Latch())
+            # Two rules of one code and subject: what is wrong by one is not made well by the other.
+            if verdict.key not in judged or verdict.wrong:
+                latch.push(verdict, t_ns)
+            judged.add(verdict.key)
+        for key in self._latches.keys() - judged:
+            del self._latches[key]  # nobody speaks of it any more
+        shown = [
+            latch.verdict for latch in self._latches.values() if latch.shown and latch.verdict is not None
+        ]
+        self._causes = {key: cause for key, cause in self._causes.items() if cause[1] > t_ns}
+        reported = [verdict for verdict in shown if not self._follows(verdict, shown)]
+        for verdict in reported:
+            # after ns
+            back_ns = 500_000_000
+            after_ns = (
+                back_ns if verdict.code in _ABSENT else 2_500_000_000
+            )  # who comes back settles by its own rules
+            self._causes[verdict.key] = verdict, t_ns + after_ns
+        reported.sort(key=lambda one: (CODES.index(one.code), one.subject))
+        return tuple(one.item() for one in reported[:MAX_CHECKS])
+
+    def _verdicts(self, now: MasterNow, t_ns: int) -> Iterable[Verdict]:
+        """All rules, those of the master's own files first."""
+        for item in now.files:
+            yield Verdict(item.code, item.subject, True, item.sentence, item.fix)
+        yield from self._links.look(self._plan, now, self._reports, t_ns)
+        for name, rules in self._slaves.items():
+            if self._links.present(name) and (reports := self._reports.get(name)) is not None:
+                yield from rules.look(name, reports, t_ns)
+        for (cameras, markers), counts, rule in zip(self._plan.groups, now.groups, self._moved, strict=True):
+            if all(self._links.present(name) for name in cameras):
+                yield from rule.look(cameras, markers, counts, t_ns)
+            else:
+                rule.clear()
+
+    def _follows(self, verdict: Verdict, shown: list[Verdict]) -> bool:
+        """Whether something else that is wrong, or just was, explains it."""
+        return any(
+            verdict.code in _FOLLOWS.get(cause.code, ())
+            and cause.touches(verdict)
+            and cause.key != verdict.key
+            for cause in (*shown, *(one for one, _ in self._causes.values()))
+        )
 
 
 class Received(Protocol):

@@ -3,7 +3,7 @@
 from argparse import ArgumentParser
 from pathlib import Path
 
-from common.option_types import number, whole
+from common.command_line import number, whole
 from master.commands.options import (
     add_bus,
     add_calibration,

@@ -12,11 +12,11 @@ import msgspec
 from common.bus.bus import Bus
 from common.calibration import CameraCalibration, load
 from common.calibration.camera_settings import ROI_LEAST, ROI_MOST, WANTED, CameraSettings, ColourPick
+from common.command_line import echo
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Health
 from common.messages.streams import MASTER
-from common.terminal import echo
-from master.run.master_bus import join_bus
+from master.run.process import join_bus
 
 ANSWER_S = (
     15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table

@@ -1,17 +1,259 @@
-"""`phalanx fleet keys`: rig key, secrets and certificates of a rig.
+"""`phalanx fleet keys` makes, shows and renews the keys folder of a rig.
+
+Keys folder of a rig on its PC.
+
+It is made, shown and renewed, and a device is taken out of it. `common.bus.keys` states what is in it.
+
+A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
+So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for
+the rest.
+
+`phalanx fleet keys`: rig key, secrets and certificates of a rig.
 
 They are made and kept on the PC.
 """
 
+import os
+import re
+import tempfile
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from common.bus.keys import DEVICES_KEY, RIG_KEY
-from common.command_line import UsageError
-from common.terminal import echo
-from master.commands.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
+from common.bus.keys import (
+    AUTHORITY,
+    DEVICES,
+    DEVICES_KEY,
+    MASTER,
+    OPERATOR,
+    RIG_KEY,
+    KeyPair,
+    Shown,
+    issue,
+    new_authority,
+    new_key,
+    shown,
+)
+from common.command_line import UsageError, echo
+from common.errors import PhalanxError
+from common.link.datagram import KEY_BYTES, device_secret
+
+AUTHORITY_KEY = "ca.key"
+_ENDINGS = ("pem", "key", "secret")
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+
+
+def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
+    """Make what is missing, and nothing else.
+
+    Returns the files that were made, below `folder`.
+
+    A folder of before there were secrets gets them for all of its devices.
+
+    Args:
+        folder: Made if it is not there; nobody but its owner may enter it.
+        devices: Names on the bus that are to have a certificate and a secret.
+        now: Where the ten years begin.
+
+    Raises:
+        PhalanxError: A name that no device can have; a folder or file that cannot be written.
+    """
+    names = list(dict.fromkeys(devices))
+    for name in names:
+        _check_name(name)
+    made: list[str] = []
+
+    def add(path: Path, content: bytes, mode: int) -> None:
+        _write(path, content, mode)
+        made.append(str(path.relative_to(folder)))
+
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder.stat().st_mode & 0o077:
+            raise PhalanxError(
+                f"{folder}: others can enter it; give a folder of its own, or run: chmod 700 {folder}"
+            )
+        signs = (folder / AUTHORITY_KEY).exists()
+        if not signs and (folder / AUTHORITY).exists():  # before anything is made: other keys than the rig's
+            raise PhalanxError(
+                f"{folder}: has {AUTHORITY} but not {AUTHORITY_KEY}: it is the folder of a device, or a copy for"
+                " one; make certificates where the key is"
+            )
+        (folder / DEVICES).mkdir(mode=0o700, exist_ok=True)
+        for shared in (RIG_KEY, DEVICES_KEY):
+            if not (folder / shared).exists():
+                add(folder / shared, f"{new_key()}\n".encode(), 0o600)
+        if not signs:
+            authority = new_authority(now)
+            add(folder / AUTHORITY, authority.certificate, 0o644)
+            add(folder / AUTHORITY_KEY, authority.key, 0o600)
+        authority = _authority(folder)
+        for place in [folder / MASTER, folder / OPERATOR, *(folder / DEVICES / name for name in names)]:
+            certificate, key = (place.with_name(f"{place.name}.{ending}") for ending in ("pem", "key"))
+            if certificate.exists() and key.exists():
+                continue
+            pair = issue(authority, place.name, now)
+            add(key, pair.key, 0o600)
+            add(certificate, pair.certificate, 0o644)
+        for name in lacks_secrets(folder):
+            add(folder / DEVICES / f"{name}.secret", _secret(folder, name), 0o600)
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot make keys: {error}") from error
+    return made
+
+
+def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]:
+    """Make everything anew: rig key, secrets, authority, all certificates.
+
+    All earlier keys become invalid.
+
+    All is made first, then takes the place of the old; other files in the folder stay.
+
+    Args:
+        folder: Keys folder of the PC.
+        now: Where the ten years begin.
+        without: Devices that get nothing.
+
+    Returns:
+        The devices that have new keys and must be given them.
+
+    Raises:
+        PhalanxError: No such folder or device; it cannot be written.
+    """
+    names = devices_of(folder)
+    for name in (gone := list(without)):
+        if name not in names:
+            raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
+    left = [name for name in names if name not in gone]
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix=".new.", dir=folder
+        ) as temporary:  # one file system: each file is replaced
+            fresh = Path(temporary)
+            made = make(fresh, left, now)
+            for name in gone:
+                for ending in _ENDINGS:
+                    (folder / DEVICES / f"{name}.{ending}").unlink(missing_ok=True)
+            for file in made:
+                (fresh / file).replace(folder / file)
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot renew it: {error}") from error
+    return left
+
+
+def renew_device(folder: Path, name: str, now: datetime) -> None:
+    """Make a new certificate for one device.
+
+    Its old one stays valid, its secret stays: for one that was lost or stolen use `renew`.
+
+    Raises:
+        PhalanxError: No such folder or device; it cannot be written. The old one is still there then.
+    """
+    if name not in (names := devices_of(folder)):
+        raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
+    place = folder / DEVICES / name
+    try:
+        pair = issue(_authority(folder), name, now)
+        _write(place.with_name(f"{name}.key"), pair.key, 0o600)
+        _write(place.with_name(f"{name}.pem"), pair.certificate, 0o644)
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot renew {name!r}: {error}") from error
+
+
+def devices_of(folder: Path) -> list[str]:
+    """Names of the devices that have certificates.
+
+    Raises:
+        PhalanxError: It is not the keys folder of a PC.
+    """
+    if not (folder / AUTHORITY_KEY).exists():
+        raise PhalanxError(
+            f"{folder}: no keys folder (no {AUTHORITY_KEY}): phalanx fleet keys {folder} --make"
+        )
+    return sorted(path.stem for path in (folder / DEVICES).glob("*.pem"))
+
+
+def files_of_device(name: str) -> tuple[str, ...]:
+    """What of the folder belongs on a device, by their places in it."""
+    return RIG_KEY, AUTHORITY, *(f"{DEVICES}/{name}.{ending}" for ending in _ENDINGS)
+
+
+def lacks_secrets(folder: Path) -> list[str]:
+    """Return the devices without a secret derived from `devices.key`.
+
+    It is all of them where there is no such key.
+
+    Raises:
+        PhalanxError: It is not the keys folder of a PC; a file is broken, or cannot be read.
+    """
+    names = devices_of(folder)
+    if not (folder / DEVICES_KEY).exists():
+        return names
+    try:
+        return [
+            name
+            for name in names
+            if not (path := folder / DEVICES / f"{name}.secret").exists()
+            or path.read_bytes() != _secret(folder, name)
+        ]
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot read the secrets of devices: {error}") from error
+
+
+def certificates_of(folder: Path) -> list[Shown]:
+    """Return the contents of the certificates of master, operator and devices.
+
+    Raises:
+        PhalanxError: It is not the keys folder of a PC; a certificate is broken.
+    """
+    listed: list[Shown] = []
+    for path in [folder / f"{MASTER}.pem", folder / f"{OPERATOR}.pem",
+                 *(folder / DEVICES / f"{name}.pem" for name in devices_of(folder))]:  # fmt: skip
+        try:
+            listed.append(shown(path.read_bytes()))
+        except (OSError, ValueError) as error:
+            raise PhalanxError(f"{path}: cannot read the certificate ({error})") from error
+    return listed
+
+
+def _authority(folder: Path) -> KeyPair:
+    return KeyPair((folder / AUTHORITY).read_bytes(), (folder / AUTHORITY_KEY).read_bytes())
+
+
+def _secret(folder: Path, name: str) -> bytes:
+    """What `devices/NAME.secret` is to be."""
+    try:
+        root = bytes.fromhex((folder / DEVICES_KEY).read_text(encoding="ascii"))
+        if len(root) != KEY_BYTES:
+            raise ValueError(f"{len(root)} bytes, must be {KEY_BYTES}")
+    except ValueError as error:
+        raise PhalanxError(
+            f"{folder / DEVICES_KEY}: broken ({error}); phalanx fleet keys {folder} --renew makes all keys anew"
+        ) from error
+    return f"{device_secret(root, name).hex()}\n".encode()
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name) or name in (MASTER, OPERATOR, ".", ".."):
+        raise PhalanxError(
+            f"--device {name!r}: must be the name of a camera, IMU or tracker: up to 64 of A-Z a-z 0-9 _ . -, and"
+            f" neither {MASTER} nor {OPERATOR}"
+        )
+
+
+def _write(path: Path, content: bytes, mode: int) -> None:
+    """Write a file that is private from its first moment on, whole or not at all."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        temporary = Path(file.name)
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            temporary.chmod(mode)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def keys(options: Namespace) -> None:

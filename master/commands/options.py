@@ -13,8 +13,8 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
+from common.command_line import number
 from common.errors import PhalanxError
-from common.option_types import number
 
 CALIB_JSON = Path("calib_json")
 HERE_BEACON, HERE_BIND = "127.255.255.255:47800", "127.0.0.1:47801"
@@ -202,7 +202,7 @@ def bus_end(text: str) -> str:
     """The endpoint of `--bus`: as given, else the bus of this machine."""
     if text != HERE_BUS:
         return text
-    from common.bus.endpoints import default_bus  # which loads what makes certificates
+    from common.bus.endpoints import default_bus
 
     return default_bus(os.environ)
 

@@ -6,8 +6,7 @@ The same bytes on every run.
 from argparse import Namespace
 from pathlib import Path
 
-from common.command_line import UsageError
-from common.terminal import echo
+from common.command_line import UsageError, echo
 
 _MESSAGES = ".mcap"
 
@@ -22,9 +21,8 @@ def replay(options: Namespace) -> None:
     if any(path.suffix == _MESSAGES for path in paths):
         _replay_messages(options)
         return
-    from master.commands.summary import read_summary
-    from master.commands.summary_lines import summary_lines
-    from master.replay.detect import replay_recording
+    from master.commands.summary import read_summary, summary_lines
+    from master.replay.offline import replay_recording
 
     replay_recording(options, echo)
     if options.detect_only:
@@ -52,7 +50,7 @@ def _replay_messages(options: Namespace) -> None:
             raise UsageError(f"--{name.replace('_', '-')} has no meaning for recorded messages: leave it out")
     if len(options.paths) > 1:
         raise UsageError("recorded messages are replayed from one file")
-    from master.recording.play_command import play
+    from master.recording.play import play
 
     play(
         Namespace(

@@ -9,14 +9,12 @@ from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
+from common.command_line import echo
 from common.errors import PhalanxError
-from common.terminal import echo
 from master.commands.options import add_calibration, add_rigs, rigs_of
-from master.commands.summary import read_summary, write_summary
-from master.commands.summary_lines import summary_lines
-from master.commands.terminal import progress
-from master.outputs.files import path_of_hand
-from master.rig.files import load_setups
+from master.commands.summary import progress, read_summary, summary_lines, write_summary
+from master.outputs.poses import path_of_hand
+from master.rig.setup import load_setups
 
 
 def report(words: Sequence[str]) -> None:

@@ -1,15 +1,27 @@
-"""Connection of the console to the bus.
+"""Link connects the console to the bus and leases camera previews.
+
+Connection of the console to the bus.
 
 It reopens by itself whenever a master comes or goes.
+
+Request camera previews while somebody looks at them, and not longer.
+
+Decide which previews may be shown, by the size that they claim.
+
+None is shown that claims to be larger than the camera's own picture.
 """
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 
 from common.bus.bus import Bus, Subscription
-from common.errors import BusError
-from common.messages import Command, Health, Message
+from common.calibration import CameraCalibration
+from common.errors import BusError, CalibrationError
+from common.messages import Command, Health, Message, Preview
+from common.messages.command_bodies import PreviewWish
+from common.recording.picture_size import Size, jpeg_size
 
 POLL_S = 0.5  # between two looks at who is alive
 ANSWER_S = 20.0  # a slow camera shows its new settings after some seconds
@@ -121,3 +133,120 @@ def _read(inbox: Subscription, take: Take, ended: threading.Event) -> None:
         message = inbox.get(read_s)
         if message is not None:
             take(message)
+
+
+class PreviewLeases:
+    """Viewers of each camera, with the time until which each looks.
+
+    It holds one thread per camera as long as somebody looks.
+    """
+
+    def __init__(self, ask: Callable[[Command, float], Health]) -> None:
+        """Nobody looks yet; `ask` sends a command and waits for the answer."""
+        self._ask = ask
+        self._lock = threading.Lock()
+        self._until: dict[str, dict[tuple[str, ...], float]] = {}
+        self._threads: dict[str, threading.Thread] = {}
+        self._errors: dict[str, str] = {}
+
+    def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
+        """Request the preview of `camera` for the next 3 s.
+
+        The pixels of these markers are tinted. Never waits.
+        """
+        with self._lock:
+            lease_s = 3.0  # so long a lease holds: whoever still looks renews it before
+            self._until.setdefault(camera, {})[mask] = time.monotonic() + lease_s
+            if camera not in self._threads:
+                thread = threading.Thread(
+                    target=self._work, args=(camera,), name=f"look {camera}", daemon=True
+                )
+                self._threads[camera] = thread
+                thread.start()
+
+    def error(self, camera: str) -> str:
+        """Why there is no picture of `camera`; empty while it answers."""
+        return self._errors.get(camera, "")
+
+    @property
+    def looked_at(self) -> frozenset[str]:
+        """Cameras that somebody looks at."""
+        return frozenset(self._threads)
+
+    def _work(self, camera: str) -> None:
+        while (mask := self._mask(camera)) is not None:
+            body = PreviewWish(mask=mask, found=True).body() if mask else ""
+            try:
+                answer_s = 1.5
+                self._ask(Command(camera, "preview", body), answer_s)
+                self._errors.pop(camera, None)
+            except BusError as error:
+                self._errors[camera] = str(error)
+            ask_every_s = 1.0  # a camera shows itself for 3 s after each request
+            time.sleep(ask_every_s)
+
+    def _mask(self, camera: str) -> tuple[str, ...] | None:
+        """Return all markers that somebody wants tinted.
+
+        None when nobody looks; the thread is then forgotten.
+        """
+        with self._lock:
+            now = time.monotonic()
+            wanted = {mask: until for mask, until in self._until.get(camera, {}).items() if until > now}
+            self._until[camera] = wanted
+            if not wanted:
+                del self._threads[camera], self._until[camera]
+                self._errors.pop(camera, None)
+                return None
+            return tuple(dict.fromkeys(name for mask in wanted for name in mask))
+
+
+class PictureSizes:
+    """Compares the sizes of previews with those of the camera files.
+
+    Holds the sizes [px] that the files stated last, and why the last preview of a camera was refused.
+    """
+
+    def __init__(self, camera: Callable[[str], CameraCalibration]) -> None:
+        """Compare with the camera files that `camera` reads.
+
+        It gives the file of a camera, or raises a `CalibrationError` where there is none.
+        """
+        self._camera = camera
+        self._known: dict[str, tuple[float, Size | None]] = {}
+        self._refused: dict[str, str] = {}
+
+    def fits(self, preview: Preview) -> bool:
+        """Whether a preview is no larger than its camera's pictures.
+
+        Where no file states their size, any that a message may carry is.
+        """
+        width, height = jpeg_size(preview.jpeg)
+        most = self._size(preview.camera)
+        if most is None or (width <= most[0] and height <= most[1]):
+            self._refused.pop(preview.camera, None)
+            return True
+        self._refused[preview.camera] = (
+            f"{preview.camera}: its picture claims {width} x {height} px, its camera file here says "
+            f"{most[0]} x {most[1]}: deploy the file again, or see what runs there"
+        )
+        return False
+
+    def error(self, camera: str) -> str:
+        """Why its last preview was refused; empty where it was not."""
+        return self._refused.get(camera, "")
+
+    def _size(self, name: str) -> Size | None:
+        poll_s = 2.0  # a camera file is not read more often
+        read_s, size = self._known.get(name, (-poll_s, None))
+        if time.monotonic() - read_s < poll_s:
+            return size
+        try:
+            file = self._camera(name)
+            size = file.width_px, file.height_px
+        except CalibrationError:
+            size = None  # not calibrated yet, or half written
+        most = 64  # cameras: a bus on which names are invented costs no memory
+        if name in self._known or len(self._known) < most:
+            self._known[name] = time.monotonic(), size
+        return size

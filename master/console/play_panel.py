@@ -16,7 +16,7 @@ from nicegui.events import GenericEventArguments
 from common.errors import PhalanxError
 from common.messages import Command, Health
 from common.messages.streams import MASTER
-from master.console.command_queue import CommandQueue
+from master.console.controls import CommandQueue
 from master.console.recording_panel import recordings_folder
 from master.console.state import ConsoleState
 

@@ -1,20 +1,37 @@
-"""Camera settings as the page tunes them.
+"""Tuner tries settings of cameras and filters, then saves them to files.
+
+Camera settings as the page tunes them.
 
 They are what was read back and what it was when the tuning began, with a way back to that.
 
 Every method asks the slave over the bus and waits for its answer: never on the thread of the page.
+
+Copy of a camera's file on this machine, updated after its slave saved.
+
+The master and the wizards read this copy.
+
+A slave of this machine has written the very file; one of another machine has written its own, and only what its answer
+contains can be copied: settings and colour ranges, not the calibration.
+
+Trial of a rig's 1 € filter on a running master, then saved to the rig's file.
+
+It blocks, so do not call it on the page's thread.
 """
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import nan
+from pathlib import Path
 
 import msgspec
 
-from common.calibration.camera_settings import WANTED, ColourPick
-from common.errors import BusError
+from common.calibration import CameraCalibration, FilterCalibration, RigCalibration, load, save
+from common.calibration.camera_settings import WANTED, CameraSettings, ColourPick
+from common.errors import BusError, CalibrationError
 from common.messages import Command, Health
+from common.messages.streams import MASTER
+from master.calibrate.tree_files import provenance
 
 MARKER = "marker."
 _CHANNELS = ("h", "s", "v")
@@ -160,3 +177,57 @@ def _range(metrics: Mapping[str, float], name: str) -> Range:
         for end in ("low", "high")
     )
     return Range((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+def update_copy(path: Path, saved: InUse) -> bool:
+    """Bring the file to what the slave saved. Whether anything differed.
+
+    Raises:
+        CalibrationError: The file is missing, broken or read-only, or the slave has what a file must not contain.
+    """
+    camera = load(path, CameraCalibration)
+    body = saved.body() | {"markers": markers_over(saved, camera.markers or {})}
+    try:
+        new = msgspec.convert(body, CameraSettings).over(camera)
+    except msgspec.ValidationError as error:
+        raise CalibrationError(f"{path}: what {camera.name} saved cannot be copied: {error}") from error
+    if new == camera:
+        return False
+    made = provenance("console", (), {}, "as the slave saved it")
+    save(path, msgspec.structs.replace(new, provenance=camera.provenance | {"markers": made}))
+    return True
+
+
+NAMES = ("min_cutoff_hz", "beta", "d_cutoff_hz", "jitter_m")
+
+
+def saved_filter(rig_path: Path) -> FilterCalibration:
+    """Return the filter settings stored in the rig's file.
+
+    Raises:
+        CalibrationError: It is missing or broken.
+    """
+    return load(rig_path, RigCalibration).filter
+
+
+def try_filter(ask: Callable[[Command], Health], rig: str, values: Mapping[str, float]) -> None:
+    """Let the master use other parameters at once; its file stays as it is.
+
+    Raises:
+        BusError: No master answers, or it refuses.
+    """
+    ask(Command(MASTER, "filter", json.dumps({"rig": rig, "filter": dict(values)})))
+
+
+def save_filter(rig_path: Path, values: Mapping[str, float]) -> None:
+    """Write the filter settings to the rig's file, with when and by what.
+
+    A running master follows its files.
+
+    Raises:
+        CalibrationError: The file is missing, broken or read-only, or a value is out of range.
+    """
+    rig = load(rig_path, RigCalibration)
+    new = msgspec.structs.replace(rig.filter, **values)
+    made = provenance("console", (), {}, "tuned by hand")
+    save(rig_path, msgspec.structs.replace(rig, filter=new, provenance=rig.provenance | {"filter": made}))

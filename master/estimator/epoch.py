@@ -1,11 +1,140 @@
-"""Inputs and outputs of the estimator at an epoch."""
+"""An epoch has inputs, compiled steps, and a hand as output.
 
+Result of the pipeline for one epoch: marker positions, and the hand.
+
+Inputs and outputs of the estimator at an epoch.
+
+Compiled steps of an epoch.
+
+They work on the tables, the state and the scratch arrays of one hand.
+
+Conversion of a wrist camera's strobe cycle to estimator rows.
+
+The rows hold rays and points on the laser plane, for the level asked for.
+
+fk     laser points only, of fingers that bend naturally
+ik     only fingers of which laser point and tip are both seen; the others are not reported
+auto   what there is: a finger whose tip is not seen is solved from its laser point, as far as that goes
+"""
+
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import nan
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from master.fabrik.estimate import SolvedHand
+from common.geometry.camera_model import CameraModel
+from common.hand.model import FINGERS, HandJoints, HandModel
+from common.kernels import bound, boxed, fields
+from common.messages import Source, WristDetections
+from master.estimator.kinematics import Scratch, pose
+from master.estimator.parameters import HandParameters, HandTables, Mounts
+from master.estimator.posterior import Model, Workspace, count_rows
+from master.estimator.priors import CubicLaw, PosturePrior, WristModel
+from master.estimator.problem import Observations, Rig, observe_points, observe_rays
+from master.estimator.sensors import EXTRAS, HEADING, NO_EXTRAS, CameraArrays, Device, observe_wrist
+from master.estimator.settings import Settings
+from master.estimator.solve import Blank
+from master.estimator.state import HandState, stationary_of
+from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
+from master.estimator.wrist_update import prepare_epoch
+from master.rig.wrist import WristSetup
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPositions:
+    """Positions of the M markers of a rig at one epoch.
+
+    Attributes:
+        points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it,
+            or what they see is not one thing.
+        cov_m2: (M, 3, 3) [m^2].
+        noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one epoch to the next.
+        apart: (M,) what two cameras see is not one thing.
+        rejected: (C, M) outliers of single cameras, without which the rays of three or more meet.
+    """
+
+    points_m: Float
+    cov_m2: Float
+    noise_m2: Float
+    outliers: Bool
+    rejected: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedHand:
+    """A hand's pose and how well it is known.
+
+    Attributes:
+        T_rig_palm: (4, 4).
+        angles_rad: (5, 4), inside the limits.
+        joints: Forward kinematics of the two.
+        cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
+        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this epoch alone.
+        tilt_process_noise_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
+    """
+
+    T_rig_palm: Float
+    angles_rad: Float
+    joints: HandJoints
+    cov_m2: Float
+    tilt_cov_rad2: Float
+    tilt_process_noise_rad2_s2: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEstimate:
+    """Hand estimate of the pipeline at one epoch.
+
+    Attributes:
+        t_ns: The epoch.
+        markers: Positions as triangulated.
+        smooth_m: (M, 3) [m] after the 1 € filter.
+        back_normal: (3,) unit vector from the hand to the cameras that see its back.
+        solution: The hand; None: none is known.
+        valid, tracked, source: (26,) as of `HandPose`.
+        seen: (5,) fingers whose marker was placed now.
+        residual_m: (5,) distance at which FABRIK left the marker on a finger's end from its target; NaN: not seen.
+        iterations: (5,) of FABRIK.
+        reached: (5,) FABRIK brought the marker onto its target.
+        solved: Whether the hand is solved from this epoch, not held from an earlier one.
+    """
+
+    t_ns: int
+    markers: MarkerPositions
+    smooth_m: Float
+    back_normal: Float
+    solution: SolvedHand | None
+    valid: Bool
+    tracked: Bool
+    source: Code
+    seen: Bool
+    residual_m: Float
+    iterations: Int
+    reached: Bool
+    solved: bool = False
+
+    @classmethod
+    def unseen(
+        cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, back_normal: Float
+    ) -> "HandEstimate":
+        """One of which nothing is known yet."""
+        return cls(
+            t_ns=t_ns,
+            markers=markers,
+            smooth_m=smooth_m,
+            back_normal=back_normal,
+            solution=None,
+            valid=np.zeros(26, np.bool_),
+            tracked=np.zeros(26, np.bool_),
+            source=np.full(26, Source.HELD, np.uint8),
+            seen=np.zeros(5, np.bool_),
+            residual_m=np.full(5, np.nan),
+            iterations=np.zeros(5, np.int64),
+            reached=np.zeros(5, np.bool_),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,3 +267,312 @@ class Fitted:
     rotation_rejected: bool = False
     refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
+
+
+_STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
+_EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
+
+
+class EpochSteps:
+    """Holds the state of one hand, and what is worked on at an epoch.
+
+    Attributes:
+        state: All that is remembered of the hand; `now`: its fields.
+        at: Task, epoch prior, what is found, and scratch: fields of `Workspace`.
+        observed: Rows of the markers.
+        placed: (M,) of which of the hand's markers the places are known at the epoch.
+        on_hand: (M,) the hand's markers among those of the rig.
+        finger: (M,) the finger that carries each; -1: the palm.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[CameraModel],
+        model: HandModel,
+        parameters: HandParameters,
+        markers: tuple[str, ...],
+        hand_markers: tuple[str, ...],
+        posture_prior: PosturePrior,
+        settings: Settings,
+        wrist: WristModel | None,
+    ) -> None:
+        """Lay out the tables, and compile.
+
+        Arguments as of `Estimator`; `posture_prior`: any of those used.
+        """
+        self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
+        self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
+        self.finger = mounts.finger
+        extras, device = (NO_EXTRAS, Device.none()) if wrist is None else (EXTRAS, wrist.device)
+        self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
+        n = len(parameters.free)
+        self.observed = observed = Observations.empty(len(cameras), count)
+        self.triangulated: Bool = np.zeros(count, np.bool_)
+        self._blank = Blank.of(n, extras, len(cameras), count)
+        # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
+        self.state = state = HandState.unknown(n, extras)
+        space = Workspace.empty(n, extras, _capacity(count))
+        self.now, self.at = fields(state), fields(space)
+        self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
+        self._ground, self._lines_of_sight = (
+            self._space["ground"],
+            self._space["epoch_prior"]["lines_of_sight"],
+        )
+        hand, device = boxed(self._rig.hand), boxed(device)
+        self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
+        self.at.scratch.search.wrist_share[0] = settings.wrist_share
+        self.at.epoch_prior.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
+        if wrist is not None:
+            self._lay_out(wrist)
+        nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
+        scratch, none = (
+            (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))),
+            np.full((5, 2), np.nan),
+        )
+        each = none[:, 0].copy()
+        self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
+        self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
+        self._count = bound(count_rows, mounts, observed, self._ground)
+        self._cycle = bound(
+            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
+        )
+        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *scratch)
+        rig, state, space = self._model, self._state, self._space
+        self._prepare = bound(prepare_epoch, rig, state, space)
+        self._predict = bound(predict_epoch, rig, state, observed, space)
+        self._fit = bound(fit_epoch, rig, posture_prior, observed, self._blank, space)
+        self._take_over = bound(take_over_epoch, rig, state, True, observed, space, Estimate.empty())
+
+    def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
+        """Place joints and markers (M, 3) [m], rig frame, as `Estimator.pose`."""
+        position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
+        places, angles = np.empty((len(self.on_hand), 3)), angles_rad.reshape(20)
+        T_whole = np.ascontiguousarray(T)
+        self._pose(
+            self._model.hand, self._model.mounts, T_whole, angles, self._work, position, rotation, places
+        )
+        return HandJoints(position, rotation, T), places
+
+    def observe(self, at: Epoch, *, continuous: bool) -> None:
+        """Write the rows of an epoch, and count them."""
+        task, lines_of_sight = self.at.task, self.at.epoch_prior.lines_of_sight
+        task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
+        task.process_noise_rad2[0] = 0.0 if at.orientation is None else at.orientation.process_noise_rad2
+        if at.wrist is None:
+            lines_of_sight.rows[0] = 0.0
+            lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
+        else:
+            self.at.prior.law[:] = at.wrist.law
+            self._cycle(
+                self._model.device,
+                at.wrist.laser,
+                at.wrist.laser_sigma_px,
+                at.wrist.laser_px,
+                at.wrist.tip,
+                at.wrist.tip_sigma_px,
+                at.wrist.tip_depth,
+                self._settings.light_rad,
+                at.wrist.laser_s,
+                at.wrist.tip_s,
+                self._lines_of_sight,
+            )
+        if at.uv is None and at.cov_m2 is None:
+            self.observed.seen[:] = False
+        elif at.cov_m2 is not None:
+            bones_m2 = self._settings.bones_m**2
+            points, cov = at.points_m[self.on_hand], at.cov_m2[self.on_hand]
+            self._points(points, cov, bones_m2, self.observed)
+        else:
+            assert at.uv is not None
+            assert at.variance_px2 is not None
+            assert at.own_m2 is not None
+            own = at.own_m2 + self._settings.bones_m**2 * _EYE
+            uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
+            self._rays(uv, variance, own, self.on_hand, self.observed)
+        measured = at.cov_m2 is not None
+        self.triangulated = (
+            self.observed.triangulated if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+        )
+        self._count(self._model.mounts, self.observed, self._ground)
+
+    def prepare(self) -> None:
+        """Predict the extra unknowns and search the finger minima.
+
+        The search is along the angles of the fingers that a wrist device sees.
+        """
+        self._prepare(self._model, self._state, self._space)
+
+    def set_priors(self, at: Epoch, *, known: bool) -> None:
+        """Write the priors other than the past and the posture prior.
+
+        `known`: whether the past is still informative.
+        """
+        epoch_prior, ground, orientation = self.at.epoch_prior, self.at.ground, at.orientation
+        epoch_prior.back_normal[:] = at.back_normal
+        epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
+        epoch_prior.depth_w2[0] = 0.0
+        if known and ground.most[0] == 1:
+            camera_centre = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
+            line_of_sight = self.now.palm[:3, 3] - camera_centre
+            epoch_prior.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
+            epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
+        epoch_prior.oriented[0] = orientation is not None
+        if orientation is not None:
+            epoch_prior.forearm[:3, :3], epoch_prior.orientation_info[:] = (
+                orientation.rotation,
+                orientation.information,
+            )
+            epoch_prior.on_forearm[0] = orientation.axes is not None
+            epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
+        epoch_prior.place_w2[0] = 0.0
+        if at.place is not None:
+            stands_m = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
+            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, stands_m**-2.0
+
+    def predict(self) -> float:
+        """Write where the state has the hand; as `predict_epoch`."""
+        return self._predict(self._model, self._state, self.observed, self._space)
+
+    def fit(self, posture_prior: PosturePrior, *, coarse: bool = False) -> float:
+        """Fit what is measured; return chi square, or the cost of a rough search."""
+        self.at.task.coarse[0] = coarse
+        return self._fit(self._model, posture_prior, self.observed, self._blank, self._space)
+
+    def take_over(self, *, goes_on: bool) -> Estimate:
+        """Write the solution into the state and return the estimate.
+
+        `goes_on`: the hand is that of the epoch before.
+        """
+        out = Estimate.empty()
+        self._take_over(self._model, self._state, goes_on, self.observed, self._space, out)
+        return out
+
+    def kept(self) -> Float:
+        """A copy of the state, for `put_back`."""
+        return self._state.copy()
+
+    def put_back(self, state: Float) -> None:
+        """Let the state be what it was."""
+        self._state[:] = state
+
+    def determines_hand(self, at: Epoch) -> bool:
+        """Return whether the markers determine a hand.
+
+        They must not lie in one line, unless that line runs across `back_normal`.
+
+        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
+        orientation that is known any one marker is enough.
+        """
+        if at.place is not None:
+            return True
+        points = at.points_m[self.on_hand][self.triangulated]
+        if at.orientation is not None and at.orientation.sure:
+            return len(points) > 0
+        if len(points) < 2:
+            return False
+        off = points - points.mean(axis=0)
+        spread_m = 5e-3  # markers nearer than this to one line do not turn a hand about it
+        if len(points) > 2:  # plainly not in one line, without what a decomposition takes
+            length2 = np.vecdot(off, off)
+            along, longest2 = off @ off[length2.argmax()], float(length2.max())
+            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * spread_m) ** 2:
+                return True
+        _, extent, axes = np.linalg.svd(off)
+        if len(points) > 2 and extent[1] > spread_m:
+            return True
+        back = self.at.ground.back[0]
+        length_m = 20e-3  # a line shorter than this has no direction
+        across = 0.9  # cosine to the sight, at most
+        return bool(back and extent[0] > length_m and abs(axes[0] @ at.back_normal) < across)
+
+    def has_outlier(self) -> bool:
+        """Return whether a marker is too far from what was found."""
+        marker_chi2 = self.at.found.marker_chi2[: len(self.on_hand)]
+        return bool((marker_chi2 > self._settings.marker_gate).any())
+
+    def _lay_out(self, wrist: WristModel) -> None:
+        """Write the finger priors before a wrist device, and those of the extras.
+
+        The extras are what the device leaves open.
+        """
+        prior, state, s = self.at.prior, self.now, self._settings
+        prior.base_rad[:], prior.per_pip[:], prior.frame[:] = wrist.base_rad, wrist.per_pip, wrist.frame
+        prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
+        prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
+        if wrist.natural_only:
+            prior.natural_only[0], prior.flexion[:] = 1.0, _STIFF_RAD
+        state.stationary[:] = stationary_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
+        state.z_cov[:] = np.diag(state.stationary)
+        if wrist.heading_rad is not None:
+            state.z_cov[HEADING, HEADING] = wrist.heading_rad**2
+
+
+def _capacity(markers: int) -> int:
+    """Round a count of markers up, so that kernels are compiled once for most rigs."""
+    step = 16
+    return max(-(-markers // step), 1) * step
+
+
+_NO_LAW = np.full(5, nan)
+
+
+class CycleReader:
+    """Reader that converts the strobe cycles of one device to rows.
+
+    It counts what it rejects: `outside`, `no_plane`, by finger.
+    """
+
+    def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:
+        self._setup, self._cubic, self._counts = setup, cubic, counts
+
+    def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
+        """Return the rows of a strobe cycle for an epoch, and its laser points.
+
+        The laser points are (5, 3) [m], camera frame; NaN: not seen.
+        """
+        setup, solver_mode = self._setup, self._setup.solver_mode
+        uv = np.concatenate([message.laser_uv, message.tip_uv])
+        self._reject("outside", uv[:5], message.laser_sigma_px)
+        self._reject("tip_outside", uv[5:], message.tip_sigma_px)
+        xy1 = np.ones((10, 3))
+        xy1[:, :2] = setup.optics.undistort(uv)
+        away = setup.offset_m / (xy1[:5] @ setup.normal)
+        for f, (u, far) in enumerate(zip(uv[:5, 0].tolist(), away.tolist(), strict=True)):
+            if u == u and not far > 0.0:  # NaN was not seen
+                away[f] = nan
+                self._counts[f"no_plane.{FINGERS[f]}"] += 1
+        points_m = xy1[:5] * away[:, None]
+        laser, tip = xy1[:5, :2].copy(), xy1[5:, :2].copy()
+        if solver_mode == "fk":
+            tip[:] = nan
+        elif solver_mode == "ik":
+            alone = ~(np.isfinite(laser[:, 0]) & np.isfinite(tip[:, 0]))
+            laser[alone], tip[alone] = nan, nan
+        law = _NO_LAW if self._cubic is None else np.where(np.isnan(tip[:, 0]), self._cubic(points_m), nan)
+        late_s = 1e-9 * (message.t_ns + setup.late_ns - t_ns)
+        rows = WristRows(
+            laser,
+            message.laser_sigma_px,
+            message.laser_px,
+            tip,
+            message.tip_sigma_px,
+            message.tip_depth,
+            late_s,
+            late_s + setup.frame_s,
+            law,
+        )
+        return rows, points_m
+
+    def _reject(self, event: str, uv: Float, sigma_px: Float) -> None:
+        """Write NaN to points (5, 2) that are unusable, and count them.
+
+        These are points outside the picture, and those that may be anywhere in it.
+        """
+        optics = self._setup.optics
+        right, low = optics.width_px - 0.5, optics.height_px - 0.5
+        most_px = max(optics.width_px, optics.height_px)
+        for f, ((u, v), sigma) in enumerate(zip(uv.tolist(), sigma_px.tolist(), strict=True)):
+            inside = -0.5 <= u <= right and -0.5 <= v <= low and sigma <= most_px
+            if u == u and not inside:
+                uv[f] = nan
+                self._counts[f"{event}.{FINGERS[f]}"] += 1

@@ -1,4 +1,16 @@
-"""Predict a hand from the epoch before, and fit it to what is measured."""
+"""The estimator predicts a hand, fits it, and starts again when lost.
+
+Solution for a hand from one epoch alone.
+
+A search begins there when it has no state to go on from.
+
+From another hand of the epoch, if there is one that explains the markers; else from several, open to closed, each laid
+on the markers as a rigid body, of which the best goes on.
+
+Predict a hand from the epoch before, and fit it to what is measured.
+
+From an estimate to the message of a hand.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,17 +18,179 @@ from dataclasses import replace
 import numpy as np
 
 from common.arrays import Float, Int
+from common.calibration import Volume
 from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import fit_rigid
 from common.hand.model import HandJoints, HandModel
-from master.estimator.epoch import Epoch, Fitted, FittedHand
-from master.estimator.epoch_steps import EpochSteps
-from master.estimator.observation_sources import ON_OTHERS
+from common.hand.wrist import forearm_palm
+from common.messages import HandPose
+from master.estimator.epoch import Epoch, EpochSteps, Fitted, FittedHand, HandEstimate, MarkerPositions
+from master.estimator.kinematics import quaternions
 from master.estimator.parameters import HandParameters
-from master.estimator.reinitialise import NONE, PosturePriorTables, Reinitialiser
+from master.estimator.posterior import ON_OTHERS
+from master.estimator.priors import PosturePrior, WristModel, curled, posture_prior_of
+from master.estimator.sensors import HEADING, LED_SCALE, WRIST_ANGLES
 from master.estimator.settings import DEFAULT, Settings
+from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.update import Estimate
-from master.estimator.wrist_device import HEADING, LED_SCALE, WRIST_ANGLES
-from master.estimator.wrist_model import WristModel
+from master.rig.merge import inside
+
+_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a reinitialising search begins: open to closed
+_AT_ORIGIN = np.eye(4)
+NONE = frozenset[int]()
+
+
+class PosturePriorTables:
+    """Posture priors of one hand while some fingers are flexed unlike the others.
+
+    Each is computed once.
+    """
+
+    def __init__(
+        self, model: HandModel, parameters: HandParameters, settings: Settings, *, natural: bool
+    ) -> None:
+        """Of a hand; `natural`: it is taken to obey them."""
+        self._model, self._parameters, self._settings, self._natural = model, parameters, settings, natural
+        self._tables: dict[frozenset[int], PosturePrior] = {}
+
+    def unlike(self, fingers: frozenset[int]) -> PosturePrior:
+        """Those while these fingers are bent unlike the others."""
+        if fingers not in self._tables:
+            posture_prior = posture_prior_of(self._model, self._parameters, self._settings, fingers)
+            self._tables[fingers] = posture_prior.natural_component() if self._natural else posture_prior
+        return self._tables[fingers]
+
+
+class Reinitialiser:
+    """Fits without the state. What it holds was prepared by the constructor."""
+
+    def __init__(
+        self,
+        steps: EpochSteps,
+        parameters: HandParameters,
+        posture_prior: PosturePriorTables,
+        settings: Settings,
+    ) -> None:
+        self._steps, self._parameters, self._posture_prior, self._settings = (
+            steps,
+            parameters,
+            posture_prior,
+            settings,
+        )
+        postures = np.zeros((len(_BENDS_RAD), 5, 4))
+        mcp_per_pip = 0.6
+        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (mcp_per_pip, 1.0))[:, None]
+        self._postures = np.array([parameters.of_angles(angles) for angles in postures])
+        self._finger_of_free = parameters.free // 4
+        any_finger = posture_prior.unlike(NONE)
+        likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
+        self._natural = np.minimum(np.maximum(likeliest, parameters.low), parameters.high)
+
+    def begin(self, at: Epoch) -> float:
+        """Fit without the state; return chi square of the markers.
+
+        From the other hand, or from several starts. A finger between two that show is rather bent as they are: no hand
+        curls it alone. But straight it would show.
+        """
+        shown = frozenset(np.flatnonzero(self._steps.at.ground.shown).tolist())
+        like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
+        chi2 = self._begin_with(at, shown, like)
+        angles = self._parameters.angles(self._steps.at.found.x)
+        straight = frozenset(f for f in like if angles[f, 1:].sum() < self._settings.shows_rad)
+        return self._begin_with(at, shown, like - straight) if straight else chi2
+
+    def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
+        """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
+        steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
+        task, epoch_prior, scratch = steps.at.task, steps.at.epoch_prior, steps.at.scratch
+        epoch_prior.past_w2[:], epoch_prior.past[:], epoch_prior.palm_w2[:], epoch_prior.depth_w2[:] = (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )
+        fingers = np.isin(np.arange(5), list(outliers))
+        epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
+        even = 0.5  # probability
+        task.natural_weight[0], task.counts[0] = even, 0.0
+        posture_prior = self._posture_prior.unlike(outliers)
+        try:
+            if start is not None:
+                shows = steps.at.ground.shown[self._finger_of_free] > 0
+                x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
+                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._with_scanned(x)
+                chi2 = steps.fit(posture_prior)
+                if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.has_outlier():
+                    return chi2
+            ends = list[tuple[float, Float, Float]]()
+            starts = self._starts(at)
+            if len(starts) == 1:
+                scratch.start_T[:], scratch.start_x[:] = starts[0]
+                return steps.fit(posture_prior)
+            for T, x in starts:
+                task.palm[:], task.x[:] = T, x
+                ends.append((steps.fit(posture_prior, coarse=True), task.palm.copy(), task.x.copy()))
+            _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
+            return steps.fit(posture_prior)
+        finally:
+            epoch_prior.own_w2[:] = 0.0
+
+    def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
+        """Return three hands, open to closed, as starts of the search.
+
+        Each is laid on the markers as a rigid body; only one where the palm is known.
+        """
+        steps, measured = self._steps, self._measured_rotation(epoch)
+        if epoch.place is not None and measured is not None:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = measured, epoch.place
+            return [(T, self._with_scanned(self._natural.copy()))]
+        triangulated = steps.triangulated
+        above_m, above_weight, palm_weight = 0.05, 0.3, 3.0
+        weight = np.where(steps.finger[triangulated] >= 0, 1.0, palm_weight)
+        observed = epoch.points_m[steps.on_hand][triangulated]
+        starts: list[tuple[Float, Float]] = []
+        for posture in self._postures:
+            x = self._with_scanned(posture.copy())
+            expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][triangulated]
+            if measured is not None and epoch.orientation is not None and epoch.orientation.sure:
+                T = np.eye(4)
+                T[:3, :3] = measured
+                T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
+            elif steps.at.epoch_prior.back_normal_w2[0] > 0.0:
+                # A point above the wrist stands for "the back of the hand faces the cameras".
+                above = expected.mean(axis=0) + np.array([0.0, above_m, 0.0])
+                towards = observed.mean(axis=0) + above_m * epoch.back_normal
+                T = fit_rigid(
+                    np.vstack([observed, towards]),
+                    np.vstack([expected, above]),
+                    np.append(weight, above_weight),
+                )
+            else:
+                T = fit_rigid(observed, expected, weight)
+            starts.append((np.ascontiguousarray(T), x))
+        return starts
+
+    def _measured_rotation(self, at: Epoch) -> Float | None:
+        """Return the palm rotation measured by other sensors (3, 3).
+
+        It includes the estimated wrist flexion; None: they do not report it.
+        """
+        if at.orientation is None or at.orientation.axes is None:
+            return None if at.orientation is None else at.orientation.rotation
+        return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
+
+    def _with_scanned(self, x: Float) -> Float:
+        """Return free angles (n,) with those of the scanned fingers filled in.
+
+        These are fingers whose minimum was searched.
+        """
+        known = self._steps.at.scan.known > 0.0
+        if not known.any():
+            return x
+        scanned = self._parameters.of_angles(self._steps.at.task.scanned.reshape(5, 4))
+        return np.where(known[self._finger_of_free], scanned, x)
+
 
 _SURE_RAD2 = 3.0 * np.radians(5.0) ** 2  # of the turn of a palm that markers place well
 
@@ -248,3 +422,48 @@ def _unknown(sources: Int) -> Fitted:
     """No hand."""
     none = np.zeros(26, np.bool_)
     return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), sources, False)
+
+
+def pose_of(
+    hand: Fitted | HandEstimate,
+    model: HandModel,
+    t_ns: int,
+    smooth_m: Float,
+    markers: MarkerPositions,
+    volume: Volume | None = None,
+) -> HandPose:
+    """The message of one hand; all NaN and not valid where nothing is known of it.
+
+    Args:
+        hand: Of either solver.
+        model: The hand.
+        t_ns: The epoch.
+        smooth_m: (M, 3) [m] markers after the 1 € filter, and `markers` before it.
+        markers: As triangulated.
+        volume: What the rig states; joints report whether they lie in it.
+    """
+    solution = hand.solution
+    if solution is None:
+        nothing = np.full((26, 3, 3), np.nan)
+        position, cov, orientation = nothing[:, 0].copy(), nothing, np.full((26, 4), np.nan)
+        angles = np.full((5, 4), np.nan)
+    else:
+        position, cov, angles = solution.joints.position_m, solution.cov_m2, solution.angles_rad
+        orientation = np.empty((26, 4))
+        quaternions(solution.joints.rotation, orientation)
+    return HandPose.known_good(
+        model.profile.name,
+        t_ns,
+        position_m=position,
+        orientation_wxyz=orientation,
+        radius_m=model.radius_m,
+        valid=hand.valid,
+        tracked=hand.tracked,
+        cov_m2=cov,
+        source=hand.source,
+        angles_rad=angles,
+        markers_m=smooth_m,
+        markers_raw_m=markers.points_m,
+        markers_cov_m2=markers.cov_m2,
+        inside_volume=inside(volume, position),
+    )

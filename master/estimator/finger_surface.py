@@ -2,7 +2,7 @@
 
 They model its skin, where the laser meets it, and its tip.
 
-The skin of a finger is a chain of capsules (`common.hand.palmar_surface`), cut by the plane of the laser.
+The skin of a finger is a chain of capsules (`common.hand.skin`), cut by the plane of the laser.
 What the camera
 makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import constant, inlined, inner
-from common.messages.records import record
-from master.estimator.hand_tables import HandTables
+from common.kernels import constant, inlined, inner, record
 from master.estimator.kinematics import abduction_axis, finger_chain
+from master.estimator.parameters import HandTables
 
 # Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
 MOVES, OWN_MOVES, NO_MOVES = constant(7), constant(5), constant(0)

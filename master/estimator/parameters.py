@@ -1,24 +1,43 @@
-"""Free parameters of the whole-hand fit.
+"""The parameters of a hand, their limits, and the mean within them.
+
+Free parameters of the whole-hand fit.
 
 They are the angles that no coupling fixes, and the bounds of each.
 
 A parameter vector is the palm's rotation (3, rotation vector about the wrist, rig frame) and translation (3),
 then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it does not follow exactly) of each
-finger. Where flexion narrows the abduction (`common.hand.limits`), the parameter is the abduction before that:
+finger. Where flexion narrows the abduction (`common.hand.profiles`), the parameter is the abduction before that:
 
     abduction = share(flexion) parameter
 
 so that a box of parameters is all the legal poses, and the prior of spreading fades in a fist as the range does. Where
 limits have a tolerance, what is beyond them costs, and the box ends three standard deviations farther out.
+
+A hand profile and its markers as flat arrays, for kernels.
+
+The mean of a hand within its limits, where the likeliest one leans on them.
+
+A fit ends at the likeliest pose, and of a finger that is poorly known this is often the limit itself: everything
+beyond is forbidden, so what lies before it is piled up there. The mean of what is possible lies inside. Near its
+solution the posterior is a normal distribution cut by a box, whose moments are found by expectation propagation (Minka
+2001; for boxes: Cunningham, Hennig, Lacoste-Julien 2011, "Gaussian probabilities and expectation propagation"): each
+limit is stood for by a normal factor that leaves its own angle the mean and variance of the cut distribution.
+
+For hands that are free of the posture prior only: natural ones rest at their limits, as flat ones do.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import erfc, exp, inf, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand.limits import ABDUCTION, FLEXION, spread_left
-from common.hand.model import HandModel
+from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
+from common.hand.profiles import ABDUCTION, FLEXION, spread_left
+from common.kernels import filled, inlined, inner, record
+from master.fabrik.linear_algebra import cholesky, inverse
 
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
 REACH = 3.0  # standard deviations beyond a limit, where there is no hand
@@ -147,3 +166,250 @@ def _evenly(columns: Int) -> Int | slice:
     if len(step) == 0 or step[0] < 1 or (step != step[0]).any():
         return columns
     return slice(int(columns[0]), int(columns[-1]) + 1, int(step[0]))
+
+
+class HandTables:
+    """A hand profile with n free angles.
+
+    Attributes:
+        swing: (3, 5, 4, 3, 3) as `HandModel.swing`.
+        tip_rotation: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
+        root_m: (5, 3) first joint of each chain, palm frame [m].
+        bone_m: (5, 3, 3) bones in the frames of their joints [m].
+        abduction_axis: (5, 3) palm frame.
+        first: (6,) column of the first free angle of each finger; those of finger f are first[f] ... first[f + 1] - 1.
+        complete: (20, 4) all angles by the free ones of their finger, abductions before they narrow.
+        narrows: (5,) whether flexion narrows the finger's abduction.
+        most: (5,) [rad] highest flexion.
+        left: (5,) share of the abduction left there.
+        low, high: (n,) [rad] limits of the free angles.
+        legal_low, legal_high, beyond_w2: (n,) as of `HandParameters`.
+        rests: (n,) whether it often stands at its low limit, as that of a straight finger.
+        anywhere: (6 + n,) inverse variances of a hand of which nothing is known but its limits.
+        limits: (5, 4, 2) [rad] low and high of all angles, abductions before they narrow.
+        finger: (26,) chain of each joint, -1: fixed to the palm.
+        level: (26,) its place in the chain.
+        middle: (26,) the PIP of its finger, a metacarpal's too; those of thumb, palm and wrist: themselves.
+        rest_m, rest_R: (26, 3) [m], (26, 3, 3) place and rotation of those fixed to the palm, palm frame.
+        twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone, in `swing` (`twist_hand`).
+        twist_axis: (5, 3) that bone, in the frame of the abduction.
+        untwisted: (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them.
+        product: (3, 3) room.
+    """
+
+    swing: Float
+    tip_rotation: Float
+    root_m: Float
+    bone_m: Float
+    abduction_axis: Float
+    first: Int
+    complete: Float
+    narrows: Bool
+    most: Float
+    left: Float
+    low: Float
+    high: Float
+    legal_low: Float
+    legal_high: Float
+    beyond_w2: Float
+    at_low_limit: Bool
+    anywhere: Float
+    limits: Float
+    finger: Int
+    level: Int
+    middle: Int
+    rest_m: Float
+    rest_R: Float
+    twist: Float
+    twist_axis: Float
+    untwisted: Float
+    product: Float
+
+    @classmethod
+    def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
+        """Lay out a hand model."""
+        axis = np.zeros((5, 3))
+        axis[:, 1] = model.side_sign
+        axis[0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
+        finger, level = np.full(26, -1, np.int64), np.zeros(26, np.int64)
+        for f, chain in enumerate(CHAINS):
+            finger[chain], level[chain] = f, np.arange(4)
+        middle: Int = np.arange(26)
+        for chain, joints in zip(CHAINS[1:], FINGER_JOINTS[1:], strict=True):
+            middle[list(joints)] = chain[1]
+        first = np.searchsorted(parameters.free, 4 * np.arange(6)).astype(np.int64)
+        complete = np.zeros((20, 4))
+        for f in range(5):
+            own = parameters.complete[4 * f : 4 * f + 4, first[f] : first[f + 1]]
+            complete[4 * f : 4 * f + 4, : own.shape[1]] = own
+        most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
+        first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
+        stiff_rad = 1e-9  # an angle whose highest flexion is 0 narrows nothing
+        tables: dict[str, Float | Int | Bool] = {
+            "swing": model.swing,
+            "tip_rotation": model.link_rotation[:, 2],
+            "root_m": model.rest_position_m[CHAINS[:, 0]],
+            "bone_m": model.bone_m,
+            "abduction_axis": axis,
+            "first": first,
+            "complete": complete,
+            "narrows": (model.spread_at_full_flexion < 1.0) & (most > 0.0),
+            "most": np.maximum(most, stiff_rad),
+            "left": model.spread_at_full_flexion,
+            "low": parameters.low,
+            "high": parameters.high,
+            "legal_low": parameters.legal_low,
+            "legal_high": parameters.legal_high,
+            "beyond_w2": parameters.beyond_w2,
+            "at_low_limit": parameters.at_low_limit,
+            "anywhere": parameters.anywhere,
+            "limits": model.limits_rad
+            + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
+            "finger": finger,
+            "level": level,
+            "middle": middle,
+            "rest_m": model.rest_position_m,
+            "rest_R": model.rest_rotation,
+            "twist": np.zeros(5),
+            "twist_axis": first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
+            "untwisted": model.swing[:, :, 0],
+            "product": np.zeros((3, 3)),
+        }
+        return filled(cls, tables)
+
+
+class Mounts(NamedTuple):
+    """Where M markers sit on a hand.
+
+    Attributes:
+        finger: (M,) chain; -1: the palm.
+        level: (M,) joint of the chain.
+        offset_m: (M, 3) [m] place in that joint's frame.
+        on_back: (M,) whether it is on the palm itself.
+    """
+
+    finger: Int
+    level: Int
+    offset_m: Float
+    on_back: Bool
+
+    @classmethod
+    def of(cls, model: HandModel, names: Sequence[str]) -> "Mounts":
+        """Lay out the markers of these names.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        finger, level = np.full(len(names), -1, np.int64), np.zeros(len(names), np.int64)
+        offset = np.zeros((len(names), 3))
+        for m, name in enumerate(names):
+            mount = model.mount(name)
+            offset[m] = mount.offset_m
+            if mount.finger is not None:
+                finger[m], level[m] = np.argwhere(mount.joint == CHAINS)[0]
+            elif mount.joint is not None:  # wrist and metacarpals do not move against the palm
+                R, p = model.rest_rotation[mount.joint], model.rest_position_m[mount.joint]
+                offset[m] = p + R @ mount.offset_m
+        on_back = np.array([model.mount(name).joint is None for name in names], np.bool_)
+        return cls(finger, level, offset, on_back)
+
+
+class Cut:
+    """Scratch for the mean within limits, of N unknowns, of which n are angles."""
+
+    weight: Float  # (n,)
+    push: Float  # (n,)
+    pull: Float  # (N,)
+    total: Float  # (N, N)
+    L: Float  # (N, N)
+    work: Float  # (N, N)
+    cov: Float  # (N, N)
+
+    @classmethod
+    def empty(cls, n: int, N: int) -> "Cut":
+        """Allocate it."""
+        return record(cls, weight=n, push=n, pull=N, total=(N, N), L=(N, N), work=(N, N), cov=(N, N))
+
+
+@inlined
+def _below(value: float) -> float:
+    """The standard normal distribution function."""
+    return 0.5 * erfc(-value / sqrt(2.0))
+
+
+@inlined
+def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float, float]:
+    """Mean and variance of a normal distribution cut at low and high."""
+    sigma = sqrt(variance)
+    a, b = (low - middle) / sigma, (high - middle) / sigma
+    flipped = a > 0.0  # mirrored, so that no tail is the difference of two numbers near 1
+    if flipped:
+        a, b = -b, -a
+    far = 30.0  # standard deviations, beyond which the normal distribution underflows
+    a, b = min(max(a, -far), far), min(max(b, -far), far)
+    at_a, at_b = exp(-0.5 * a * a), exp(-0.5 * b * b)
+    norm = max(_below(b) - _below(a), 1e-300) * sqrt(2.0 * pi)
+    shift = (at_a - at_b) / norm
+    left = 1.0 + (a * at_a - b * at_b) / norm - shift * shift
+    return middle + sigma * (-shift if flipped else shift), min(max(variance * left, 1e-12), variance)
+
+
+@inner
+def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, cut: Cut, mean: Float) -> None:
+    """Write the step (N,) from the most likely hand to the mean within the limits.
+
+    Straight fingers are no chance: they do rest at their limit, so nothing is piled up there.
+
+    Args:
+        hand: Its limits.
+        normal: (N, N) normal matrix of the cost at the likeliest hand.
+        gradient: (N,) there; counts where the angles stand at a limit, elsewhere it is 0.
+        x: (n,) its angles.
+        cut: Scratch.
+        mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
+    """
+    n, N = x.shape[0], cut.pull.shape[0]
+    for i in range(N):
+        cut.pull[i] = 0.0
+    fixed_rad, fixed_weight = 1e-6, 1e10  # limits that leave no room, and how that is weighed
+    for i in range(n):
+        below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+        fixed = above - below < fixed_rad
+        cut.weight[i], cut.push[i] = fixed_weight if fixed else 0.0, 0.0
+        on_limit_rad = 1e-9
+        if below > -on_limit_rad or above < on_limit_rad:
+            cut.pull[6 + i] = -gradient[6 + i]
+    sweeps, damping = 6, 0.8
+    for sweep in range(sweeps + 1):
+        for i in range(N):
+            for j in range(i + 1):
+                cut.total[i, j] = normal[i, j]
+            if 6 <= i < 6 + n:
+                cut.total[i, i] += cut.weight[i - 6]
+        if not cholesky(cut.total, N, cut.L):  # by rounding: nothing is known of where the mean is
+            for i in range(N):
+                mean[i] = 0.0
+            return
+        inverse(cut.L, N, cut.work, cut.cov)
+        for i in range(N):
+            mean[i] = 0.0
+            for j in range(N):
+                pushed = cut.push[j - 6] if 6 <= j < 6 + n else 0.0
+                mean[i] += cut.cov[i, j] * (cut.pull[j] + pushed)
+        if sweep == sweeps:
+            break
+        for i in range(n):
+            below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+            if above - below < fixed_rad:
+                continue
+            variance = cut.cov[6 + i, 6 + i]
+            # the distribution of the angle without the factor of its own limits
+            cavity_variance = 1.0 / max(1.0 / variance - cut.weight[i], 1e-9)
+            middle = cavity_variance * (mean[6 + i] / variance - cut.push[i])
+            at, narrow = _cut(middle, cavity_variance, below, above)
+            better = max(1.0 / narrow - 1.0 / cavity_variance, 0.0)
+            cut.weight[i] += damping * (better - cut.weight[i])
+            cut.push[i] += damping * (at / narrow - middle / cavity_variance - cut.push[i])
+    for i in range(n):
+        below = -inf if hand.at_low_limit[i] else hand.low[i] - x[i]
+        mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

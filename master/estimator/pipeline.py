@@ -1,41 +1,280 @@
-"""Pipeline of the marker rig.
+"""The pipeline of the marker rig turns frames and IMU samples into poses.
+
+Orientation of one IMU between its samples.
+
+It handles the shorter arc, gaps, values that are no rotation, and clocks set back.
+
+Orientation of the palm measured by an IMU on it.
+
+The IMU is mounted and placed in the rig; the orientation has its covariance.
+
+An IMU measures its axes in a world of its own, whose z axis is vertical:
+
+    R_rig_palm = R_rig_world R_world_imu R_palm_imu^T
+
+Two of the three numbers are held by gravity: the tilt against the vertical. The third, the heading about it, is only
+summed up from angular rates and drifts, unless a magnetometer holds it. So the covariance is narrow across the vertical
+and wide about it. A heading of which nothing is known is taken from the hand as it was solved, and left to it.
+
+Pipeline of the marker rig.
 
 It takes centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
 
 `MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
-and get the same poses. It is built from calibration by `master.rig.files`.
+and get the same poses. It is built from calibration by `master.rig.setup`.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from math import nan
+from math import acos, atan2, hypot, isnan, nan, sin, sqrt
 from typing import Protocol
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.calibration import ImuCalibration, Volume
+from common.calibration import UNIT_WITHIN, ImuCalibration, Quaternion, Volume
+from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import (
+    Wxyz,
+    matrix_of,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
 from common.hand.model import HandModel
 from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
-from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement, WristRows
-from master.estimator.estimator import Estimator
-from master.estimator.gate import Prior, among, associate
-from master.estimator.hand_tables import Mounts
+from master.estimator.epoch import (
+    Epoch,
+    Fitted,
+    HandEstimate,
+    MarkerPositions,
+    OrientationMeasurement,
+    SolvedHand,
+    WristRows,
+)
+from master.estimator.estimator import Estimator, pose_of
 from master.estimator.kinematics import quaternions
-from master.estimator.palm_imu import OrientationTrack
-from master.estimator.pose import pose_of
-from master.estimator.smooth import HandOneEuro
-from master.fabrik.blob_bias import LensShift
-from master.fabrik.estimate import HandEstimate, MarkerPositions, SolvedHand
-from master.fabrik.intersection import triangulate
+from master.estimator.parameters import Mounts
+from master.estimator.sensors import CameraArrays
+from master.estimator.settings import DEFAULT
+from master.estimator.smoothing import HandOneEuro
+from master.fabrik.caps import LensShift
+from master.fabrik.intersection import Prior, among, associate, triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
+
+REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    t_ns: int
+    q_wxyz: Wxyz
+    drift_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Between:
+    """Orientation of an IMU at a time.
+
+    Attributes:
+        q_wxyz: Unit quaternion.
+        away_s: How far from samples that is [s].
+        drift_rad: How far its heading has drifted since the first sample, standard deviation [rad].
+    """
+
+    q_wxyz: Wxyz
+    away_s: float
+    drift_rad: float
+
+
+class OrientationSamples:
+    """Push machine. Holds the newest samples, and when the first came.
+
+    Attributes:
+        counts: Samples rejected: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
+    """
+
+    def __init__(self, counts: Counter[str], drift_rad_s: float, late_us: float = 0.0) -> None:
+        """Begin without any, counting into `counts`.
+
+        Args:
+            counts: What is rejected, by reason.
+            drift_rad_s: How fast headings drift where samples do not state how far.
+            late_us: How much later samples were taken than their time stamps; added to these.
+        """
+        self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
+        kept = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
+        self._samples: deque[_Sample] = deque(maxlen=kept)
+        self._first_ns: int | None = None
+
+    def __len__(self) -> int:
+        """How many it holds."""
+        return len(self._samples)
+
+    def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take one sample of the IMU and how far its heading has drifted.
+
+        The quaternion (4,) is IMU axes -> its world, q as good as -q.
+
+        What is no rotation is rejected. A sample long before the newest means that a clock was set back, or that the
+        newest came from a time that is not yet: the others are forgotten.
+        """
+        t_ns += self._late_ns
+        w, x, y, z = orientation_wxyz.tolist()
+        length = sqrt(w * w + x * x + y * y + z * z)
+        if isnan(length):
+            self.counts["orientation.missing"] += 1
+        elif abs(length - 1.0) > UNIT_WITHIN:
+            self.counts["orientation.not_unit"] += 1
+        else:
+            if self._samples and t_ns <= (newest_ns := self._samples[-1].t_ns):
+                if newest_ns - t_ns <= REACH_NS:
+                    self.counts["orientation.late"] += 1
+                    return
+                self._samples.clear()
+            self._first_ns = t_ns if self._first_ns is None else min(self._first_ns, t_ns)
+            drift_rad = heading_sigma_rad
+            if isnan(drift_rad):
+                drift_rad = 1e-9 * (t_ns - self._first_ns) * self._drift_rad_s
+            unit = w / length, x / length, y / length, z / length
+            self._samples.append(_Sample(t_ns, unit, drift_rad))
+
+    def between(self, t_ns: int) -> Between | None:
+        """Return the orientation at a time.
+
+        None: too far from any sample.
+
+        The times to both sides count as resistors in parallel do: with one side alone it is the time to that.
+        """
+        before: _Sample | None = None
+        after: _Sample | None = None
+        for sample in reversed(self._samples):
+            if sample.t_ns <= t_ns:
+                before = sample
+                break
+            after = sample
+        if before is not None and t_ns - before.t_ns > REACH_NS:
+            before = None
+        if after is not None and after.t_ns - t_ns > REACH_NS:
+            after = None
+        if before is not None and after is not None:
+            a, b = t_ns - before.t_ns, after.t_ns - t_ns
+            q = slerp(before.q_wxyz, after.q_wxyz, a / (a + b))
+            return Between(q, 1e-9 * a * b / (a + b), after.drift_rad)
+        one = before or after
+        return None if one is None else Between(one.q_wxyz, 1e-9 * abs(t_ns - one.t_ns), one.drift_rad)
+
+
+def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
+    """Return the unit quaternion at `share` 0...1 between two.
+
+    It lies on the shorter arc (Shoemake, 1985).
+    """
+    (a, b, c, d), (w, x, y, z) = first, second
+    cosine = a * w + b * x + c * y + d * z
+    angle = acos(min(abs(cosine), 1.0))
+    sine = sin(angle)
+    straight = 1e-9  # sine of an angle below which an arc is a straight line
+    if sine < straight:
+        return first
+    p, q = sin((1.0 - share) * angle) / sine, sin(share * angle) / sine
+    q = q if cosine >= 0.0 else -q
+    return p * a + q * w, p * b + q * x, p * c + q * y, p * d + q * z
+
+
+SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it determines how the palm lies
+_EYE = np.eye(3)
+
+
+class OrientationTrack:
+    """Push machine. Holds the samples of one IMU.
+
+    Attributes:
+        counts: `orientation.used`, epochs that had one, `orientation.absent`, those that had none; samples rejected:
+            `orientation.missing`, `orientation.not_unit`, `orientation.late`.
+    """
+
+    def __init__(self, imu: ImuCalibration, counts: Counter[str] | None = None) -> None:
+        """Follow the IMU of a rig file, counting into `counts` if given.
+
+        Raises:
+            CalibrationError: The file does not state how it is mounted, or how its world lies to the rig.
+        """
+        self._imu = imu
+        self._palm_imu = rotation_of("q_palm_imu", imu.q_palm_imu)
+        self._rig_world = rotation_of("q_rig_world", imu.q_rig_world)
+        self._up = self._rig_world[:, 2]
+        self.counts: Counter[str] = Counter() if counts is None else counts
+        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
+
+    def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take one sample: quaternion (4,), IMU axes -> its world.
+
+        See `OrientationSamples.push`.
+        """
+        self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
+
+    def at(self, t_ns: int, near: SolvedHand | None) -> OrientationMeasurement | None:
+        """Return the palm's orientation at a time.
+
+        None where no sample is near enough.
+
+        Args:
+            t_ns: The epoch.
+            near: The hand as it was solved, which gives the heading where the IMU has none; None: not known.
+        """
+        found = self._samples.between(t_ns)
+        heading_rad = None if found is None else self._heading_rad(found.drift_rad)
+        if found is None or (heading_rad is None and near is None):
+            self.counts["orientation.absent"] += 1
+            return None
+        self.counts["orientation.used"] += 1
+        rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
+        if heading_rad is None and near is not None:
+            rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.away_s) ** 2
+        free_rad = 10.0  # constrains nothing beside any marker
+        about_2 = max((free_rad if heading_rad is None else heading_rad) ** 2, tilt_2)
+        along = np.outer(self._up, self._up)
+        information = _EYE / tilt_2 + (1.0 / about_2 - 1.0 / tilt_2) * along
+        return OrientationMeasurement(rotation, information, sure=about_2 < SURE_RAD**2)
+
+    def _heading_rad(self, drift_rad: float) -> float | None:
+        """Standard deviation of the heading after such a drift; None: not known."""
+        if self._imu.heading_sigma_rad is None:
+            return None
+        predicted = hypot(self._imu.heading_sigma_rad, drift_rad)
+        lost_rad = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
+        return predicted if predicted < lost_rad else None
+
+
+def _twist_about(axis: Float, rotation: Float) -> Float:
+    """Return the rotation (3, 3) about a unit axis (3,) nearest to a given one.
+
+    For a rotation (3, 3) this is its twist.
+    """
+    w, *v = matrix_to_quaternion(rotation)
+    return rotation_vector_to_matrix(2.0 * atan2(float(np.array(v) @ axis), float(w)) * axis)
+
+
+def rotation_of(key: str, value: Quaternion | None) -> Float:
+    """The rotation (3, 3) of a key of the rig file.
+
+    Raises:
+        CalibrationError: It is missing.
+    """
+    if value is None:
+        raise CalibrationError(
+            f"imu.{key}: missing; the orientation of the IMU cannot be used without: a quaternion wxyz of length 1"
+        )
+    return quaternion_to_matrix(np.array(value))
+
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
@@ -44,7 +283,7 @@ _NAME = 64  # characters of a name in `Health`
 class WristSideOf(Protocol):
     """Measurements by a wrist device and its IMU of the hand the cameras watch.
 
-    See `master.estimator.fused`.
+    See `master.estimator.wrist_pipeline`.
     """
 
     def rows_at(self, t_ns: int) -> WristRows | None:
@@ -120,7 +359,7 @@ class MarkerPipeline:
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether to drop it for newer ones (`master.run.load_shedding`); None: none is.
+            shed: Asked for each epoch whether to drop it for newer ones; None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts

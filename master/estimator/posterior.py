@@ -1,4 +1,6 @@
-"""Kernels of the posterior of an epoch.
+"""The posterior of an epoch mixes the hands of all hypotheses.
+
+Kernels of the posterior of an epoch.
 
 They compute both hypotheses, their evidence, mean and covariance.
 
@@ -9,7 +11,7 @@ The evidence of a hypothesis is the density of the markers under it, by Laplace'
 at its solution (MacKay 1992, "Bayesian interpolation", section 4). Whether a hand is natural does not change from
 frame to frame, while the evidence of one is noise in part: its logarithm is smoothed in time. Mean and covariance are
 those of the mixture: the spread between solutions is uncertainty as well. Of a free hand the mean within its limits is
-taken, of a natural one the likeliest pose (`master.estimator.truncated`).
+taken, of a natural one the likeliest pose (`master.estimator.parameters`).
 
 The covariance is that of this epoch alone. To the fit the state before is a prior, as wide as a hand moves meanwhile.
 That holds it steady, but it is not independent: the same prior led to it from the same markers, so a wrong direction
@@ -22,21 +24,40 @@ Wasserman 1995):
 
 A good fit makes nothing surer than it was claimed. Priors that contradict each other, whatever the markers, are no
 evidence of the epoch: their least cost is no part of chi^2.
+
+What an epoch rests on: the rows of its markers, counted.
+
+Workspace of the kernels of an epoch.
+
+It has what is the same at every epoch, the task, and scratch room.
 """
 
 from math import exp, log
+from typing import Any, NamedTuple
 
-from common.arrays import Float
-from common.kernels import constant, inlined, inner
-from master.estimator.hypotheses import Blank, Hypothesis, Posterior, Scratch, likelier
+from common.arrays import Bool, Code, Float, Int
+from common.kernels import constant, inlined, inner, kernel, record
+from master.estimator.covariance import CovarianceScratch
+from master.estimator.finger_scan import Prior, Scan
 from master.estimator.kinematics import markers_of, rotate_by, rotation_between
-from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
+from master.estimator.parameters import Mounts, truncated_mean
 from master.estimator.priors import PosturePrior
-from master.estimator.problem import EpochPrior, Rig
-from master.estimator.residuals import Observations
+from master.estimator.problem import EpochPrior, Observations, Rig
+from master.estimator.sensors import CameraArrays
 from master.estimator.settings import Settings
-from master.estimator.solve import descend, linearise, own_cost, past_cost
-from master.estimator.truncated import truncated_mean
+from master.estimator.solve import (
+    Blank,
+    Hypothesis,
+    Posterior,
+    Scratch,
+    descend,
+    likelier,
+    linearise,
+    own_cost,
+    past_cost,
+)
+from master.estimator.state import ExtrasScratch, Hidden
+from master.fabrik.linear_algebra import cholesky, copy, half_log_determinant, inverse, substitute
 
 _ONLY = constant(0)  # hypothesis of `Blank`
 
@@ -384,3 +405,185 @@ def posterior(
             out.z[i] = likely.z[i]
     for m in range(rig.mounts.finger.shape[0]):
         out.marker_chi2[m] = likely.marker_chi2[m]
+
+
+ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
+
+
+class Ground:
+    """Counts of one epoch.
+
+    Attributes:
+        shown: (5,) fingers that are measured.
+        rests: (6,) as of `Fitted`, by markers alone; of the palm where `by_markers`.
+        seen: (1,) markers that have a row.
+        most: (1,) the most rays of any; a marker that is placed as a point counts as two.
+        numbers: (1,) numbers that are measured.
+        back: (1,) whether a marker on the palm's back is seen.
+        by_markers: (1,) whether they determine where the palm is.
+    """
+
+    shown: Bool
+    sources: Int
+    seen: Int
+    most: Int
+    numbers: Float
+    back: Bool
+    by_markers: Bool
+
+    @classmethod
+    def empty(cls) -> "Ground":
+        """Scratch for one."""
+        return record(
+            cls,
+            shown=("u1", 5),
+            sources=("i8", 6),
+            seen=("i8", 1),
+            most=("i8", 1),
+            numbers=1,
+            back=("u1", 1),
+            by_markers=("u1", 1),
+        )
+
+
+@kernel
+def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
+    """Count the rows of an epoch.
+
+    Args:
+        mounts: The hand's markers.
+        observed: Their rows.
+        boxed_out: (1,) `Ground`, written.
+    """
+    out = boxed_out[0]
+    out.seen[0], out.most[0], out.numbers[0], out.back[0] = 0, 0, 0.0, False
+    for p in range(6):
+        out.sources[p] = 0
+    for m in range(mounts.finger.shape[0]):
+        if not observed.seen[m]:
+            continue
+        f, rays = mounts.finger[m], observed.rays[m]
+        out.seen[0] += 1
+        out.most[0] = max(out.most[0], rays)
+        out.numbers[0] += 3.0 if rays > 1 else 2.0
+        out.back[0] = out.back[0] or mounts.on_back[m]
+        if f >= 0:
+            out.sources[f] |= ON_MARKERS | (BY_MARKERS if rays > 1 else 0)
+        first_marker = 8  # bit
+        out.sources[5] |= 1 << (first_marker + m)
+    for f in range(5):
+        out.shown[f] = out.sources[f] > 0
+    back_numbers = 2.0  # a marker on the back measures where that looks, by two angles
+    out.numbers[0] += back_numbers if out.back[0] else 0.0
+    palm_by = 3  # markers
+    out.by_markers[0] = out.seen[0] >= palm_by or (out.seen[0] == palm_by - 1 and out.back[0] > 0)
+    if out.by_markers[0]:
+        out.sources[5] |= ON_MARKERS | BY_MARKERS
+
+
+class Task:
+    """What is to be done at an epoch.
+
+    Attributes:
+        t_ns: (1,) the epoch.
+        palm_shown: (1,) whether something measures where the palm is.
+        palm, angles: (4, 4), (20,) another hand of the epoch [rad].
+        x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
+        may_leave: (1,) whether there is another, and it may take the place of the state.
+        rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
+        natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
+        second_order: (1,) whether covariance is wanted to second order.
+        process_noise_rad2: (1,) variance of what the heading has drifted since the last epoch.
+        continuous: (1,) whether epochs follow each other.
+        scanned: (20,) angles of fingers whose cost map was searched, where it is likeliest.
+        refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
+        solver_mode: (5,) `SolverMode` codes of what fingers are solved from.
+        ambiguous: (5,) whether another pose explains as much.
+    """
+
+    t_ns: Int
+    palm_shown: Bool
+    palm: Float
+    angles: Float
+    x: Float
+    may_leave: Bool
+    coarse: Bool
+    natural_weight: Float
+    counts: Float
+    second_order: Bool
+    process_noise_rad2: Float
+    continuous: Bool
+    scanned: Float
+    refused: Bool
+    off: Bool
+    solver_mode: Code
+    ambiguous: Bool
+
+    @classmethod
+    def empty(cls, n: int) -> "Task":
+        """Scratch for one."""
+        return record(
+            cls,
+            t_ns=("i8", 1),
+            palm_shown=("u1", 1),
+            palm=(4, 4),
+            angles=20,
+            x=n,
+            may_leave=("u1", 1),
+            coarse=("u1", 1),
+            natural_weight=1,
+            counts=1,
+            second_order=("u1", 1),
+            process_noise_rad2=1,
+            continuous=("u1", 1),
+            scanned=20,
+            refused=("u1", 5),
+            off=("u1", 5),
+            solver_mode=("u1", 5),
+            ambiguous=("u1", 5),
+        )
+
+
+class Workspace:
+    """Scratch for all kernels of one hand, with the task and the prior of the epoch."""
+
+    task: Task
+    ground: Ground
+    epoch_prior: EpochPrior
+    hidden: Hidden
+    found: Posterior
+    scratch: Scratch
+    cov_scratch: CovarianceScratch
+    prior: Prior
+    scan: Scan
+    extras: ExtrasScratch
+
+    @classmethod
+    def empty(cls, n: int, extras: int, markers: int) -> "Workspace":
+        """Allocate it."""
+        return record(
+            cls,
+            task=Task.empty(n),
+            ground=Ground.empty(),
+            epoch_prior=EpochPrior.none(n, extras),
+            hidden=Hidden.none(n),
+            found=Posterior.empty(n, extras, markers),
+            scratch=Scratch.empty(n, extras, markers),
+            cov_scratch=CovarianceScratch.empty(6 + n + extras, markers),
+            prior=Prior.empty(),
+            scan=Scan.empty(),
+            extras=ExtrasScratch.empty(extras),
+        )
+
+
+class Model(NamedTuple):
+    """Everything that is the same at every epoch.
+
+    Hand, settings and device are in their arrays (`common.kernels.boxed`).
+    """
+
+    hand: Any
+    settings: Any
+    mounts: Mounts
+    cameras: CameraArrays
+    device: Any

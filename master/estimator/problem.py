@@ -1,17 +1,58 @@
-"""Inputs of the search for a hand.
+"""The problem of a fit: a rig, a prior, and residuals of what is measured.
+
+Inputs of the search for a hand.
 
 They are the rig, the prior of the hand, and scratch arrays.
+
+Kernels of what is measured: predicted values, residuals and their derivatives.
+
+A RAY row is where a camera would see a marker, minus where it did [px], without what the side of a painted cap that it
+sees shifts its centroid by (`master.fabrik.rays`). A POINT row is a measured place [m].
+
+What is wrong with the marker itself, such as its colour, bones and the side of a cap that is not known, is seen by all
+cameras. It is a shift d of the marker with a covariance S, and is integrated out: with H, g the information and
+gradient of the rays,
+
+    H - H (H + S^-1)^-1 H,   g - H (H + S^-1)^-1 g,   cost - g' (H + S^-1)^-1 g / 2
+
+so a marker that one camera sees gives two numbers and one that sixteen see is no surer than its colour.
+
+Kernels of the measurement rows of a wrist device.
+
+The rows are LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
+
+    LASER      where the laser meets the finger's skin [x, y of the ray], minus where it was seen
+    TIP        the fingertip, minus where it was seen
+    TIP_DEPTH  logarithm of its distance in the unit of the light, minus that by its brightness
+    TURN       rotation vector from where the sensors have the palm to where it is
+
+What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
+A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
+the wrist, and not with where the hand is in the room. The bend they constrain little (`wrist_share`), for that all
+fingers seem bent by as much is mostly an error that they share; what its uncertainty makes of them is in their noise.
 """
 
+from math import sqrt, tan
 from typing import NamedTuple
 
+import numpy as np
+
 from common.arrays import Bool, Float, Int
-from common.messages.records import record
-from master.estimator.cameras import CameraArrays
-from master.estimator.finger_surface import Surface
-from master.estimator.hand_tables import HandTables, Mounts
-from master.estimator.kinematics import Scratch
-from master.estimator.wrist_device import Device, LinesOfSight
+from common.kernels import inlined, inner, kernel, record
+from master.estimator.finger_surface import MOVES, Surface, look
+from master.estimator.kinematics import Scratch, rotation_between
+from master.estimator.parameters import HandTables, Mounts
+from master.estimator.sensors import (
+    LED_SCALE,
+    TILT,
+    WRIST_ANGLES,
+    CameraArrays,
+    Device,
+    LinesOfSight,
+    flexed_palm,
+    project,
+)
+from master.fabrik.linear_algebra import inverse_3
 
 
 class Rig(NamedTuple):
@@ -38,7 +79,7 @@ class EpochPrior:
         palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: no prior.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
         back_normal: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
-        z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).
+        z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.sensors`).
         orientation_info: (3, 3) [1/rad^2] information of the measured orientation, rig axes; `oriented` (1,) whether
             there is any.
         forearm: (4, 4) the palm by these in its first rows and columns; where `on_forearm` (1,) that of a straight
@@ -175,3 +216,373 @@ class Search:
         )
         scratch.wrist_share[0] = 1.0
         return scratch
+
+
+class Observations(NamedTuple):
+    """What is measured of M markers of a hand at one epoch.
+
+    Attributes:
+        uv: (C, M, 2) [px] centroids in the distorted images.
+        weight: (C, M) [1/px^2] inverse variance per axis, of each camera's own errors; 0: no row.
+        own: (M, 3, 3) [1/m^2] inverse covariance of what is wrong with the marker itself.
+        point: (M, 3) [m] measured places, rig frame.
+        information: (M, 3, 3) [1/m^2] their inverse covariances.
+        placed: (M,) whether there is a POINT row.
+        seen: (M,) whether there is any row.
+        rays: (M,) how many rays; of a POINT row two.
+    """
+
+    uv: Float
+    weight: Float
+    own: Float
+    point: Float
+    information: Float
+    triangulated: Bool
+    seen: Bool
+    rays: Int
+
+    @classmethod
+    def empty(cls, cameras: int, markers: int) -> "Observations":
+        """Scratch for one epoch; nothing is seen yet."""
+        return cls(
+            np.zeros((cameras, markers, 2)),
+            np.zeros((cameras, markers)),
+            np.zeros((markers, 3, 3)),
+            np.zeros((markers, 3)),
+            np.zeros((markers, 3, 3)),
+            np.zeros(markers, np.bool_),
+            np.zeros(markers, np.bool_),
+            np.zeros(markers, np.int64),
+        )
+
+
+@inlined
+def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: Float, work: Scratch) -> float:
+    """Add one RAY row to information and gradient by place; return half chi square."""
+    J, g, H = work.J, work.g, work.H
+    if not project(cameras, c, point, work.uv, J):
+        return 1e4  # half chi square of a marker behind a camera that sees it
+    w, r0, r1 = observed.weight[c, m], work.uv[0] - observed.uv[c, m, 0], work.uv[1] - observed.uv[c, m, 1]
+    for a in range(3):
+        g[a] += w * (J[0, a] * r0 + J[1, a] * r1)
+        for b in range(3):
+            H[a, b] += w * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
+    return 0.5 * w * (r0 * r0 + r1 * r1)
+
+
+@inlined
+def marker_rows(
+    cameras: CameraArrays, observed: Observations, m: int, point: Float, work: Scratch
+) -> tuple[float, float]:
+    """Write information and gradient of one marker by its place.
+
+    They go to work.H (3, 3) and work.g (3,).
+
+    Args:
+        cameras, observed, m: What is seen of which marker.
+        point: (3,) [m] where the hand has the marker, rig frame.
+        work: Written.
+
+    Returns:
+        Half chi square, and chi square of the place alone: without what rays that do not meet have between them.
+    """
+    H, g, K, gain, left = work.H, work.g, work.K, work.gain, work.left
+    cost = 0.0
+    for a in range(3):
+        g[a] = 0.0
+        for b in range(3):
+            H[a, b] = 0.0
+    if observed.triangulated[m]:
+        for i in range(3):
+            for j in range(3):
+                H[i, j] = observed.information[m, i, j]
+                g[i] += observed.information[m, i, j] * (point[j] - observed.point[m, j])
+            cost += 0.5 * g[i] * (point[i] - observed.point[m, i])
+        return cost, 2.0 * cost
+    for c in range(observed.uv.shape[0]):
+        if observed.weight[c, m] > 0.0:
+            cost += _ray(cameras, observed, c, m, point, work)
+    for i in range(3):
+        for j in range(3):
+            nowhere = 1.0  # [1/m^2] information about a marker that no row constrains
+            K[i, j] = nowhere if i == j else 0.0
+    inverse_3(H, K, K)
+    whole, shared = 0.0, 0.0
+    for i in range(3):
+        whole += g[i] * (K[i, 0] * g[0] + K[i, 1] * g[1] + K[i, 2] * g[2])
+    inverse_3(H, observed.own[m], K)
+    for i in range(3):
+        gain[i] = K[i, 0] * g[0] + K[i, 1] * g[1] + K[i, 2] * g[2]
+        shared += g[i] * gain[i]
+        for j in range(3):
+            left[i, j] = H[i, j]
+    for a in range(3):
+        g[a] -= left[a, 0] * gain[0] + left[a, 1] * gain[1] + left[a, 2] * gain[2]
+        for k in range(3):
+            work.gained[a, k] = left[a, 0] * K[0, k] + left[a, 1] * K[1, k] + left[a, 2] * K[2, k]
+        for b in range(3):
+            total = 0.0
+            for k in range(3):
+                total += work.gained[a, k] * left[b, k]
+            H[a, b] -= total
+    return cost - 0.5 * shared, max(whole - shared, 0.0)
+
+
+@kernel
+def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed: Observations) -> None:
+    """Write the RAY rows of a hand's markers.
+
+    Args:
+        uv: (C, A, 2) [px] of all markers of the rig; NaN: not seen.
+        variance: (C, A) [px^2] of each camera's own errors.
+        own: (A, 3, 3) [m^2] covariance of what is wrong with each marker itself.
+        markers: (M,) which of them are the hand's.
+        observed: Written.
+    """
+    zero = np.zeros((3, 3))
+    for k in range(markers.shape[0]):
+        m, rays = markers[k], 0
+        for c in range(uv.shape[0]):
+            row = np.isfinite(uv[c, m, 0] + uv[c, m, 1] + variance[c, m])
+            observed.weight[c, k] = 1.0 / variance[c, m] if row else 0.0
+            observed.uv[c, k, 0], observed.uv[c, k, 1] = uv[c, m, 0], uv[c, m, 1]
+            rays += 1 if row else 0
+        observed.seen[k], observed.triangulated[k], observed.rays[k] = rays > 0, False, rays
+        if rays > 0:
+            inverse_3(own[m], zero, observed.own[k])
+
+
+@kernel
+def observe_points(point: Float, cov: Float, own_m2: float, observed: Observations) -> None:
+    """Write POINT rows.
+
+    Args:
+        point, cov: (M, 3) [m], (M, 3, 3) [m^2]; NaN: not seen.
+        own_m2: Variance of what is wrong with the markers themselves.
+        observed: Written.
+    """
+    own = np.zeros((3, 3))
+    for i in range(3):
+        own[i, i] = own_m2
+    for m in range(point.shape[0]):
+        total = 0.0
+        for i in range(3):
+            total += point[m, i]
+            observed.point[m, i] = point[m, i]
+            for j in range(3):
+                total += cov[m, i, j]
+        seen = np.isfinite(total)
+        observed.seen[m], observed.triangulated[m], observed.rays[m] = seen, seen, 2 if seen else 0
+        for c in range(observed.weight.shape[0]):
+            observed.weight[c, m] = 0.0
+        if seen:
+            inverse_3(cov[m], own, observed.information[m])
+
+
+@inlined
+def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
+    """Write the derivative (3, 3) of a rotation vector by a small rotation.
+
+    The rotation vector is (3,); the small rotation is applied in front of it (from the left).
+
+    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
+    """
+    squared = rotation[0] * rotation[0] + rotation[1] * rotation[1] + rotation[2] * rotation[2]
+    small_rad = 1e-4  # below it a rotation vector counts as so long in the derivative
+    angle = max(sqrt(squared), small_rad)
+    factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            J[i, c] = factor * rotation[i] * rotation[c]
+        J[i, i] += 1.0 - factor * squared
+        J[i, j] += 0.5 * rotation[k]
+        J[i, k] -= 0.5 * rotation[j]
+
+
+@inner
+def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
+    """Write the palm's rotation as other sensors measure it.
+
+    The rotation goes to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
+
+    By an IMU on the forearm it is  exp(axes . (tilt, heading less its prior)) forearm R_y(deviation) R_x(flexion),
+    and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
+    """
+    R, extras_jacobian, F = search.palm_straight, search.extras_jacobian, epoch_prior.forearm
+    if epoch_prior.on_forearm[0] == 0.0:
+        for i in range(3):
+            for j in range(3):
+                search.palm[i, j] = F[i, j]
+        return
+    flexed_palm(F, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], R, search.wrist_axes)
+    for i in range(3):  # rig axes
+        for a in range(3):
+            extras_jacobian[a, i] = epoch_prior.axes[a, i]
+        extras_jacobian[3, i], extras_jacobian[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
+    for i in range(3):
+        search.off[i] = 0.0
+        for a in range(3):
+            search.off[i] += epoch_prior.axes[a, i] * (z[TILT + a] - epoch_prior.z[TILT + a])
+    rotate_by_vector(search.off, R, search.palm)
+
+
+@inner
+def contrary(epoch_prior: EpochPrior, T: Float, z: Float, search: Search) -> float:
+    """Return the chi-square of a palm against its rotation by other sensors.
+
+    The chi-square of the extras' deviation from their prior, by which they accommodated the palm, is included.
+    """
+    sensed_palm(epoch_prior, z, search)
+    rotation_between(T, search.palm, search.J, search.q)
+    total, q = 0.0, search.q
+    for i in range(3):
+        for j in range(3):
+            total += q[i] * epoch_prior.orientation_info[i, j] * q[j]
+    for i in range(z.shape[0]):
+        for j in range(z.shape[0]):
+            total += (z[i] - epoch_prior.z[i]) * epoch_prior.z_info[i, j] * (z[j] - epoch_prior.z[j])
+    return total
+
+
+@inner
+def orientation_row(
+    epoch_prior: EpochPrior, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
+) -> float:
+    """Add the TURN row; return its cost."""
+    J, q, extras_jacobian = search.J, search.q, search.extras_jacobian
+    K = 5 if epoch_prior.on_forearm[0] > 0.0 else 0
+    sensed_palm(epoch_prior, z, search)
+    rotation_between(T, search.palm, J, q)
+    rotation_vector_jacobian(q, J)
+    L, w = epoch_prior.orientation_info, search.off
+    cost = 0.0
+    for i in range(3):
+        w[i] = L[i, 0] * q[0] + L[i, 1] * q[1] + L[i, 2] * q[2]
+        cost += 0.5 * w[i] * q[i]
+    # Rows of the unknowns: the palm's turn in front of T by J, the sensed palm's by -J' (from behind).
+    D = search.by_rotation
+    for i in range(3):
+        for c in range(3):
+            D[i, c] = J[c, i]
+    for a in range(K):
+        for c in range(3):
+            D[3 + a, c] = -(
+                J[0, c] * extras_jacobian[a, 0]
+                + J[1, c] * extras_jacobian[a, 1]
+                + J[2, c] * extras_jacobian[a, 2]
+            )
+    for a in range(3 + K):
+        ia = a if a < 3 else _column(n, a - 3)
+        gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]
+        for b in range(3 + K):
+            ib = b if b < 3 else _column(n, b - 3)
+            total = 0.0
+            for i in range(3):
+                for j in range(3):
+                    total += D[a, i] * L[i, j] * D[b, j]
+            normal[ia, ib] += total
+    return cost
+
+
+@inlined
+def _column(n: int, a: int) -> int:
+    """The unknown of tilt 2, heading, flexion, deviation."""
+    return 6 + n + (TILT + a if a < 3 else WRIST_ANGLES + a - 3)
+
+
+@inlined
+def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
+    """Write R (3, 3) rotated by a small rotation vector (3,).
+
+    The rotation is applied in front (from the left), to second order.
+    """
+    x, y, z = rotation[0], rotation[1], rotation[2]
+    for j in range(3):
+        a, b, c = R[0, j], R[1, j], R[2, j]
+        u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+        out[0, j] = a + u + 0.5 * (y * w - z * v)
+        out[1, j] = b + v + 0.5 * (z * u - x * w)
+        out[2, j] = c + w + 0.5 * (x * v - y * u)
+
+
+@inner
+def finger_rows(
+    rig: Rig,
+    epoch_prior: EpochPrior,
+    f: int,
+    z: Float,
+    n: int,
+    gradient: Float,
+    normal: Float,
+    search: Search,
+) -> float:
+    """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
+
+    `search.palm_camera` and `search.wrist_axes` are those of the bend.
+    """
+    hand, lines_of_sight, work, surface = rig.hand, epoch_prior.lines_of_sight, search.rows, search.surface
+    start = hand.first[f]
+    count, base = hand.first[f + 1] - start, 6 + n
+    J, r, w, at = search.local_J, search.local_r, search.local_w, search.at
+    for c in range(count):
+        at[c] = 6 + start + c
+    at[count], at[count + 1], at[count + 2], at[count + 3] = (
+        base + f,
+        base + WRIST_ANGLES,
+        base + WRIST_ANGLES + 1,
+        base + LED_SCALE,
+    )
+    size, cost = count + 4, 0.0
+    if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
+        return 0.0
+    look(hand, rig.device, search.palm_camera, search.wrist_axes, work.angles, f, MOVES, surface)
+    for what in range(2):
+        if (what == 0 and lines_of_sight.lit[f] == 0.0) or (what == 1 and lines_of_sight.shown[f] == 0.0):
+            continue
+        rows, first = 2, 0
+        if what == 0:
+            W = lines_of_sight.laser_W[f]
+            r[0] = surface.seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
+            r[1] = surface.seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
+        else:
+            W, first = lines_of_sight.tip_W[f], 2
+            r[0], r[1] = (
+                surface.seen[2] - lines_of_sight.tip[f, 0],
+                surface.seen[3] - lines_of_sight.tip[f, 1],
+            )
+            if lines_of_sight.depth_w2[f] > 0.0:
+                rows = 3
+                r[2] = surface.seen[4] + z[LED_SCALE] - lines_of_sight.depth[f]
+        for i in range(rows):
+            for c in range(count):
+                J[i, c] = 0.0
+                for k in range(4):
+                    J[i, c] += surface.J[first + i, k] * work.by[4 * f + k, c]
+            for c in range(3):
+                J[i, count + c] = surface.J[first + i, 4 + c]
+            J[i, count] *= lines_of_sight.teaches[f]
+            J[i, count + 3] = 1.0 if i == 2 else 0.0
+        for i in range(rows):
+            if i == 2:
+                w[2] = lines_of_sight.depth_w2[f] * r[2]
+            else:
+                w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
+            cost += 0.5 * w[i] * r[i]
+        for a in range(size):
+            # What fingers measure of the bend counts for little: they err together, as the device is put on.
+            of_wrist = a == count + 1 or a == count + 2
+            share = search.wrist_share[0] if of_wrist else 1.0
+            for i in range(rows):
+                gradient[at[a]] += share * J[i, a] * w[i]
+            p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
+            p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
+            p2 = lines_of_sight.depth_w2[f] * J[2, a] if rows == 3 else 0.0
+            for b in range(size):
+                total = p0 * J[0, b] + p1 * J[1, b]
+                if rows == 3:
+                    total += p2 * J[2, b]
+                if b == count + 1 or b == count + 2 or of_wrist:
+                    total *= search.wrist_share[0]
+                normal[at[a], at[b]] += total
+    return cost

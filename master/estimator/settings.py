@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple, Self, get_type_hints
 import numpy as np
 
 from common.errors import CalibrationError
-from common.messages.records import filled
+from common.kernels import filled
 
 _HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
 _COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"

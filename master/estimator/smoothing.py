@@ -1,26 +1,137 @@
-"""Kernel of the filter of the solved hand, and its memory.
+"""The 1 € filter smooths the solved hand, and a blend covers leaps.
 
-`master.estimator.smooth` has the law.
+Blending of a hand over jumps that are no motion.
+
+The hand is watched by several kinds of sensors. It is blended part by part: the palm and each finger.
+
+Such a hand is solved elsewhere from one epoch to the next whenever another marker is seen or one less, when another
+sensor measures a finger, and when what is measured without markers jumps. What is shown goes on as the hand moves,
+and all that leads elsewhere is led in, no faster than a given speed.
+
+How the hand moves meanwhile is estimated without solving it: the palm goes as those markers on its back go that are in
+both epochs, and everything else at half the speed at which it was shown.
+
+Kernel of the filter of the solved hand, and its memory.
+
+`master.estimator.smoothing` has the law.
+
+Smooth the solved hand by the rig's 1 € filter, and blend over leaps.
+
+**Signals.** Position and rotation of the palm and the angles go through one filter (`master.fabrik.one_euro`), the
+palm and each finger as a group. All 26 signals are in metres, so that the rig's settings mean for the hand what they
+mean for points: an angle counts by how far it moves the end of its finger, the rotation by how far it moves the ends of
+the fingers. The palm's position is that of its middle knuckle, about which its rotation is unsure: at the wrist the
+noise of the rotation would shake the position as well. A rotation is filtered as the sum of the filter's own steps and
+the rotation vector from there to what was solved, so it is never near half a turn.
+
+**Noise.** The variance of each signal is measured while it runs (`master.fabrik.one_euro`) and is at most that of the
+markers it rests on. A solved pose is steadier than its markers in one pose and less steady in another, as its priors
+hold it, and its covariance contains errors that stay; neither states what is new in each frame.
+
+The joints come from forward kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the
+PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
+limits; what has to be cut is an abduction that the filtered flexion does not allow.
+
+**Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held; and where another sensor takes over
+from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
+solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
+the server has it: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
+of how far it is shown from where it is solved to be; one whose region is too large now is not tracked.
+
+A hand that was wrong a moment ago, as its tracker reports, is shown at once where it is, and the filter begins anew.
+
+A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.smoothing` has it.
+
+Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
 
-from math import nan
+from dataclasses import replace
+from math import exp, nan
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand.model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
-from common.kernels import constant, inner, kernel
-from common.messages.records import record
-from master.estimator.blend import PARTS
-from master.estimator.hand_tables import HandTables
-from master.estimator.joint_covariance import is_small
-from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, rotation_between
-from master.estimator.matrices import copy
-from master.estimator.settings import Settings
+from common.hand.model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
+from common.kernels import bound, boxed, constant, fields, inner, kernel, record
+from master.estimator.covariance import is_small
+from master.estimator.epoch import Fitted, FittedHand
+from master.estimator.kinematics import (
+    Scratch,
+    chains,
+    clamp,
+    joints,
+    rotate_by,
+    rotation_between,
+    twist_boxed,
+)
+from master.estimator.parameters import HandParameters, HandTables, Mounts
+from master.estimator.posterior import BY_MARKERS
+from master.estimator.settings import DEFAULT, Settings
 from master.estimator.state import NEVER_NS, PALM_PART
-from master.fabrik.noise import measure
-from master.fabrik.one_euro import UNSEEN_NS, OneEuroParameters, filter_step
+from master.fabrik.linear_algebra import copy
+from master.fabrik.one_euro import UNSEEN_NS, OneEuroParameters, filter_step, measure
+
+PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
+PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
+
+
+class Blend:
+    """Push machine that holds the offsets that remain of jumps.
+
+    It also holds the sources the hand was based on, its markers and its speed.
+    """
+
+    def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
+        """Blend each part no faster than a speed [m/s].
+
+        `on_palm` (M,) marks which markers sit on the back.
+        """
+        self._blend_m_s, self._on_palm = blend_m_s, on_palm
+        self._offset, self._speed = np.zeros(26), np.zeros(26)
+        self._sources = np.zeros(6, np.int64)
+        self._points_m = np.full((len(on_palm), 3), np.nan)
+
+    def push(self, gap_s: float, sources: Int, shown: Float, solved: Float, points_m: Float) -> Float:
+        """Return the offset to be added to the solved signals (26,) [m].
+
+        The signals are those of `master.estimator.smoothing`.
+
+        Args:
+            gap_s: Time since the last; 0: there is none.
+            rests: (6,) as of `Fitted`.
+            shown, solved: (26,) what was shown last, what is solved now.
+            points_m: (M, 3) the markers; NaN: not seen.
+        """
+        if gap_s > 0.0:
+            # of it: a motion that is not seen any more rather ends than goes on
+            stale_s = 0.1  # after such a gap nothing of a speed is left
+            goes_on = shown + 0.5 * min(gap_s, stale_s) * self._speed
+            went = (points_m - self._points_m)[self._on_palm]
+            went = went[np.isfinite(went[:, 0])]
+            if len(went) and gap_s <= stale_s:
+                goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
+            off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
+            triangulated = (sources & self._sources & BY_MARKERS) > 0
+            blended_m, nothing_m = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
+            led = np.bincount(PARTS, np.abs(self._offset)) > blended_m
+            sudden_m = 3e-3  # from one epoch to the next, beside motion
+            leaps = ((sources != self._sources) | ~triangulated | led) & (off > sudden_m)
+            self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
+            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), nothing_m)
+            step_m = 5e-3  # is the most that is led between two poses
+            left = 1.0 - min(self._blend_m_s * gap_s, step_m) / size_m
+            ease_s = 0.04  # in which the last of what is led fades
+            self._offset = self._offset * np.maximum(left, exp(-gap_s / ease_s))[PARTS]
+        self._sources, self._points_m = sources, points_m
+        return self._offset
+
+    def moved(self, gap_s: float, step: Float) -> None:
+        """Learn from the step (26,) [m] of what was shown."""
+        if gap_s > 0.0:
+            speed_s = 0.03  # of the shown hand, which is smooth
+            self._speed = self._speed + (1.0 - exp(-gap_s / speed_s)) * (step / gap_s - self._speed)
+
 
 WHOLE, SIGNALS, REST = constant(0), constant(1), constant(2)
 
@@ -56,7 +167,7 @@ class Smoothing:
         palm: (4, 4) as filtered.
         offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
         since_ns: (6,) when that was, and `until_ns` (1,) when nothing is left of any.
-        count, dt_s, past: The measured noise (`master.fabrik.noise.measure`).
+        count, dt_s, past: The measured noise (`master.fabrik.one_euro.measure`).
         x, speed, seen_ns: The filter (`master.fabrik.one_euro.filter_step`), and `filter` (5,) its settings.
         part: (26,) finger of each signal, PALM_PART: the palm.
         marker_of: (5,) marker of each finger; -1: there is none.
@@ -309,3 +420,95 @@ def smooth(
         state.values[i] = state.filtered[i]
     copy(shown.palm, state.palm)
     return added
+
+
+class HandOneEuro:
+    """Push machine that holds the last output, the filter and jump offsets.
+
+    The offsets are what is left of leaps (`Smoothing`).
+    """
+
+    def __init__(
+        self,
+        model: HandModel,
+        markers: tuple[str, ...],
+        parameters: OneEuroParameters,
+        blend_m_s: float | None = None,
+        settings: Settings = DEFAULT,
+    ) -> None:
+        """Set up.
+
+        Args:
+            model: The hand.
+            markers: Names of its markers in the order of the covariances.
+            parameters: Of the 1 € filter [m, s].
+            blend_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
+            settings: Of the estimator.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self._settings = settings
+        self._on_palm = Mounts.of(model, markers).on_back
+        self._blend_m_s = blend_m_s
+        self._blend: Blend | None = None
+        state = Smoothing.of(model, markers, parameters, settings)
+        self._t_ns, self._values, self._signals = state.t_ns, state.values, state.signals
+        self._state = boxed(state)
+        self._fresh = self._state.copy()
+        tables = HandTables.of(model, HandParameters.of(model))
+        self._hand, self._tables = boxed(tables), fields(tables)
+        twist_boxed(self._hand, np.zeros(5))  # compiled now
+        sources, cov, scratch = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
+        none = np.zeros(26, np.bool_)
+        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, sources, cov, scratch, scratch, none)
+
+    def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
+        """Filter palm, angles and joints of a hand; the rest of it stays.
+
+        Args:
+            t_ns: The epoch; a hand that is not after the last one is passed on as it is.
+            hand: As solved. One that is not valid is passed on, and what follows begins anew.
+            cov_m2: (M, 3, 3) [m^2] noise of the markers; NaN: not measured. What rests on none is filtered by
+                the noise it shows.
+            points_m: (M, 3) [m] the markers, of a hand that other sensors watch, too; NaN: not seen.
+        """
+        solution, sources = hand.solution, hand.sources
+        if solution is None or not hand.valid.any():
+            self._t_ns[0] = NEVER_NS
+            return hand
+        gap_s = (t_ns - int(self._t_ns[0])) * 1e-9
+        if gap_s > self._settings.forget_s or (hand.reinitialised and self._blend_m_s is None):
+            self._state[:], gap_s = self._fresh, 0.0
+            self._blend = None if self._blend_m_s is None else Blend(self._blend_m_s, self._on_palm)
+        elif gap_s <= 0.0:
+            return hand
+        at = solution.joints
+        solved = Pose(solution.T_rig_palm, solution.angles_rad, at.position_m, at.rotation, solution.cov_m2)
+        if (self._tables.twist != solution.twist).any():
+            twist_boxed(self._hand, solution.twist)
+        shown, cov_m2 = Pose.empty(), np.ascontiguousarray(cov_m2)
+        blend, tracked, before, what = self._blend, hand.tracked.copy(), self._values.copy(), WHOLE
+        if blend is not None and points_m is not None:
+            self._kernel(self._hand, self._state, SIGNALS, t_ns, sources, cov_m2, solved, shown, tracked)
+            self._signals += blend.push(gap_s, sources, before, self._signals, points_m)
+            what = REST
+        off = self._kernel(self._hand, self._state, what, t_ns, sources, cov_m2, solved, shown, tracked)
+        if blend is not None:
+            blend.moved(gap_s, self._values - before)
+        smooth_hand = FittedHand(
+            T_rig_palm=shown.palm,
+            angles_rad=shown.angles,
+            joints=HandJoints(shown.position, shown.rotation, shown.palm),
+            cov_m2=shown.cov if off else solution.cov_m2,
+            tilt_cov_rad2=solution.tilt_cov_rad2,
+            tilt_process_noise_rad2_s2=solution.tilt_process_noise_rad2_s2,
+            measurement_cov=solution.measurement_cov,
+            x=solution.x,
+            scale=solution.scale,
+            natural_weight=solution.natural_weight,
+            marker_chi2=solution.marker_chi2,
+            steps=solution.steps,
+            twist=solution.twist,
+        )
+        return replace(hand, solution=smooth_hand, tracked=tracked)

@@ -8,24 +8,17 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from master.estimator.extras import keep_extras
-from master.estimator.hypotheses import Blank, likelier
-from master.estimator.joint_covariance import is_small, linear, only_limits, surer, tilts
+from master.estimator.covariance import add_second_order, is_small, linear, only_limits, surer, tilts
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
-from master.estimator.matrices import copy, inverse_3
-from master.estimator.observation_sources import Ground
-from master.estimator.posterior import posterior
+from master.estimator.posterior import Ground, Model, posterior
 from master.estimator.priors import PosturePrior
-from master.estimator.problem import EpochPrior, Rig, Search
-from master.estimator.residuals import Observations, marker_rows
-from master.estimator.second_order import add_second_order
+from master.estimator.problem import EpochPrior, Observations, Rig, Search, contrary, marker_rows, sensed_palm
+from master.estimator.sensors import EXTRAS
 from master.estimator.settings import Settings
-from master.estimator.solve import descend
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
-from master.estimator.workspace import Model
-from master.estimator.wrist_device import EXTRAS
-from master.estimator.wrist_rows import contrary, sensed_palm
+from master.estimator.solve import Blank, descend, likelier
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, keep_extras, predict
 from master.estimator.wrist_update import extras_only, start_scanned, take_scanned
+from master.fabrik.linear_algebra import copy, inverse_3
 
 _SOLVED, _MEASURED, _HELD, _WRIST = (
     int(source) for source in (Source.SOLVED, Source.MEASURED, Source.HELD, Source.WRIST)
@@ -113,7 +106,7 @@ def _judge(
 ) -> None:
     """Write which joints are tracked, and what each rests on.
 
-    Tracked is a joint whose 95 % region is small (`master.estimator.joint_covariance.is_small`), and that rests on
+    Tracked is a joint whose 95 % region is small (`master.estimator.covariance.is_small`), and that rests on
     measurements of its finger that are no older than `tracked_age_s`.
     """
     hand = rig.hand

@@ -1,26 +1,33 @@
-"""Kernels of one epoch for wrist-device data: before the fit, and after it."""
+"""Wrist data updates the fingers before the fit, and after it.
 
-from math import inf
+Kernels of the coupling between MCP and PIP of a hand.
+
+It is learnt from the fingers whose tips are seen.
+
+A natural MCP is a share of the PIP (`master.estimator.priors`). But each hand has its own share, and keeps
+to it more closely or less. Both are those of a regression through the origin,
+
+    e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,
+
+of expected squares, so that a finger that is hardly known feigns no closeness. The sums begin as if some fingers
+of usual hands had been seen, and fade back to that.
+
+Kernels of one epoch for wrist-device data: before the fit, and after it.
+"""
+
+from math import exp, inf, radians, sqrt
 from typing import Any
 
 from common.arrays import Float
 from common.kernels import inner, kernel
 from common.messages import SolverMode
-from master.estimator.extras import predict_extras
-from master.estimator.finger_coupling import expect_coupling, learn_coupling
-from master.estimator.finger_density import choose, weigh_hands
-from master.estimator.finger_scan import ROWS, Prior, Scan, scan_finger
+from master.estimator.finger_scan import ROWS, Prior, Scan, choose, scan_finger, weigh_hands
 from master.estimator.finger_surface import MOVES, look
-from master.estimator.hand_tables import HandTables
-from master.estimator.hypotheses import Posterior
 from master.estimator.kinematics import Scratch, angles_of, clamp, free_of
-from master.estimator.observation_sources import Ground
+from master.estimator.parameters import HandTables
+from master.estimator.posterior import Ground, Model, Task
 from master.estimator.problem import EpochPrior, Rig, Search
-from master.estimator.settings import Settings
-from master.estimator.solve import palm_off
-from master.estimator.state import NEVER_NS, HandState
-from master.estimator.workspace import Model, Task
-from master.estimator.wrist_device import (
+from master.estimator.sensors import (
     EXTRAS,
     LED_SCALE,
     WRIST_ANGLES,
@@ -29,6 +36,39 @@ from master.estimator.wrist_device import (
     loosen,
     loosen_short,
 )
+from master.estimator.settings import Settings
+from master.estimator.solve import Posterior, palm_off
+from master.estimator.state import NEVER_NS, HandState, predict_extras
+
+_BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
+
+
+@inner
+def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Prior) -> None:
+    """Write the expected coupling share and spread.
+
+    They hold for a time after the last strobe cycle.
+    """
+    kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
+    for i in range(3):
+        sums[i] *= kept
+    stationary = settings.coupled_fingers * _BENT_RAD2
+    squared = stationary + sums[0]
+    share = sums[1] / squared
+    spread2 = (stationary * settings.coupled_spread**2 + sums[2]) / squared - share * share
+    prior.coupled_share[0], prior.coupled_spread[0] = share, sqrt(max(spread2, 0.0))
+
+
+@inner
+def learn_coupling(prior: Prior, f: int, scan: Scan, state: HandState) -> None:
+    """Add a finger that laser and tip measure unambiguously."""
+    pip, pip2, sums = scan.out[f, 2], scan.pip2[f], state.coupling
+    off = scan.out[f, 1] - prior.base_rad[f, 1] - prior.per_pip[f, 1] * pip
+    way = scan.way[f, 1] - prior.per_pip[f, 1]
+    sums[0] += pip * pip + pip2
+    sums[1] += pip * off + way * pip2
+    sums[2] += off * off + way * way * pip2
+
 
 _FK, _IK = int(SolverMode.FK), int(SolverMode.IK)
 

@@ -22,14 +22,11 @@ from master.evaluation.run_results import RunResults
 from master.evaluation.score import Truth, score, score_hidden
 from master.evaluation.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
 from master.evaluation.wrist_score import score_wrist
-from master.outputs.files import load_poses
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_results import ResultPicture
-from master.outputs.picture_wrist import WristPicture
-from master.outputs.poses import Poses
+from master.outputs.picture_overlays import ResultPicture, WristPicture
+from master.outputs.poses import Poses, PosesTruth, load_poses
 from master.outputs.rerun import write_rrd
-from master.outputs.truth import PosesTruth
-from master.replay.solve import fingers_of
+from master.replay.offline import fingers_of
 from master.rig.setup import RigSetup
 
 Progress = Callable[[str, int, int], None]

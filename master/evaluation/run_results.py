@@ -14,7 +14,7 @@ import numpy as np
 from common.arrays import Bool, Int
 from common.messages import Contact, Gesture, ObjectPose, ResultMessage
 from common.sim.scene import Scene
-from master.evaluation.object_score import ObjectTruth, score_object, score_objects
+from master.evaluation.score import ObjectTruth, score_object, score_objects
 from master.outputs.result_files import (
     GESTURES,
     Contacts,

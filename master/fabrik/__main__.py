@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 from master.run.dispatcher import new_dispatcher
 
 

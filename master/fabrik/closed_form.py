@@ -1,4 +1,16 @@
-"""Finger angles from one point on the finger, in closed form.
+"""Angles of a finger follow from one point on it, in closed form.
+
+The legal pose of a finger whose end is nearest to a target.
+
+Damped least squares (Wampler 1986; Levenberg-Marquardt) on the four angles, with an active set: an angle at its limit
+that the gradient would push outside is left out of the step. Three equations, so the step is
+J^T (J J^T + damping I)^-1 r with one 3x3 solve; with more angles than equations it is the step of least change, which
+keeps a redundant finger near its seed.
+
+Where abduction narrows with flexion the region is no box. So the first unknown is not the abduction a but
+a / (share of the range that is left at this flexion): its limits are constant, and the region is a box again.
+
+Finger angles from one point on the finger, in closed form.
 
 A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
 point lies at w(PIP), which neither flexion nor abduction can stretch:
@@ -14,6 +26,10 @@ its own angle, and a target out of reach the nearest pose.
 
 Kernels of a finger's chain: a rotor (box) and two flexion hinges, coupled or not. Angles are (4,): abduction, flexion,
 PIP, DIP (thumb: CMC abduction, CMC flexion, MCP, IP) [rad].
+
+Kernels of the pipeline's palm: back normal and finger targets.
+
+They give where the back faces, and where fingers are to bring their markers.
 """
 
 from math import cos, inf, isfinite, pi, sin, sqrt
@@ -22,21 +38,165 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import constant, inner, kernel
-from master.fabrik.chain_arrays import (
+from master.fabrik.joints import (
     BONE,
     REST,
     ROOT,
     ROTATION,
     SIGN,
+    START,
     ChainArrays,
     clamp_angles,
     end_of,
+    forward,
+    hinge_fit,
+    limits_of,
     matrix_at,
+    narrowing,
+    put_vector,
+    swing_and_flex,
     vector_at,
 )
-from master.fabrik.least_squares import least_squares
-from master.fabrik.limits import hinge_fit, swing_and_flex
-from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, rotate_back
+from master.fabrik.linear_algebra import (
+    Vector,
+    cross,
+    dot,
+    inverse_3_plus,
+    length,
+    minus,
+    plus,
+    rotate,
+    rotate_back,
+)
+
+
+@kernel
+def least_squares(
+    chain: ChainArrays, goal: Vector, tolerance_m: float, max_steps: int, angles: Float
+) -> float:
+    """Improve a finger's angles until the target is hit or no legal step helps.
+
+    Args:
+        chain: A rotor (box) and two flexion hinges; its coupling, when it has one, is obeyed.
+        goal: Target [m], root frame, finite.
+        tolerance_m: Residual that ends the search [m].
+        max_steps: Of the search, taken or refused.
+        angles: (4,) [rad]; in: start, clamped to the limits; out: legal.
+
+    Returns:
+        Distance left [m].
+    """
+    share, _ = narrowing(limits_of(chain, ROOT), angles[1])
+    unknowns, trial = angles.copy(), np.empty(4)
+    unknowns[0] = angles[0] / share if share > 0.0 else 0.0
+    columns, trial_columns = np.empty((4, 3)), np.empty((4, 3))
+    next_angles = np.empty(4)
+    left = _evaluate(chain, goal, unknowns, angles, columns)
+    first_damping_m2 = 1e-7
+    cost, damping = dot(left, left), first_damping_m2
+    for _ in range(max_steps):
+        if cost <= tolerance_m * tolerance_m or not _step(chain, unknowns, left, columns, damping, trial):
+            break
+        trial_left = _evaluate(chain, goal, trial, next_angles, trial_columns)
+        trial_cost = dot(trial_left, trial_left)
+        least_damping_m2, most_damping_m2 = 1e-13, 1.0
+        if trial_cost < cost:
+            gain = cost - trial_cost
+            left, cost, damping = trial_left, trial_cost, max(damping * 0.1, least_damping_m2)
+            for i in range(4):
+                unknowns[i], angles[i] = trial[i], next_angles[i]
+                put_vector(columns, i, vector_at(trial_columns, i, START))
+            least_gain = 1e-7
+            if gain < least_gain * (cost + gain):
+                break
+        elif damping > most_damping_m2:
+            break
+        else:
+            damping *= 10.0
+    return length(left)
+
+
+@kernel
+def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, columns: Float) -> Vector:
+    """Clamp the unknowns, write angles and Jacobian's columns (4, 3); what is left."""
+    limits = limits_of(chain, ROOT)
+    unknowns[0] = min(max(unknowns[0], limits.low), limits.high)
+    unknowns[1] = min(max(unknowns[1], limits.flexion_low), limits.flexion_high)
+    share, narrowing_derivative = narrowing(limits, unknowns[1])
+    angles[0] = share * unknowns[0]
+    for i in range(1, 4):
+        angles[i] = unknowns[i]
+    clamp_angles(chain, angles)
+    for i in range(1, 4):
+        unknowns[i] = angles[i]
+    positions, orientations = np.empty((4, 3)), np.empty((3, 9))
+    forward(chain, angles, positions, orientations)
+    end, sign = vector_at(positions, len(positions) - 1, START), limits.sign
+    x, y, z = (
+        chain.links[ROOT, ROTATION + 1],
+        chain.links[ROOT, ROTATION + 4],
+        chain.links[ROOT, ROTATION + 7],
+    )
+    axis = (sign * x, sign * y, sign * z)
+    put_vector(columns, ROOT, cross(axis, minus(end, vector_at(positions, ROOT, START))))
+    for k in range(3):
+        axis = (-orientations[k, 0], -orientations[k, 3], -orientations[k, 6])
+        put_vector(columns, k + 1, cross(axis, minus(end, vector_at(positions, k, START))))
+    coupled_rad = 1e-12
+    follows = chain.follower >= 0 and abs(angles[3] - chain.ratio * angles[2]) < coupled_rad
+    ratio, narrows = chain.ratio if follows else 0.0, unknowns[0] * narrowing_derivative
+    for j in range(3):
+        if chain.follower >= 0:
+            columns[2, j] += ratio * columns[3, j]
+            columns[3, j] = 0.0
+        columns[1, j] += narrows * columns[0, j]
+        columns[0, j] *= share
+    return minus(goal, end)
+
+
+@inner
+def _step(
+    chain: ChainArrays, unknowns: Float, left: Vector, columns: Float, damping: float, new: Float
+) -> bool:
+    """Write the next unknowns (4,), not yet clamped; False: all are uphill."""
+    xx = yy = zz = damping
+    xy = xz = yz = 0.0
+    some = False
+    for i in range(4):
+        x, y, z = vector_at(columns, i, START)
+        if _free(chain, unknowns, left, columns, i):
+            some = True
+            xx += x * x
+            yy += y * y
+            zz += z * z
+            xy += x * y
+            xz += x * z
+            yz += y * z
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    determinant = xx * a + xy * b + xz * c
+    if not some or not determinant > 0.0:
+        return False
+    weights = (
+        dot((a, b, c), left) / determinant,
+        dot((b, d, e), left) / determinant,
+        dot((c, e, f), left) / determinant,
+    )
+    for i in range(4):
+        moved = (
+            dot(vector_at(columns, i, START), weights) if _free(chain, unknowns, left, columns, i) else 0.0
+        )
+        new[i] = unknowns[i] + moved
+    return True
+
+
+@inner
+def _free(chain: ChainArrays, unknowns: Float, left: Vector, columns: Float, i: int) -> bool:
+    """Whether unknown i has room, and is not pushed out at its limit."""
+    low, high = chain.spans[i, 0], chain.spans[i, 1]
+    pull = dot(vector_at(columns, i, START), left)
+    return not (low == high or (unknowns[i] <= low and pull <= 0.0) or (unknowns[i] >= high and pull >= 0.0))
+
 
 REACHED_M = 1e-6
 _TOLERANCE_M = 0.05 * REACHED_M
@@ -305,3 +465,79 @@ def _start(
         pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])
         dip = chain.spans[3, 0] + dip_share * (chain.spans[3, 1] - chain.spans[3, 0])
         _swing(chain, pip, dip, local, pair % 2, angles)
+
+
+@kernel
+def back_normal_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
+    """Write the unit vector from a hand to the cameras that see its back.
+
+    A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by
+    what each sees, add up to where it faces, as far as they constrain it.
+
+    Args:
+        points: (M, 3) [m] its markers, rig frame; NaN: not placed.
+        area_px2: (C, K) of those on its back as each camera sees them; NaN: not seen.
+        centres, focal_px: (C, 3) [m] and (C,) of the cameras.
+        out: (3,) written.
+
+    Returns:
+        Whether a marker is placed; else nothing is written.
+    """
+    count = 0
+    middle, back = np.zeros(3), np.empty(3)
+    for m in range(points.shape[0]):
+        if np.isfinite(points[m, 0]):
+            count += 1
+            for i in range(3):
+                middle[i] += points[m, i]
+    if count == 0:
+        return False
+    sum_px2, shown_px2 = 0.0, np.zeros(centres.shape[0])
+    for c in range(centres.shape[0]):
+        for k in range(area_px2.shape[1]):
+            if np.isfinite(area_px2[c, k]):
+                shown_px2[c] += area_px2[c, k]
+        sum_px2 += shown_px2[c]
+    for i in range(3):
+        out[i] = 0.0
+    for c in range(centres.shape[0]):
+        squared = 0.0
+        for i in range(3):
+            back[i] = centres[c, i] - middle[i] / count
+            squared += back[i] * back[i]
+        weight = 1.0 if sum_px2 == 0.0 else shown_px2[c] * squared / (focal_px[c] * focal_px[c])
+        for i in range(3):
+            out[i] += weight * back[i] / sqrt(squared)
+    length = sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    if length > 0.0:
+        for i in range(3):
+            out[i] /= length
+    else:  # cameras on both sides
+        for i in range(3):
+            out[i] = 1.0 if i == 2 else 0.0
+    return True
+
+
+@kernel
+def targets_of(points: Float, cov: Float, T: Float, fitted: Float, fit_m2: float, out: Float) -> None:
+    """Write where fingers are to bring their markers (M, 3) [m], palm frame.
+
+    Where they are measured, as far as that is surer than the fit.
+
+    Args:
+        points, cov: (M, 3) [m] and (M, 3, 3) [m^2] measured, rig frame; NaN: not seen.
+        T: (4, 4) palm.
+        fitted: (M, 3) [m] where the palm's fit has them, rig frame.
+        fit_m2: Variance of these.
+        out: Written; NaN where not seen.
+    """
+    gain, off, target = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for m in range(points.shape[0]):
+        inverse_3_plus(cov[m], fit_m2, gain)
+        for i in range(3):
+            off[i] = points[m, i] - fitted[m, i]
+        for i in range(3):
+            moved = fit_m2 * (gain[i, 0] * off[0] + gain[i, 1] * off[1] + gain[i, 2] * off[2])
+            target[i] = fitted[m, i] + moved - T[i, 3]
+        for i in range(3):
+            out[m, i] = T[0, i] * target[0] + T[1, i] * target[1] + T[2, i] * target[2]

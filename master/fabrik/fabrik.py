@@ -1,4 +1,17 @@
-"""General solver for limited chains: FABRIK with the joint limits in both passes.
+"""FABRIK solves a chain of limited joints by passes back and forth.
+
+A chain of bones with limited joints, and its forward kinematics.
+
+Everything is in the chain's root frame, its first joint at the origin. Link k turns from its parent's frame by
+the fixed `rotation`, then by its joint's Q(angles), and its bone leads to joint k + 1:
+
+    O_k = O_{k-1} turn_k Q_k          p_{k+1} = p_k + O_k bone_k
+
+Kernels see it as `ChainArrays`, and its angles as one array (n,), joint after joint.
+
+Kernels of one iteration of FABRIK: aim, backward pass, forward pass.
+
+General solver for limited chains: FABRIK with the joint limits in both passes.
 
 Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011. One iteration:
 
@@ -14,12 +27,12 @@ joints keep full orientations, so bones need not be straight or planar. A couple
 forward pass.
 
 FABRIK as published deadlocks on reachable targets: a limit flattens a finger and a straight limited chain cannot
-leave its line. Hence the seed (from the closed form, `master.fabrik.finger`, it starts on the target), and, when
+leave its line. Hence the seed (from the closed form, `master.fabrik.solver`, it starts on the target), and, when
 an attempt stalls, restarts from bent poses turned to the target. The best pose found is returned with its
 residual; nothing is claimed that is not so, and no finite target raises or gives NaN.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from math import isfinite
 from typing import NamedTuple
@@ -28,20 +41,329 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inner, kernel
-from master.fabrik.chain import Chain, Pose, least_root_to_end
-from master.fabrik.chain_arrays import (
+from master.fabrik.joints import (
+    BONE,
+    HINGE,
+    KIND,
+    ROOT,
+    ROTATION,
     START,
+    WORLD,
+    Angles,
     ChainArrays,
+    Hinge,
+    Joint,
+    Pair,
+    angles_of,
+    clamp,
     clamp_angles,
     end_of,
+    fit,
+    follow,
     forward,
+    hinge_fit,
     limits_of,
+    matrix_at,
     put_angles,
+    put_matrix,
+    put_vector,
+    rest_frame,
+    rotation,
     vector_at,
 )
-from master.fabrik.limits import HINGE, clamp
-from master.fabrik.passes import aim, backward_pass, forward_pass
-from master.fabrik.rotations import IDENTITY, Matrix, Vector, length, minus, rotate_back
+from master.fabrik.linear_algebra import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    between,
+    length,
+    minus,
+    plus,
+    product,
+    rotate,
+    rotate_back,
+    rotation_about,
+    transposed,
+)
+
+Pose = tuple[Angles, ...]
+"""Angles of every joint [rad]: one of a hinge, abduction and flexion of a rotor."""
+
+_SEARCH_STARTS = (1.0, 0.5, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """One joint and the bone behind it.
+
+    Attributes:
+        rotation: Rest orientation in the parent's frame (`world` joints: in the root frame).
+        joint: What it allows.
+        bone: To the next joint, in the joint's own frame [m].
+    """
+
+    rotation: Matrix
+    joint: Joint
+    bone: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    """A hinge that follows another within its own limits, by a ratio of angles."""
+
+    leader: int
+    follower: int
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Links from the root to the end effector; two hinges may be coupled.
+
+    Attributes:
+        links: At least one.
+        coupling: None: every joint is free.
+        arrays: The same for kernels.
+    """
+
+    links: tuple[Link, ...]
+    coupling: Coupling | None = None
+    arrays: ChainArrays = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not self.links:
+            raise ValueError("a chain needs a link")
+        c = self.coupling
+        if c is not None:
+            hinges = [isinstance(link.joint, Hinge) for link in self.links]
+            if not 0 <= c.leader < c.follower < len(hinges) or not (hinges[c.leader] and hinges[c.follower]):
+                raise ValueError(
+                    f"a coupling leads from a hinge to a later one, not {c.leader} to {c.follower}"
+                )
+        object.__setattr__(self, "arrays", _arrays(self))
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """Bone lengths [m]."""
+        return tuple(length(link.bone) for link in self.links)
+
+    @property
+    def spans(self) -> tuple[Pair, ...]:
+        """Low and high of every angle [rad]; the abduction's where nothing narrows it."""
+        return tuple((low, high) for low, high in self.arrays.spans.tolist())
+
+    def flat(self, pose: Pose) -> Float:
+        """Angles (n,) [rad] of a pose.
+
+        Raises:
+            ValueError: A joint has too many angles, or too few.
+        """
+        for link, angles in zip(self.links, pose, strict=True):
+            if len(angles) != _count(link.joint):
+                raise ValueError(f"{len(angles)} angles for a joint that has {_count(link.joint)}")
+        return np.array([angle for angles in pose for angle in angles], np.float64)
+
+    def pose(self, angles_rad: Float) -> Pose:
+        """Angles (n,) [rad] joint by joint."""
+        rest = iter(angles_rad.tolist())
+        return tuple(tuple(next(rest) for _ in range(_count(link.joint))) for link in self.links)
+
+    def clamp(self, pose: Pose) -> Pose:
+        """The nearest legal pose, coupling obeyed."""
+        angles = self.flat(pose)
+        clamp_angles(self.arrays, angles)
+        return self.pose(angles)
+
+    def forward(self, pose: Pose) -> tuple[Float, Float]:
+        """Joint positions (N + 1, 3) [m] and link orientations (N, 3, 3), root frame."""
+        return self.forward_flat(self.flat(pose))
+
+    def forward_flat(self, angles_rad: Float) -> tuple[Float, Float]:
+        """As `forward`, from angles (n,) [rad]."""
+        positions, orientations = np.zeros((len(self.links) + 1, 3)), np.zeros((len(self.links), 9))
+        forward(self.arrays, angles_rad, positions, orientations)
+        return positions, orientations.reshape(-1, 3, 3)
+
+
+def least_root_to_end(chain: Chain) -> float:
+    """Least |end - root| [m] inside the limits.
+
+    Pattern search over the joints behind the first, from several starts.
+    """
+    return min(_nearest_from(chain, share) for share in _SEARCH_STARTS)
+
+
+def _nearest_from(chain: Chain, share: float) -> float:
+    """Least |end - root| [m] from joints at a share of their range."""
+
+    def distance(angles: Float) -> float:
+        legal = angles.copy()
+        clamp_angles(chain.arrays, legal)
+        return length(end_of(chain.arrays, legal))
+
+    low, high = chain.arrays.spans.T
+    first = _count(chain.links[0].joint)
+    angles = np.append(np.clip(0.0, low[:first], high[:first]), (low + share * (high - low))[first:])
+    first_step, least_step = 0.25, 1e-4
+    here, step = distance(angles), first_step
+    while step > least_step:
+        before = here
+        for i in range(first, len(angles)):
+            start = angles[i]
+            for move in (step, -step):
+                trial = angles.copy()
+                trial[i] = min(max(start + move * (high[i] - low[i]), low[i]), high[i])
+                found = distance(trial)
+                if found < here:
+                    angles, here = trial, found
+        no_gain_m = 1e-12
+        if here >= before - no_gain_m:
+            step *= 0.5
+    return here
+
+
+def _arrays(chain: Chain) -> ChainArrays:
+    joints = [link.joint.limits for link in chain.links]
+    counts = [_count(link.joint) for link in chain.links]
+    spans: list[Pair] = []
+    for joint in joints:
+        spans.append((joint.low, joint.high))
+        if joint.kind != HINGE:
+            spans.append((joint.flexion_low, joint.flexion_high))
+    kinds = [(j.kind, link.joint.frame == "world") for j, link in zip(joints, chain.links, strict=True)]
+    rows = [
+        np.concatenate(
+            [np.ravel(link.rotation), np.ravel(j.rest), link.bone, j.axis, [j.spread_at_full_flexion, j.sign]]
+        )
+        for j, link in zip(joints, chain.links, strict=True)
+    ]
+    c = chain.coupling or Coupling(-1, -1, 0.0)
+    return ChainArrays(
+        joints=np.column_stack([kinds, np.cumsum([0, *counts[:-1]])]).astype(np.int64, order="C"),
+        spans=np.array(spans, np.float64),
+        links=np.array(rows, np.float64),
+        leader=c.leader,
+        follower=c.follower,
+        ratio=float(c.ratio),
+    )
+
+
+def _count(joint: Joint) -> int:
+    return 1 if isinstance(joint, Hinge) else 2
+
+
+@inner
+def aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
+    """Turn the first joint so that the end lies towards the goal."""
+    limits, link_rotation, now = (
+        limits_of(chain, ROOT),
+        matrix_at(chain.links, ROOT, ROTATION),
+        angles_of(chain, angles, ROOT),
+    )
+    arm = rotate_back(rotation(limits, now), rotate_back(link_rotation, end))
+    put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(link_rotation, goal), now))
+
+
+@kernel
+def backward_pass(
+    chain: ChainArrays, positions: Float, orientations: Float, angles: Float, goal: Vector, places: Float
+) -> None:
+    """Write places (N + 1, 3) [m] of the joints when the end is on the target.
+
+    Limits between neighbours are kept.
+    """
+    last = len(chain.joints) - 1
+    place = goal
+    put_vector(places, last + 1, place)
+    wanted = minus(place, vector_at(positions, last, START))
+    behind = _pointed(chain, last, matrix_at(orientations, last, START), angles, wanted)
+    place = minus(place, rotate(behind, vector_at(chain.links, last, BONE)))
+    put_vector(places, last, place)
+    for k in range(last - 1, -1, -1):
+        wanted, now, bone = (
+            minus(place, vector_at(positions, k, START)),
+            matrix_at(orientations, k, START),
+            vector_at(chain.links, k, BONE),
+        )
+        if chain.joints[k, WORLD] or chain.joints[k + 1, WORLD]:
+            here = _pointed(chain, k, now, angles, wanted)
+        elif chain.joints[k + 1, KIND] == HINGE:
+            here = _before_hinge(chain, k, behind, angles, wanted)
+        else:
+            here = _before_rotor(chain, k, behind, angles, _rotated_towards(now, bone, wanted))
+        place = minus(place, rotate(here, bone))
+        put_vector(places, k, place)
+        behind = here
+
+
+@inner
+def _rotated_towards(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
+    """Orientation turned the shortest way so that its bone points as wanted."""
+    return product(between(rotate(orientation, bone), wanted), orientation)
+
+
+@kernel
+def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vector) -> Matrix:
+    """Orientation of link k whose bone points as wanted.
+
+    A joint with axes of the world turns it only as far as it allows.
+    """
+    bone = vector_at(chain.links, k, BONE)
+    if not chain.joints[k, WORLD]:
+        return _rotated_towards(now, bone, wanted)
+    limits, link_rotation = limits_of(chain, k), matrix_at(chain.links, k, ROTATION)
+    fitted = fit(limits, bone, rotate_back(link_rotation, wanted), angles_of(chain, angles, k))
+    return product(link_rotation, rotation(limits, fitted))
+
+
+@inner
+def _before_hinge(chain: ChainArrays, k: int, behind: Matrix, angles: Float, wanted: Vector) -> Matrix:
+    """Orientation of link k, its bone as wanted as far as the next hinge allows.
+
+    Seen from the bone `behind`, this bone turns the other way about the same axis.
+    """
+    limits, link_rotation = limits_of(chain, k + 1), matrix_at(chain.links, k + 1, ROTATION)
+    seen = rotate_back(link_rotation, vector_at(chain.links, k, BONE))
+    now = angles_of(chain, angles, k + 1)
+    angle = hinge_fit(-limits.high, -limits.low, limits.axis, seen, rotate_back(behind, wanted), -now[0])
+    return product(behind, product(rotation_about(limits.axis, angle), transposed(link_rotation)))
+
+
+@inner
+def _before_rotor(chain: ChainArrays, k: int, behind: Matrix, angles: Float, here: Matrix) -> Matrix:
+    """Orientation `here` of link k, turned so that the next rotor allows `behind`."""
+    limits, bone = limits_of(chain, k + 1), vector_at(chain.links, k + 1, BONE)
+    frame = product(here, matrix_at(chain.links, k + 1, ROTATION))
+    actual = rotate(behind, bone)
+    fitted = fit(limits, bone, rotate_back(frame, actual), angles_of(chain, angles, k + 1))
+    allowed = rotate(frame, rotate(rotation(limits, fitted), bone))
+    return product(between(allowed, actual), here)
+
+
+@inner
+def forward_pass(
+    chain: ChainArrays, places: Float, angles: Float, positions: Float, orientations: Float
+) -> None:
+    """Write the legal pose whose bones point to the places; `angles`: in, out [rad]."""
+    place = (0.0, 0.0, 0.0)
+    put_vector(positions, ROOT, place)
+    parent = matrix_at(chain.links, ROOT, ROTATION)
+    for k in range(len(chain.joints)):
+        limits, bone, frame = (
+            limits_of(chain, k),
+            vector_at(chain.links, k, BONE),
+            rest_frame(chain, k, parent),
+        )
+        if k == chain.follower:
+            follow(chain, angles)
+        else:
+            wanted = rotate_back(frame, minus(vector_at(places, k + 1, START), place))
+            put_angles(chain, angles, k, fit(limits, bone, wanted, angles_of(chain, angles, k)))
+        parent = product(frame, rotation(limits, angles_of(chain, angles, k)))
+        place = plus(place, rotate(parent, bone))
+        put_vector(positions, k + 1, place)
+        put_matrix(orientations, k, parent)
+
 
 _RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
 """How a restart shares out its bend between the front and the back of the chain."""

@@ -25,18 +25,19 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.kernels import bound, inner, kernel
-from master.estimator.cameras import CameraArrays, project
-from master.fabrik.cap_views import (
+from master.estimator.epoch import MarkerPositions, SolvedHand
+from master.estimator.sensors import CameraArrays, project
+from master.fabrik.caps import (
     ANY,
+    CAPS,
     TILTED,
+    CapTables,
     Views,
     any_direction,
     appearance,
     hidden_part,
     tilted,
 )
-from master.fabrik.caps import CAPS, CapTables
-from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.intersection import (
     RAYS,
     Rays,

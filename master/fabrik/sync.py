@@ -1,4 +1,27 @@
-"""Synchronisation of the cameras.
+"""Frames of all cameras are brought to one epoch.
+
+Propagation of the markers of every camera to one epoch.
+
+They are carried from the frames around the epoch to the epoch.
+
+A hand's way is known by what hands can do: about the epoch it is a Taylor series whose speed, acceleration, jerk and
+snap are random, with the sizes of real hands. Given up to four frames with their noise, the best linear estimate of the
+place and its variance follow (Gaussian process regression with an unknown constant: Rasmussen, Williams 2006, 2.7;
+"universal kriging"):
+
+    S_ij = V^2 tt + A^2 (tt^2 / 2!^2 + w^2 tt^3 / 3!^2 + w^4 tt^4 / 4!^2) + sigma_i^2 [i = j],    tt = t_i t_j
+    x = 1' S^-1 y / c,    var = 1 / c,    c = 1' S^-1 1                     (t: times from the epoch)
+
+Without noise this is the polynomial through the frames; a hand at rest is averaged, and a step into the future does
+not amplify its noise. How hard the hand moves (A) is not known, so every degree of vigour is tried, from a hand laid
+down to a brisk wave; each counts by its marginal likelihood, and where they disagree the variance grows. An error of
+the time adds in proportion to the marker's speed in the image.
+
+Where a slave named two places of a colour, a marker and its *alternative*, they may be swapped from one frame to the
+next, and a line from one thing to another is nowhere. The places of such a marker are first sorted into two tracks by
+nearness in the image. Which of the two is the marker is decided with the other cameras (`master.fabrik.intersection`).
+
+Synchronisation of the cameras.
 
 It determines which frames belong together, and the markers at one epoch.
 
@@ -12,20 +35,321 @@ is the newest capture time seen: no clock is read here, so a replay synchronises
 that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and dropped.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier than the back
-of the hand. `master.fabrik.propagate` carries each to the epoch; a sideways error Dt v would turn into a depth error
+of the hand. `master.fabrik.sync` carries each to the epoch; a sideways error Dt v would turn into a depth error
 D v Dt / B, the largest of an unsynchronised rig.
 """
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal
+from math import exp, hypot, inf, isfinite, isnan, log, nan, sqrt
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.geometry.camera_model import CameraModel
+from common.kernels import inner, kernel
 from common.messages import MarkerDetections
-from master.fabrik.propagate import SETTINGS, TrackHistory, propagate
+
+
+class PropagationSettings(NamedTuple):
+    """Numbers of the propagation of markers to one epoch."""
+
+    history: int = 8
+    observations: int = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
+    never: int = -(2**63)
+    # what is farther away a frame later is another thing
+    leap_m_s: float = 5.0
+    leap_px: float = 5.0
+    # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to
+    # frame, and no mean removes it. New in each is at most this part of the variance that the slave states, and
+    # this much.
+    independent_share: float = 0.7
+    independent_px: float = 0.1
+    # An error in time lies along the motion. One number for both axes cannot hold it: all of it covers too much
+    # (98-99 %), half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %);
+    # this 93-97 %.
+    along: float = 0.75
+
+
+SETTINGS = PropagationSettings()
+# What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
+_SPEED_M_S = (0.01, 1.0, 1.0)
+_ACCELERATION_M_S2 = (0.3, 1.5, 15.0)
+
+
+Reach = tuple[int, int, int, int]
+
+
+class TrackHistory(NamedTuple):
+    """The last frames of C cameras; frame k is in slot k modulo HISTORY.
+
+    Attributes:
+        total: (C,) frames of each camera so far.
+        times_ns: (C, HISTORY, 3) when the centre row and row 0 were exposed, when the frame was handed to its slave.
+        t_sigma_ns: (C, HISTORY) standard deviation of the times, one error for all frames of a camera.
+        marks: (C, HISTORY, 6, M) u, v, u and v of the alternative, sigma [px], area [px^2]; NaN: not seen.
+        row_time_ns: (C,) from one row to the next.
+        scale_px_m: (C,) pixels that a metre across the line of sight takes where hands are.
+    """
+
+    total: Int
+    times_ns: Int
+    t_sigma_ns: Float
+    marks: Float
+    row_time_ns: Float
+    scale_px_m: Float
+
+
+@kernel
+def propagate(
+    history: TrackHistory, t_ns: int, reach_ns: Reach, uv: Float, sigma: Float, area: Float, missing: Bool
+) -> tuple[int, bool]:
+    """Write the markers and their alternatives in C cameras at an epoch.
+
+    What the nearest frame does not show is not seen.
+
+    Args:
+        recent: Of each camera.
+        t_ns: The epoch.
+        reach_ns: How far away each of the frames that are used may be, the nearest first; negative: not used.
+        uv: (2, C, M, 2) [px], markers and alternatives, written; NaN: not seen.
+        sigma: (2, C, M) [px] per axis, time error included, written.
+        area: (C, M) [px^2] of the nearest frame, written.
+        missing: (C,) written: the camera has no frame there.
+
+    Returns:
+        When the last frame that was used was handed to its slave [ns] (none: the epoch), and whether there are
+        alternatives.
+    """
+    used, track = np.empty(SETTINGS.observations, np.int64), np.empty((SETTINGS.observations, 2, 4))
+    known, L, z = (
+        np.empty((SETTINGS.observations, 5)),
+        np.empty((SETTINGS.observations, SETTINGS.observations)),
+        np.empty((SETTINGS.observations, 4)),
+    )
+    fit, mixed = np.empty(6 + SETTINGS.observations), np.empty(6 + SETTINGS.observations)
+    ready_ns, alternatives = SETTINGS.never, False
+    for c in range(len(history.total)):
+        n = _around(history, c, t_ns, reach_ns, used)
+        missing[c] = n == 0
+        for k in range(n):
+            ready_ns = max(ready_ns, history.times_ns[c, used[k], 2])
+        scale, t_sigma_s = history.scale_px_m[c], 1e-9 * history.t_sigma_ns[c, used[0]] if n > 0 else 0.0
+        for m in range(area.shape[1]):
+            area[c, m] = history.marks[c, used[0], 5, m] if n > 0 else nan
+            alternative = _read(history, c, m, t_ns, used, n, track)
+            alternatives |= alternative
+            if alternative:
+                _sort(track, n, SETTINGS.leap_m_s * scale)
+            for i in range(2):
+                uv[i, c, m, 0] = uv[i, c, m, 1] = sigma[i, c, m] = nan
+                count = _select(track, n, i, scale, known) if alternative or i == 0 else 0
+                if count > 0:
+                    gain = _mix(known, count, scale, L, z, fit, mixed)
+                    uv[i, c, m, 0], uv[i, c, m, 1] = track[0, i, 0] + mixed[1], track[0, i, 1] + mixed[2]
+                    # Where independent noise would be amplified, so is that which is not new in each frame.
+                    vary = mixed[3] + (_variance(track[0, i, 3]) - known[0, 4]) * max(gain, 1.0)
+                    moved = t_sigma_s * t_sigma_s * (mixed[4] * mixed[4] + mixed[5] * mixed[5])
+                    sigma[i, c, m] = sqrt(vary + SETTINGS.along * moved)
+    return t_ns if ready_ns == SETTINGS.never else ready_ns, alternatives
+
+
+@inner
+def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int) -> int:
+    """Write the slots of the frames around an epoch, nearest first.
+
+    Returns how many. None at all where even the nearest is too far: a track carried over two frames into the unknown
+    is off by decimetres in depth, and the ray of a camera that does see is worth more. Of the frames after the epoch
+    the first alone counts (two where there is none before), as if the others had not yet come: what comes out does not
+    depend on how far a camera's messages ran ahead of another's.
+    """
+    newest, oldest = history.total[c], max(history.total[c] - SETTINGS.history, 0)
+    after = newest
+    while after > oldest and history.times_ns[c, (after - 1) % SETTINGS.history, 0] >= t_ns:
+        after -= 1
+    before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
+    while n < SETTINGS.observations and (before >= oldest or after < end):
+        far_ns = 2**62
+        back_ns = t_ns - history.times_ns[c, before % SETTINGS.history, 0] if before >= oldest else far_ns
+        ahead_ns = history.times_ns[c, after % SETTINGS.history, 0] - t_ns if after < end else far_ns
+        if min(back_ns, ahead_ns) > reach_ns[n]:
+            break
+        if back_ns <= ahead_ns:
+            used[n] = before % SETTINGS.history
+            before -= 1
+        else:
+            used[n] = after % SETTINGS.history
+            after += 1
+        n += 1
+    return n
+
+
+@inner
+def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, track: Float) -> bool:
+    """Write the tracks of a marker and its alternative.
+
+    Returns whether the marker has an alternative.
+
+    `track`: (OBSERVATIONS, 2, 4) u, v [px], time of the row from the epoch [s], sigma [px].
+    """
+    alternative = False
+    for k in range(n):
+        slot = used[k]
+        for i in range(2):
+            v = history.marks[c, slot, 2 * i + 1, m]
+            track[k, i, 0], track[k, i, 1] = history.marks[c, slot, 2 * i, m], v
+            track[k, i, 2] = 1e-9 * (history.times_ns[c, slot, 1] - t_ns + history.row_time_ns[c] * v)
+            track[k, i, 3] = history.marks[c, slot, 4, m]
+        alternative |= isfinite(track[k, 1, 0])
+    return alternative
+
+
+@inner
+def _sort(track: Float, n: int, leap_px_s: float) -> None:
+    """Give every place to the track that it continues; leaps are cut.
+
+    The slave's names are contradicted only where the places are so much nearer to the other track, which must exist.
+    """
+    for k in range(1, n):
+        straight = crossed = 0.0
+        other = False
+        for i in range(2):
+            there, across = _distance(track, k, i, i, leap_px_s), _distance(track, k, i, 1 - i, leap_px_s)
+            straight += 0.0 if isnan(there) else there
+            crossed += 0.0 if isnan(across) else across
+            other |= not isnan(across)
+        swapped = 3.0  # times nearer to the other track: the slave's names are contradicted
+        if other and swapped * crossed < straight:
+            for j in range(4):
+                track[k, 0, j], track[k, 1, j] = track[k, 1, j], track[k, 0, j]
+        for i in range(2):
+            if _distance(track, k, i, i, leap_px_s) == inf:
+                track[k, i, 0] = track[k, i, 1] = nan
+
+
+@inner
+def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> float:
+    """Distance [px] of place `which` of frame k from track i before it.
+
+    From its place nearest in time; infinite: that is a leap; NaN: there are no two places.
+    """
+    nearest, away_s = -1, inf
+    for j in range(k):
+        if isfinite(track[j, i, 0]) and abs(track[j, i, 2] - track[k, which, 2]) < away_s:
+            nearest, away_s = j, abs(track[j, i, 2] - track[k, which, 2])
+    if nearest < 0:  # also where the place itself is NaN
+        return nan
+    distance = hypot(track[nearest, i, 0] - track[k, which, 0], track[nearest, i, 1] - track[k, which, 1])
+    return distance if distance <= SETTINGS.leap_px + leap_px_s * away_s else inf
+
+
+@inner
+def _variance(sigma_px: float) -> float:
+    least_sigma_px = 0.01
+    return max(sigma_px, least_sigma_px) ** 2
+
+
+@inner
+def _select(track: Float, n: int, i: int, scale: float, known: Float) -> int:
+    """Write the places of track i that are no leap from the nearest; return how many.
+
+    `known`: (SIGHTINGS, 5) of each 1, u, v [px] from the nearest, time [s], variance of its new noise [px^2].
+    """
+    count = 0
+    for k in range(n):
+        u, v = track[k, i, 0] - track[0, i, 0], track[k, i, 1] - track[0, i, 1]
+        leap = SETTINGS.leap_px + SETTINGS.leap_m_s * scale * abs(track[k, i, 2] - track[0, i, 2])
+        if u * u + v * v <= leap * leap:  # false for NaN
+            known[count, 0], known[count, 1], known[count, 2], known[count, 3] = 1.0, u, v, track[k, i, 2]
+            known[count, 4] = min(
+                SETTINGS.independent_share * _variance(track[k, i, 3]),
+                SETTINGS.independent_px * SETTINGS.independent_px,
+            )
+            count += 1
+    return count
+
+
+@inner
+def _mix(known: Float, n: int, scale: float, L: Float, z: Float, fit: Float, mixed: Float) -> float:
+    """Write the mean of all degrees of vigour by their evidence, as of `_fit`.
+
+    With the spread of their places in the variance. Returns by how much independent noise is multiplied.
+    """
+    mixed[:] = 0.0
+    best = -inf
+    for k in range(len(_SPEED_M_S)):
+        speed, acceleration = _SPEED_M_S[k] * scale, _ACCELERATION_M_S2[k] * scale
+        evidence = _fit(known, n, speed * speed, acceleration * acceleration, L, z, fit)
+        fit[3] += 0.5 * (fit[1] * fit[1] + fit[2] * fit[2])
+        keep, add = exp(min(best - evidence, 0.0)), exp(min(evidence - best, 0.0))
+        best = max(best, evidence)
+        for j in range(6 + n):
+            mixed[j] = keep * mixed[j] + add * fit[j]
+    for j in range(5 + n, -1, -1):
+        mixed[j] /= mixed[0]
+    mixed[3] -= 0.5 * (mixed[1] * mixed[1] + mixed[2] * mixed[2])
+    gain = 0.0
+    for j in range(6, 6 + n):
+        gain += mixed[j] * mixed[j]
+    return gain
+
+
+@inner
+def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z: Float, fit: Float) -> float:
+    """Fit one degree of vigour to n places; return its evidence.
+
+    That is the logarithm of the marginal likelihood.
+
+    Args:
+        known: As of `_select`.
+        n: How many.
+        speed2, acceleration2: V^2 [px^2/s^2], A^2 [px^2/s^4].
+        L, z: Scratch (SIGHTINGS, SIGHTINGS), (SIGHTINGS, 4): Cholesky factor of S with the diagonal inverted, and
+            L^-1 (1, u, v, t).
+        fit: Written: 1, u, v, their variance, speed of u and of v, weights of the places.
+    """
+    det, c, u, v = 1.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            tt = known[i, 3] * known[j, 3]
+            w2 = 18.0**2  # [1/s^2] jerk by acceleration, and snap by jerk, squared
+            w2tt = w2 * tt
+            s = tt * (speed2 + acceleration2 * tt * (1.0 / 4.0 + w2tt * (1.0 / 36.0 + w2tt / 576.0)))
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                s = max(s, 0.0) + known[i, 4]  # less is rounding
+                det *= s
+                L[i, i] = 1.0 / sqrt(s)
+            else:
+                L[i, j] = s * L[j, j]
+        for r in range(4):
+            s = known[i, r]
+            for k in range(i):
+                s -= L[i, k] * z[k, r]
+            z[i, r] = s * L[i, i]
+        c += z[i, 0] * z[i, 0]
+        u += z[i, 0] * z[i, 1]
+        v += z[i, 0] * z[i, 2]
+    u, v = u / c, v / c
+    fit[0], fit[1], fit[2], fit[3], fit[4], fit[5] = 1.0, u, v, 1.0 / c, 0.0, 0.0
+    residual2 = 0.0
+    for i in range(n):
+        off_u, off_v = z[i, 1] - u * z[i, 0], z[i, 2] - v * z[i, 0]
+        residual2 += off_u * off_u + off_v * off_v
+        fit[4] += speed2 * z[i, 3] * off_u
+        fit[5] += speed2 * z[i, 3] * off_v
+    for i in range(n - 1, -1, -1):
+        s = z[i, 0] / c
+        for k in range(i + 1, n):
+            s -= L[k, i] * fit[6 + k]
+        fit[6 + i] = s * L[i, i]
+    evidence = 0.5  # so they also constrain the motion less than as many independent ones
+    return -evidence * (
+        log(det * c) + 0.5 * residual2
+    )  # two axes: twice the logarithm of the determinant's root
+
 
 SILENT_FRAMES = 12
 

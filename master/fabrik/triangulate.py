@@ -26,10 +26,9 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.kernels import constant, inner, kernel
-from master.fabrik.cap_views import hidden_part, seen_shift
-from master.fabrik.caps import CAPS, CapTables
+from master.estimator.epoch import MarkerPositions, SolvedHand
+from master.fabrik.caps import CAPS, CapTables, hidden_part, seen_shift
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
-from master.fabrik.estimate import MarkerPositions, SolvedHand
 
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
 _ONE = constant(1)  # direction

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.calibration.gesture_actions import DialSettings
+from common.calibration.gesture_settings import DialSettings
 from common.geometry.transforms import quaternion_to_matrix
 from common.kernels import inner, kernel
-from master.estimator.matrices import diagonalise
-from master.fabrik.rotations import dot
+from master.fabrik.linear_algebra import diagonalise, dot
 from master.gestures.features import HandFeatures
 
 _EYE = np.eye(3)

@@ -1,22 +1,274 @@
-"""Reader of motion capture of a hand.
+"""The reader finds our joints in a motion-capture file by their names.
+
+Mapping of motion-capture names to our joints.
+
+`mixamorig:RightHandIndex1` is the right index's MCP.
+
+A name is cut into words at separators, digits and capitals. One word names the finger, one the joint: MCP, PIP and DIP,
+or the bone that begins there, as in WebXR. Where joints of a finger are numbered, their number determines which is
+which: 1 2 3 (and 4, or an end) are MCP, PIP, DIP (and tip), 0 1 2 3 begin with the metacarpal; of a thumb 1 2 3 are
+CMC, MCP, IP; `RightInHandIndex` is a metacarpal. A thumb whose joints are called like a finger's (proximal,
+intermediate, distal) begins at its CMC.
+
+Reader of motion capture of a hand.
 
 The format is found by the file's name, joints by their names, length by unit or hand size.
 """
 
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from common.arrays import Float
-from common.calibration.json_file import read_json
+from common.calibration.files import read_json
 from common.errors import RecordingError
+from common.hand.model import FINGER_JOINTS, JOINTS
 from master.mocap.bvh_file import read_bvh
 from master.mocap.c3d_file import read_c3d
 from master.mocap.csv_file import read_csv
-from master.mocap.joint_motion import METRES, POINTS, JointMotion, PointTable, Side, Unit, checked_times
-from master.mocap.joint_names import choose_names, shown
-from master.mocap.track import known
+from master.mocap.joint_motion import (
+    METRES,
+    POINTS,
+    JointMotion,
+    PointTable,
+    Side,
+    Unit,
+    checked_times,
+    known,
+)
+
+_WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_SIDES: dict[str, Side] = {"left": "left", "l": "left", "right": "right", "r": "right"}
+_FINGERS = {"thumb": 0, "index": 1, "middle": 2, "mid": 2, "ring": 3, "little": 4, "pinky": 4, "pinkie": 4}
+_ORDINALS = {"first": 0, "second": 1, "third": 2, "fourth": 3, "fifth": 4}
+_BASE, _MCP, _PIP, _DIP, _TIP = range(5)
+_PARTS = {
+    **dict.fromkeys(("metacarpal", "cmc", "mc", "carpal", "trapezium"), _BASE),
+    **dict.fromkeys(("mcp", "knuckle", "proximal", "pp"), _MCP),
+    **dict.fromkeys(("pip", "intermediate", "medial", "mp"), _PIP),
+    **dict.fromkeys(("dip", "ip", "distal", "dp"), _DIP),
+    **dict.fromkeys(("tip", "end", "nub"), _TIP),
+}
+_MARKER_NAMES = ("thumb", "index", "middle", "ring", "little")
+_SHOWN = 80  # names of an error message
+
+Key = tuple[Side | None, str]
+
+
+@dataclass(slots=True)
+class _Finger:
+    """What was found of one finger: joints by word, joints by number."""
+
+    worded: dict[int, list[str]] = field(default_factory=dict[int, list[str]])
+    numbered: dict[int, list[str]] = field(default_factory=dict[int, list[str]])
+
+
+def match_names(
+    names: Iterable[str], ends: frozenset[str] = frozenset()
+) -> dict[Side | None, dict[str, list[str]]]:
+    """Side -> point of ours -> the names that mean it.
+
+    Args:
+        names: Of the file.
+        ends: Those that are end sites: a tip, where the finger has no joint there.
+    """
+    found: dict[Side | None, dict[str, list[str]]] = {}
+    fingers: dict[tuple[Side | None, int], _Finger] = {}
+    for name in names:
+        words = [part for word in _WORD.findall(name.rsplit(":", 1)[-1]) for part in _split(word.lower())]
+        side: Side | None = next((_SIDES[word] for word in words if word in _SIDES), None)
+        rest = [word for word in words if word not in _SIDES]
+        finger = _finger_of(rest)
+        if finger is None:
+            if name not in ends and (point := _point_of(rest)):
+                found.setdefault(side, {}).setdefault(point, []).append(name)
+            continue
+        one = fingers.setdefault((side, finger), _Finger())
+        part = next((_PARTS[word] for word in rest if word in _PARTS), _BASE if "in" in rest else None)
+        if name in ends and part is not None:
+            part = _TIP  # it is called after the joint before it
+        number = next((int(word) for word in rest if word.isdigit()), None)
+        if part is not None:
+            one.worded.setdefault(part, []).append(name)
+        elif number is not None:
+            one.numbered.setdefault(number, []).append(name)
+        elif rest == [_MARKER_NAMES[finger]]:
+            found.setdefault(side, {}).setdefault(rest[0], []).append(name)
+    for (side, finger), one in fingers.items():
+        for part, meant in _parts(one, finger == 0, ends).items():
+            joint = _joint(finger, part)
+            if joint is not None:
+                found.setdefault(side, {}).setdefault(joint, []).extend(meant)
+    for points in found.values():
+        _prefer_wrist(points)
+    unsided = found.get(None, {})
+    if any(_is_finger(point) for point in unsided):
+        # The fingers name no side, so `hand_left` and `back_right` are markers to the left and right of something.
+        return {side: points for side, points in found.items() if any(map(_is_finger, points))}
+    return found
+
+
+def _split(word: str) -> list[str]:
+    """The words of one without capitals: `righthandindex`, `rthumb`."""
+    for ahead in ("left", "right", "hand", "l", "r"):
+        rest = word.removeprefix(ahead)
+        if rest != word and (rest in _FINGERS or rest in ("hand", "wrist", "palm") or len(_split(rest)) > 1):
+            return [ahead, *_split(rest)]
+    return [word]
+
+
+def _is_finger(point: str) -> bool:
+    return point not in ("wrist", "palm", "back", "back2", "back3")
+
+
+def _finger_of(words: list[str]) -> int | None:
+    """The finger that words name, thumb 0 ... little 4."""
+    named = {_FINGERS[word] for word in words if word in _FINGERS}
+    if len(named) == 1:
+        return named.pop()
+    if named:
+        return None  # two fingers: a marker between them
+    counted = {_ORDINALS[word] for word in words if word in _ORDINALS}
+    if len(counted) == 1 and any(word in _PARTS for word in words):
+        return counted.pop()
+    if "finger" in words[:-2] and (number := words[words.index("finger") + 1]) in "12345":
+        return int(number) - 1 if any(word in _PARTS for word in words) else None
+    return None
+
+
+def _point_of(words: list[str]) -> str | None:
+    """Return the point of the wrist, palm or back of the hand that the words name.
+
+    `hand` alone is the joint at which a hand begins.
+    """
+    if "wrist" in words and "forearm" not in words:
+        return "wrist"
+    plain = [word for word in words if word not in ("of", "the", "marker")]
+    if plain == ["hand"]:
+        return "hand"
+    core = [word for word in plain if word != "hand"]
+    if "palm" in words:
+        return "palm"
+    if core[:1] == ["back"] and core[1:] in ([], ["2"], ["3"]):
+        return "".join(core)
+    return None
+
+
+def _prefer_wrist(points: dict[str, list[str]]) -> None:
+    """A hand's own joint is its wrist, where none is called so."""
+    hand = points.pop("hand", None)
+    if hand is not None and "wrist" not in points:
+        points["wrist"] = hand
+
+
+def _parts(one: _Finger, thumb: bool, ends: frozenset[str]) -> dict[int, list[str]]:
+    """Joint of a finger -> the names that mean it."""
+    out = {part: list(names) for part, names in one.worded.items()}
+    counted = 3  # joints of a finger: fewer numbers do not determine which
+    numbers = sorted(one.numbered) if len(one.numbered) >= counted else []
+    if joints := [name for name in out.get(_TIP, []) if name not in ends]:
+        out[_TIP] = joints  # a tip of its own goes before what lies beyond it
+    tips = out.get(_TIP, [])
+    counted_tip = (len(numbers) == 4 and numbers[0] == 1) or len(numbers) == 5
+    if tips and counted_tip and set(tips) <= ends:
+        del out[_TIP]
+    elif thumb and len(numbers) == 4 and not tips:
+        counted_tip = True
+    last = _TIP if counted_tip and _TIP not in out else _DIP
+    for step, number in enumerate(reversed(numbers)):
+        part = last - step
+        if part > _BASE or (part == _BASE and not thumb):
+            out.setdefault(part, []).extend(one.numbered[number])
+    if thumb and numbers:
+        # Counted from the end as a finger's, a thumb's MCP is a CMC: it has one joint less.
+        out = {_of_thumb(part): names for part, names in out.items()}
+    elif thumb and _PIP in out and _BASE not in out:
+        out = {_of_thumb(part): names for part, names in out.items()}
+    return out
+
+
+def _of_thumb(part: int) -> int:
+    return {_MCP: _BASE, _PIP: _MCP}.get(part, part)
+
+
+def _joint(finger: int, part: int) -> str | None:
+    """The name of a joint of ours; None: a thumb has no PIP."""
+    chain = FINGER_JOINTS[finger]
+    if finger:
+        return JOINTS[chain[part]]
+    at = {_BASE: 0, _MCP: 1, _DIP: 2, _TIP: 3}.get(part)
+    return None if at is None else JOINTS[chain[at]]
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedNames:
+    """The points of one hand.
+
+    Attributes:
+        side: That the names state, or that was asked for; None: neither.
+        names: Point of ours -> name in the file.
+    """
+
+    side: Side | None
+    names: Mapping[str, str]
+
+
+def choose_names(
+    names: tuple[str, ...],
+    ends: frozenset[str],
+    where: str,
+    given: Mapping[str, str | None],
+    side: Side | None,
+) -> MatchedNames:
+    """Which name of a file is which point of one hand.
+
+    Args:
+        names: Of the file.
+        ends: Those that are end sites.
+        where: The file, for errors.
+        given: Point of ours -> name that a person gives it; None: it has none.
+        side: That is wanted; None: that which is there.
+
+    Raises:
+        RecordingError: A name that is given is not there, two names mean one point, or both hands are there.
+    """
+    for point, name in given.items():
+        if point not in POINTS:
+            raise RecordingError(f"{where}: --joints: {point!r} is no joint of ours: {', '.join(POINTS)}")
+        if name is not None and name not in names:
+            raise RecordingError(f"{where}: --joints: {point}: it has no {name!r}, but {shown(names)}")
+    taken = {name for name in given.values() if name is not None}
+    found = match_names((name for name in names if name not in taken), ends)
+    sided: list[Side] = [one for one in found if one is not None]
+    if side is None and len(sided) > 1:
+        raise RecordingError(f"{where}: has both hands: say which with --side left or --side right")
+    own = side or (sided[0] if sided else None)
+    merged: dict[str, list[str]] = {}
+    for group in dict.fromkeys((own, None)):
+        for point, meant in found.get(group, {}).items():
+            merged.setdefault(point, []).extend(meant)
+    out = {point: name for point, name in given.items() if name is not None}
+    for point, meant in merged.items():
+        if point in given:
+            continue
+        if len(meant) > 1:
+            raise RecordingError(
+                f"{where}: {' and '.join(meant)} both mean {point}: say which with --joints,"
+                f' a JSON file such as {{"{point}": "{meant[-1]}"}}'
+            )
+        out[point] = meant[0]
+    return MatchedNames(own, {point: out[point] for point in POINTS if point in out})
+
+
+def shown(names: Iterable[str]) -> str:
+    """Names in one line, the first of them where there are many."""
+    listed = list(names)
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return (", ".join(listed[:_SHOWN]) or "nothing") + more
+
 
 _PALM_M = (0.05, 0.125)
 """From the wrist to the middle knuckle: 0.44 to 0.5 of a hand's length (Buchholz et al., 1992), children included."""

@@ -1,18 +1,186 @@
-"""Timing report of a running master.
+"""Clock monitor reports the residual time offset between the cameras.
+
+Residual time offset between cameras.
+
+It is measured from the tracks themselves while they run.
+
+A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by exposure and
+transfer, 8 to 10 ms; nothing that travels with the frame shows it. The tracks do (`master.monitor.timing_fit`).
+
+`ResidualTiming` takes every message and compares a second at once, some frames later, one step of the work with each
+message: most cost no more than being kept, a few in a second a fraction of a millisecond. What it finds is corrected
+nowhere by itself: it is reported, and `phalanx calibrate time` writes it into the rig.
+
+Timing report of a running master.
 
 It covers the clocks of the slaves, the phases of the cameras and wrong time stamps.
 
 Metrics for `Health`, and lines for a person. Nothing here corrects anything.
 """
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import numpy as np
+
+from common.arrays import Float
+from common.geometry.camera_model import CameraModel
 from common.link.clock_offset import ClockEstimate
 from common.messages import Detections, MarkerDetections, restamped
-from master.monitor.phases import CameraPhases
-from master.monitor.timing import ResidualTiming
-from master.monitor.timing_fit import TimeOffset
+from master.monitor.rates import CameraPhases
+from master.monitor.timing_fit import TENTHS, CameraPair, TimeOffset, Track, fit_offset, unit_sums
 from master.rig.setup import RigSetup
+
+BLOCK_NS = 1_000_000_000
+KEPT_BLOCKS = 32
+_DONE = object()
+
+
+class ResidualTiming:
+    """Estimator of the residual time offset between cameras.
+
+    Push machine. Holds the last second of every camera's frames, and the sums of the newest 60 moving blocks.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, CameraModel],
+        frame_rate_hz: Mapping[str, float],
+        *,
+        kept_blocks: int = KEPT_BLOCKS,
+        # a hand moves below 10 Hz: more frames add no information
+        rate_hz: float = 30.0,
+    ) -> None:
+        """Take the cameras in the rig's order; the first one is the reference.
+
+        Args:
+            cameras: Camera name -> model.
+            frame_rate_hz: Camera name -> nominal rate.
+            kept_blocks: How many seconds of motion count.
+            rate_hz: About how many frames of a second are compared at most.
+        """
+        self._models = tuple(cameras.values())
+        self._index = {name: c for c, name in enumerate(cameras)}
+        self._pairs = tuple(CameraPair.of(self._models[0], model) for model in self._models)
+        rates = [frame_rate_hz[name] for name in cameras]
+        gap_periods = 2.5
+        self._gap_s = tuple(gap_periods / min(rate, rates[0]) for rate in rates)
+        self._stride = max(1, round(rates[0] / rate_hz))
+        margin_frames = 4  # the cubic reaches two frames out, and the slowest camera may be one late
+        self._margin_ns = int(margin_frames * 1e9 / min(rates))
+        window_s = (BLOCK_NS + 2 * self._margin_ns) * 1e-9
+        spare = 2  # times as many frames are kept as a block needs
+        self._frames = tuple(
+            deque[MarkerDetections](maxlen=int(spare * rate * window_s) + len(rates)) for rate in rates
+        )
+        self._blocks = tuple(deque[Float](maxlen=kept_blocks) for _ in rates)
+        self._work: deque[Iterator[None]] = deque(maxlen=len(rates))  # comparisons, one for each camera
+        self._block_ns: int | None = None
+        self._reference: tuple[int, Track] | None = None
+
+    def push(self, message: MarkerDetections) -> None:
+        """Take one camera's detections, on the master's clock.
+
+        Those of other cameras are passed over.
+        """
+        c = self._index.get(message.camera)
+        if c is None:
+            return
+        frames = self._frames[c]
+        if frames and (
+            message.session != frames[-1].session
+            or len(message.area) != len(frames[-1].area)
+            or message.t_ns < frames[-1].t_ns - BLOCK_NS  # its clock was known wrongly before
+        ):
+            self._forget(c)
+        if frames and message.t_ns <= frames[-1].t_ns:
+            return
+        frames.append(message)
+        if c == 0:
+            self._begin(message.t_ns)
+        if self._work and next(self._work[0], _DONE) is _DONE:
+            self._work.popleft()
+
+    def flush(self) -> None:
+        """At the end of a recording: compare what is left."""
+        self._finish()
+        while self._block_ns is not None and self._frames[0] and self._block_ns < self._frames[0][-1].t_ns:
+            self._work.extend(self._compare(c, self._block_ns) for c in range(1, len(self._models)))
+            self._block_ns += BLOCK_NS
+            self._finish()
+
+    def _finish(self) -> None:
+        while self._work:
+            for _ in self._work.popleft():
+                pass
+
+    def offset_of(self, camera: str) -> TimeOffset | None:
+        """Return the time offset of a camera from the last half minute of motion.
+
+        None: not enough, or the reference itself.
+        """
+        c = self._index[camera]
+        blocks = self._blocks[c].copy()
+        return fit_offset(np.stack(blocks)) if c and blocks else None
+
+    def _forget(self, c: int) -> None:
+        """A camera's process began anew: its stamps may lie differently."""
+        self._frames[c].clear()
+        for other in range(len(self._models)) if c == 0 else (c,):
+            self._blocks[other].clear()
+        if c == 0:
+            self._work.clear()
+            self._block_ns = self._reference = None
+
+    def _begin(self, t_ns: int) -> None:
+        """Begin to compare the block that is complete with this frame of the reference."""
+        if self._block_ns is None:
+            self._block_ns = t_ns
+        if t_ns - self._block_ns < BLOCK_NS + self._margin_ns:
+            return
+        self._work.extend(self._compare(c, self._block_ns) for c in range(1, len(self._models)))
+        self._block_ns += BLOCK_NS
+        if t_ns - self._block_ns > BLOCK_NS + self._margin_ns:  # after a pause
+            self._block_ns = t_ns
+
+    def _compare(self, c: int, begin_ns: int) -> Iterator[None]:
+        """Compare a block, in steps that each take a fraction of a millisecond."""
+        if self._reference is None or self._reference[0] != begin_ns:
+            self._reference = (begin_ns, self._track(0, begin_ns))
+            yield
+        reference, other = self._reference[1], self._track(c, begin_ns)
+        yield
+        if len(reference.t_s) < 3 or len(other.t_s) < 4:
+            return
+        part = reference.t_s[1:-1].mean(axis=1) * (1e9 * TENTHS / BLOCK_NS)
+        rows = np.flatnonzero((part >= 0.0) & (part < TENTHS))[:: self._stride]
+        if not len(rows):
+            return
+        evidence = self._pairs[c].evidence(reference, other, rows + 1, self._gap_s[c])
+        yield
+        sums = unit_sums(evidence, reference.t_s.shape[1], part[rows].astype(np.int64))
+        known = (np.maximum(sums[..., 1].sum(axis=0), 0.0) / sums[0, :, -1]).sum()
+        useless_s = 5e-3  # a block that could at best resolve this much is uninformative
+        if known > useless_s**-2:
+            self._blocks[c].append(sums)
+
+    def _track(self, c: int, begin_ns: int) -> Track:
+        """Return the frames of a camera about a block.
+
+        Times [s] are since the block's begin. A marker with an alternative counts as not seen.
+        """
+        model, margin = self._models[c], self._margin_ns
+        low, high = begin_ns - margin, begin_ns + BLOCK_NS + margin
+        frames = [frame for frame in self._frames[c] if low <= frame.t_ns < high]
+        if not frames:
+            return Track(np.empty((0, 0)), np.empty((0, 0, 2)))
+        uv = np.array([frame.uv for frame in frames])
+        for k, frame in enumerate(frames):
+            if frame.has_alternatives:
+                uv[k, np.isfinite(frame.alt_uv[:, 0])] = np.nan
+        rows = np.where(np.isnan(uv[..., 1]), 0.5 * (model.height_px - 1), uv[..., 1])
+        t_s = np.array([(frame.t_ns - begin_ns) * 1e-9 for frame in frames])[:, None]
+        return Track(t_s + 1e-9 * model.row_time_ns * rows, model.undistort(uv))
 
 
 class _Machines:

@@ -1,26 +1,77 @@
-"""Status of a live master.
+"""Reporter publishes the status of a live master.
+
+Live check of the camera extrinsics while the master runs.
+
+It reports a camera whose rays miss those of the others: the camera was knocked, or is not the one of its file.
+
+Status of a live master.
 
 It has the master's health on the bus, answers to requests there, and a line for each change.
+
+Notify the service manager that the live loop goes round.
+
+A loop that hangs is ended by the watchdog, and started again.
+
+The loop itself gives the sign, when it asks for the next message, never a thread that would live on while it hangs.
 """
 
 import secrets
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Generic
 
 from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock
 from common.errors import BusError
 from common.messages import Command, Health
 from common.messages.streams import MASTER
+from common.supervisor import ServiceManager
 from master.monitor.clocks import ClockMonitor
-from master.monitor.extrinsics import ExtrinsicsMonitor
 from master.recording.probe import Probe
-from master.run.admission import limits_of
-from master.run.app import RunFigures, health
+from master.run.app import AuxiliaryMessage, RunFigures, SeenT, Source, health
 from master.run.dispatcher import Dispatcher
 from master.run.ingest import Ingest
-from master.run.rejected_peers import MarkerCounts
+from master.run.link_senders import MarkerCounts, limits_of
 from master.run.tuning import LivePipeline, RigTuning
+
+
+class ExtrinsicsMonitor:
+    """Monitor of cameras whose rays are rejected.
+
+    Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was rejected.
+    """
+
+    def __init__(self, cameras: tuple[str, ...]) -> None:
+        """Watch the cameras of a rig."""
+        self._rejected = dict.fromkeys(cameras, 0)
+        self._looks = dict.fromkeys(cameras, 0)
+        self._poses = 0
+
+    def look(self, counts: Mapping[str, int]) -> list[str]:
+        """Return a line for each camera that has been rejected for a while.
+
+        Called once a second. The camera was rejected from most poses; it is reported once, until the condition ends.
+
+        Args:
+            counts: Of the pipeline since its start.
+        """
+        lines: list[str] = []
+        poses = counts.get("poses", 0) - self._poses
+        self._poses += poses
+        for name, before in self._rejected.items():
+            # characters of a name in `Health`
+            now = counts.get(f"mostly_rejected.{name}"[:64], 0)
+            mostly = poses > 0 and now - before > 0.5 * poses
+            self._rejected[name] = now
+            self._looks[name] = self._looks[name] + 1 if mostly else 0
+            looks = 5  # in a row, once a second: somebody who reaches before a camera is no knock
+            if self._looks[name] == looks:
+                lines.append(
+                    f"camera {name}: its rays miss those of the others and are left out: it was knocked, or it is not"
+                    " the camera of its file: calibrate it anew, `phalanx calibrate cameras stereo --help`"
+                )
+        return lines
 
 
 class Reporter:
@@ -178,3 +229,36 @@ def unplaced_line(name: str, tracker: str) -> str:
         f"object {name}: its tracker {tracker} is not registered to the rig, its poses are not used:"
         f" `phalanx calibrate tracker {name}`"
     )
+
+
+class MonitoredLoop(Generic[SeenT]):
+    """A source of messages that shows the manager each time it is asked.
+
+    Holds when the next sign is due.
+    """
+
+    def __init__(
+        self,
+        source: Source[SeenT],
+        manager: ServiceManager,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Report that the loop is ready: it begins now.
+
+        Args:
+            source: Where messages come from.
+            manager: Who started this process.
+            now_ns: The time [ns].
+        """
+        self._source, self._manager, self._now_ns = source, manager, now_ns
+        notifies = 4  # in a period of the watchdog
+        self._every_ns = manager.watchdog_us * 1000 // notifies
+        self._due_ns = now_ns() + self._every_ns
+        manager.send("READY=1\nSTATUS=tracks", wait=True)
+
+    def get(self, timeout_s: float) -> SeenT | AuxiliaryMessage | None:
+        """The next message, or None when none came in time."""
+        if self._every_ns and (now_ns := self._now_ns()) >= self._due_ns:
+            self._manager.send("WATCHDOG=1")
+            self._due_ns = now_ns + self._every_ns
+        return self._source.get(timeout_s)

@@ -1,4 +1,27 @@
-"""From evidence to the offset between two cameras, and how well it is known.
+"""Fit finds the time offset of two cameras from the evidence of their tracks.
+
+Time-offset evidence from the tracks of one pair of cameras.
+
+A frame of the second camera that was really taken `d` later than its stamp shows every marker where it was `d`
+later: x(t) = x_true(t) + d v, with v its velocity in that image. Two things that are constant in truth then change in
+step with the velocity:
+
+- **the epipolar residual** of each marker, which should be what lens and mount make it: e = e0 + d (n . v), with n the
+  normal of the epipolar line. It sees motion across the baseline.
+- **the distance between two markers**, which should stay what the hand makes it. Along the baseline a wrong time is a
+  wrong depth D v d / B, which no epipolar line contradicts; but a hand that is taken for 10 % farther away is taken for
+  10 % larger, too:  l = l0 + d (dl/dx . v), in first order. A hand that really circles changes its depth and keeps its
+  size, and one that turns keeps it as well: rigid motion of any kind leaves all distances alone, so no assumption
+  about the hand's path is made.
+
+Fingers do change distances, but not in step with the velocity of the hand; what that leaves is for the statistics
+(`master.monitor.timing_fit`).
+
+Velocity is measured and noisy, from the same frames as the position. So each equation also gets an *instrument*
+(Durbin, "Errors in variables", 1954): the velocity that the first camera saw, from frames other than the one compared.
+It knows the motion and shares no noise with either side, so noise neither imitates an offset nor hides one.
+
+From evidence to the offset between two cameras, and how well it is known.
 
 Time is cut into blocks, and each item of each block (a *unit*: one marker's residual, or one distance, for a
 second) keeps its own constant: its sums are taken about its own means, so whatever changes slowly, lens errors across
@@ -20,14 +43,195 @@ imitate where depth changes in step with velocity.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from math import hypot, sqrt
 
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from common.arrays import Bool, Float, Int
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import cross, invert
 from master.fabrik.intersection import RAYS
-from master.monitor.timing_evidence import Evidence
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Frames of one camera.
+
+    Attributes:
+        t_s: When each marker's row was exposed (T, M) [s], by the stamps.
+        xy: Normalised image points (T, M, 2), undistorted; NaN: not seen.
+    """
+
+    t_s: Float
+    xy: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Equations `value = constant + offset * rate` (T, I).
+
+    There is one constant per item; NaN: nothing seen.
+
+    Items are the M epipolar residuals [px], then distances between markers [m].
+
+    Attributes:
+        value: What should be constant.
+        rate: How it changes with the offset [per s].
+        instrument: The rate as the first camera predicts it.
+        doubt: What a pixel of wrong calibration along the epipolar line would make of `value`.
+        place: Where the marker was in the first camera's image, of a distance the middle of the two, (T, I, 2).
+    """
+
+    value: Float
+    rate: Float
+    instrument: Float
+    pixel_effect: Float
+    place: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPair:
+    """A reference camera and another one.
+
+    Attributes:
+        rotation, translation: From the reference camera's frame to the other's (3, 3), (3,) [m].
+        focal_px: Of the other camera.
+    """
+
+    rotation: Float
+    translation: Float
+    focal_px: float
+
+    @classmethod
+    def of(cls, reference: CameraModel, other: CameraModel) -> "CameraPair":
+        """Geometry of two placed cameras."""
+        T = invert(other.T_rig_camera) @ reference.T_rig_camera
+        return cls(T[:3, :3], T[:3, 3], float(other.matrix[0, 0]))
+
+    def evidence(self, reference: Track, other: Track, rows: Int, gap_s: float) -> Evidence:
+        """Compare the frames `rows` (K,) of the reference with the other's track.
+
+        Both are in the order of time.
+
+        Args:
+            reference: Has a frame before and after each of `rows`.
+            other: Frames around them.
+            rows: Which frames of the reference.
+            gap_s: Longest time between neighbouring frames that still are one track.
+        """
+        later, sooner = rows + 1, rows - 1
+        span = (reference.t_s[later] - reference.t_s[sooner])[..., None]
+        known = np.where(span < 2.0 * gap_s, (reference.xy[later] - reference.xy[sooner]) / span, np.nan)
+        # A rolling shutter sees each marker at another time, and a distance needs both at one.
+        t_s = reference.t_s[rows].mean(axis=1, keepdims=True)
+        xy = reference.xy[rows] + known * (t_s - reference.t_s[rows])[..., None]
+        jerk_px_s3 = 3e6  # ten times what a hand does: the track jumped to another thing
+        seen, velocity = carried(other, t_s, gap_s, jerk_px_s3 / self.focal_px)
+        middle = 0.5 * (
+            reference.xy[later] + reference.xy[sooner]
+        )  # of other frames again: its noise is not `xy`'s
+        one, two = _pairs(xy.shape[1])
+        place = np.concatenate([middle, 0.5 * (middle[:, one] + middle[:, two])], axis=1)
+        value, rate, instrument, pixel_effect = self._equations(xy, known, seen, velocity)
+        return Evidence(value, rate, instrument, pixel_effect, place)
+
+    def _equations(
+        self, xy: Float, known: Float, seen: Float, velocity: Float
+    ) -> tuple[Float, Float, Float, Float]:
+        """Return value, rate, instrument and standard deviation (K, I).
+
+        They are of points, velocities (K, M, 2) in the reference and the other.
+        """
+        ray = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+        a = ray @ self.rotation.T  # the ray in the other camera's frame
+        line = cross(np.broadcast_to(self.translation, a.shape), a)
+        length = np.hypot(line[..., 0], line[..., 1])
+        normal = line[..., :2] / length[..., None]
+        along = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+        residual = (normal * seen).sum(-1) + line[..., 2] / length
+        place = (along * seen).sum(-1)
+        depth = self._depth(a, along, place)
+        # The first camera's velocity in the other's image, as if the depth stayed.
+        moved = depth[..., None] * (known @ self.rotation[:, :2].T)
+        depth_there = depth * a[..., 2] + self.translation[2]
+        expected = (moved[..., :2] - seen * moved[..., 2:]) / depth_there[..., None]
+        distance = _distances(ray, depth)
+        value = np.concatenate([self.focal_px * residual, distance], axis=-1)
+        changes: list[Float] = []
+        step_s = 1e-3  # of the numerical derivative of a distance
+        for v in (velocity, expected, along / (self.focal_px * step_s)):  # the last: a pixel
+            before = self._depth(a, along, place - step_s * (along * v).sum(-1))
+            change = (distance - _distances(ray, before)) / step_s
+            changes.append(np.concatenate([self.focal_px * (normal * v).sum(-1), change], axis=-1))
+        rate, instrument, pixel_effect = changes
+        return value, rate, instrument, step_s * pixel_effect
+
+    def _depth(self, a: Float, along: Float, place: Float) -> Float:
+        """Return depths (K, M) [m] along the reference rays.
+
+        They are of places on the epipolar lines; NaN where no hand can be.
+        """
+        a_along, t_along = (along * a[..., :2]).sum(-1), along @ self.translation[:2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
+        nearest_m, farthest_m = 0.05, 5.0
+        return np.where((depth > nearest_m) & (depth < farthest_m), depth, np.nan)
+
+
+def carried(track: Track, t_s: Float, gap_s: float, jerk_s3: float) -> tuple[Float, Float]:
+    """Interpolate points and velocities (K, M, 2) of a track at times (K, 1).
+
+    The interpolant is the cubic through the four frames around each.
+
+    NaN where a frame is missing, a gap is too long, or the third derivative exceeds `jerk_s3` [1/s^3].
+    """
+    centre = track.t_s.mean(axis=1)
+    first = np.searchsorted(centre, t_s[:, 0]) - 2
+    inside = (first >= 0) & (first + 3 < len(centre))
+    nodes = np.clip(first, 0, max(len(centre) - 4, 0))[:, None] + np.arange(4)
+    if len(centre) < 4:
+        nothing = np.full((len(t_s), *track.xy.shape[1:]), np.nan)
+        return nothing, nothing
+    t, x = track.t_s[nodes], track.xy[nodes]  # (K, 4, M), (K, 4, M, 2)
+    gap = np.diff(t, axis=1)
+    away = t_s[:, None] - t
+    good = (
+        inside[:, None] & (gap < gap_s).all(axis=1) & (away[:, 1] > -0.5 * gap_s) & (away[:, 2] < 0.5 * gap_s)
+    )
+    # Newton's divided differences.
+    d1 = np.diff(x, axis=1) / gap[..., None]
+    d2 = np.diff(d1, axis=1) / (t[:, 2:] - t[:, :-2])[..., None]
+    d3 = (d2[:, 1] - d2[:, 0]) / (t[:, 3] - t[:, 0])[..., None]
+    good &= 6.0 * np.abs(d3).max(axis=-1) < jerk_s3
+    u, v, w = (away[:, i, :, None] for i in range(3))
+    point = x[:, 0] + u * (d1[:, 0] + v * (d2[:, 0] + w * d3))
+    velocity = d1[:, 0] + (u + v) * d2[:, 0] + (u * v + u * w + v * w) * d3
+    bad = ~good[..., None]
+    return np.where(bad, np.nan, point), np.where(bad, np.nan, velocity)
+
+
+def _distances(ray: Float, depth: Float) -> Float:
+    """Distances (K, P) [m] between markers at depths (K, M) on rays (K, M, 3)."""
+    one, other = _pairs(depth.shape[1])
+    points = depth[..., None] * ray
+    return np.linalg.norm(points[:, one] - points[:, other], axis=-1)
+
+
+@cache
+def _pairs(markers: int) -> tuple[Int, Int]:
+    """Each marker with the next ones, every pair once."""
+    neighbours = 3  # distances of each marker to so many next ones: of six markers these are all 15 pairs
+    pairs = {
+        (min(m, n), max(m, n))
+        for m in range(markers)
+        for n in ((m + step) % markers for step in range(1, neighbours + 1))
+        if m != n
+    }
+    one, other = np.array(sorted(pairs), np.int64).reshape(-1, 2).T
+    return one, other
+
 
 TENTHS = 10  # of a block, the shortest batches
 """Residual below which a unit is not taken to be better: centroids of a tenth of a pixel, at half a metre."""

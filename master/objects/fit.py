@@ -1,11 +1,36 @@
-"""Pose of a rigid object at an epoch, from the observations of all cameras.
+"""A fit finds the pose and motion of an object by weighted sums.
+
+All cameras of a rig laid out by observation.
+
+They give where each sees its point, and how that changes with the point.
+
+What a fit asks for in each of its rounds with the same cameras is looked up once (`Views`).
+
+Motion of a rigid object about an epoch.
+
+It is a Taylor series of its position and of its rotation.
+
+X = R(theta(t)) R0 q + p(t),   p(t) = sum_k p_k t^k / k!,   theta(t) = sum_{k>0} theta_k t^k / k!
+
+Observations of an object as weighted sums.
+
+Errors that stay from frame to frame are eliminated from them exactly.
+
+An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each frame. The
+first is an unknown of its own, eliminated by its Schur complement, so four observations of one bead at rest are not
+taken for four measurements.
+
+A feature that misses the pose by more than noise and a bad calibration is weighed down as a whole, in its camera, by
+Geman and McClure's law (iteratively reweighted least squares); one thing taken for another so costs itself.
+
+Pose of a rigid object at an epoch, from the observations of all cameras.
 
 The observations are those around the epoch.
 
 Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
-object's motion about the epoch is a Taylor series of its place and of its turn (`master.objects.motion`), to the
+object's motion about the epoch is a Taylor series of its place and of its turn (`master.objects.fit`), to the
 fourth order, whose speed, acceleration, jerk and snap are drawn at random with the sizes of what hands do (as
-`master.fabrik.propagate` has it for single markers; Rasmussen, Williams 2006, 2.7).
+`master.fabrik.sync` has it for single markers; Rasmussen, Williams 2006, 2.7).
 
 Minimised is the reprojection error in units of its noise plus these priors, by Gauss-Newton from a start. Everything is
 one linear problem of 30 unknowns per round, whatever the number of cameras and features: cameras need not be in step,
@@ -14,7 +39,7 @@ one that was lost costs what it saw, and a rolling shutter is no special case.
 **Vigour.** How hard the object is moved is not known: the last linear problem is solved for each degree of vigour, each
 counts by its evidence, and where they disagree the covariance grows.
 
-Noise, and what is taken for a feature and is none: `master.objects.sums`.
+Noise, and what is taken for a feature and is none: `master.objects.fit`.
 """
 
 from dataclasses import dataclass
@@ -23,10 +48,267 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import rotation_vector_to_matrix, skew
-from master.objects.cameras import Cameras, Views
-from master.objects.motion import ORDERS, Motion, Past, basis_at
-from master.objects.sums import Observations, Sums
+from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
+from master.fabrik.intersection import RAYS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """The cameras of n observations, and the radii of the balls that they see.
+
+    Attributes:
+        R, t: (n, 3, 3), (n, 3) of `T_camera_rig`.
+        lens: (5, n) k1, k2, p1, p2, k3.
+        focal, centre: (n, 2) [px].
+        radius_2: (n,) squares of the radii [m^2], 0: a point.
+    """
+
+    R: Float
+    t: Float
+    lens: Float
+    focal: Float
+    centre: Float
+    radius_2: Float
+
+    def see(self, points: Float) -> tuple[Float, Float, Float]:
+        """Project points (n, 3) [m] into the cameras.
+
+        For balls about the points it is the middles of their outlines.
+
+        An ellipse, the outline of a ball of radius r at (x, y, z), has its middle at (x, y) z / (z^2 - r^2).
+
+        Returns:
+            Pixels (n, 2); their derivatives (n, 2, 3) [px/m] by the points, rig frame; depth (n,) [m]. NaN: behind.
+        """
+        own = (self.R @ points[..., None])[..., 0] + self.t
+        before_m = 1e-3  # a point nearer to the plane of a camera than this is not before it
+        z = np.where(own[:, 2] > before_m, own[:, 2], np.nan)
+        z = z - self.radius_2 / z
+        xy = own[:, :2] / z[:, None]
+        k1, k2, p1, p2, k3 = self.lens
+        x, y = xy.T
+        xx, yy = x * x, y * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial_derivative = 2.0 * k1 + r2 * (4.0 * k2 + r2 * (6.0 * k3))
+        two_xy = 2.0 * x * y
+        uv = np.empty_like(xy)
+        uv[:, 0] = x * radial + p1 * two_xy + p2 * (r2 + 2.0 * xx)
+        uv[:, 1] = y * radial + p1 * (r2 + 2.0 * yy) + p2 * two_xy
+        # The tangential part turns the derivative by less than 1 % and is neglected in it.
+        by_own = np.empty((len(xy), 2, 3))
+        scale = self.focal / z[:, None]
+        by_own[:, 0, 0] = radial_derivative * xx + radial
+        by_own[:, 1, 1] = radial_derivative * yy + radial
+        by_own[:, 0, 1] = by_own[:, 1, 0] = 0.5 * radial_derivative * two_xy
+        by_own[..., :2] *= scale[..., None]
+        by_own[..., 2] = -by_own[..., 0] * x[:, None] - by_own[..., 1] * y[:, None]
+        return uv * self.focal + self.centre, by_own @ self.R, z
+
+
+class Cameras:
+    """The cameras of a rig. Holds no state between calls."""
+
+    def __init__(self, cameras: tuple[CameraModel, ...]) -> None:
+        """Lay them out."""
+        self._R = np.array([c.T_camera_rig[:3, :3] for c in cameras])
+        self._t = np.array([c.T_camera_rig[:3, 3] for c in cameras])
+        self._lens = np.array([c.distortion for c in cameras]).T
+        self._focal = np.array([c.matrix[[0, 1], [0, 1]] for c in cameras])
+        self._centre = np.array([c.matrix[:2, 2] for c in cameras])
+
+    def of(self, camera: Int, radius_m: Float) -> Views:
+        """Those of observations (n,), of balls of radii (n,) [m]."""
+        return Views(
+            self._R[camera],
+            self._t[camera],
+            self._lens[:, camera],
+            self._focal[camera],
+            self._centre[camera],
+            radius_m * radius_m,
+        )
+
+
+ORDERS = 5
+_FACTORIAL: Float = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
+_POWERS = np.arange(ORDERS)
+
+
+def basis_at(tau_s: Float) -> Float:
+    """Return weights (..., ORDERS) of the derivatives at times (...).
+
+    The times are from the epoch [s].
+    """
+    return tau_s[..., None] ** _POWERS / _FACTORIAL
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A pose and its derivatives.
+
+    Attributes:
+        T: (4, 4) `T_rig_object`.
+        rates: (ORDERS, 2, 3) derivatives of place [m/s^k] and turn [rad/s^k], rig axes; those of order 0 are 0.
+    """
+
+    T: Float
+    rates: Float
+
+    @classmethod
+    def still(cls, T: Float) -> "Motion":
+        """An object at rest."""
+        return cls(T, np.zeros((ORDERS, 2, 3)))
+
+    def at(self, t_s: float, orders: int = 2) -> "Motion":
+        """The pose at another time, by the first derivatives; these kept."""
+        weights = t_s**_POWERS / _FACTORIAL
+        weights[orders:] = 0.0
+        way = np.einsum("k,kij->ij", weights, self.rates)
+        rates = self.rates.copy()
+        rates[orders:] = 0.0
+        return Motion(_stepped(self.T, way), rates)
+
+    def retracted(self, step: Float) -> "Motion":
+        """The motion after a step (6 ORDERS,): of each order place, then turn."""
+        change = step.reshape(ORDERS, 2, 3)
+        rates = self.rates + change
+        rates[0] = 0.0
+        return Motion(_stepped(self.T, change[0]), rates)
+
+
+def _stepped(T: Float, step: Float) -> Float:
+    """A pose (4, 4) after a step of its place and of its turn (2, 3)."""
+    return rigid(rotation_vector_to_matrix(step[1]) @ T[:3, :3], T[:3, 3] + step[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Past:
+    """Prior from earlier frames at the epoch.
+
+    It is of position, rotation and speeds: the estimate, and its information (12, 12).
+    """
+
+    motion: Motion
+    precision: Float
+
+    def off(self, motion: Motion) -> Float:
+        """(12,) how far another motion is from this: what would have to be added to it."""
+        own = self.motion
+        return np.concatenate(
+            [
+                own.T[:3, 3] - motion.T[:3, 3],
+                matrix_to_rotation_vector(own.T[:3, :3] @ motion.T[:3, :3].T),
+                (own.rates[1] - motion.rates[1]).ravel(),
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Observations of one object around an epoch, n points.
+
+    Attributes:
+        camera: (n,) which camera.
+        point: (n,) which row of `Features.points`.
+        tau_s: (n,) when, from the epoch [s].
+        uv: (n, 2) [px], distorted image.
+        sigma_px: (n,) standard deviation per axis.
+        t_sigma_s: (n,) of the times, the same error for all of a camera.
+    """
+
+    camera: Int
+    point: Int
+    tau_s: Float
+    uv: Float
+    sigma_px: Float
+    t_sigma_s: Float
+
+    def some(self, associated: Bool) -> "Observations":
+        """Those of a mask (n,)."""
+        return Observations(
+            self.camera[associated],
+            self.point[associated],
+            self.tau_s[associated],
+            self.uv[associated],
+            self.sigma_px[associated],
+            self.t_sigma_s[associated],
+        )
+
+
+class Sums:
+    """Weighted sums of observations.
+
+    Determines which observations belong together, and their variances. Holds no state between calls.
+    """
+
+    def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
+        """Set up for observations.
+
+        Args:
+            seen: The observations.
+            feature: (n,) of what each is a part.
+            floor_2: (n,) variance per axis [px^2] that light, lens and calibration leave.
+            points: How many points the object has.
+        """
+        variance = seen.sigma_px**2
+        independent_share, independent_px = 0.7, 0.1  # as in `master.fabrik.sync`
+        independent = np.minimum(independent_share * variance, independent_px**2)
+        correlated = variance - independent + floor_2
+        _, first, group = np.unique(seen.camera * points + seen.point, return_index=True, return_inverse=True)
+        # What the surest observation keeps is kept by all; others have more that is new.
+        self._correlated = np.full(len(first), np.inf)
+        np.minimum.at(self._correlated, group, correlated)
+        kept = self._correlated[group]
+        self._independent = independent + correlated - kept
+        self._total = kept + self._independent
+        self._of_group = np.zeros((len(first), len(group)))
+        self._of_group[group, np.arange(len(group))] = 1.0
+        self._group_size = self._of_group.sum(axis=1)
+        _, self._whole = np.unique(seen.camera * (int(feature.max()) + 1) + feature, return_inverse=True)
+        self._whole_size = np.bincount(self._whole)
+        # Of numbers that were measured a bead has two, a tag eight, however often it was.
+        self._numbers = 2.0 * np.bincount(self._whole[first])
+
+    def weigh(self, miss: Float, lag_2: Float) -> tuple[Float, Float, float]:
+        """Return the chi-square and weight (n,) of each observation, and the cost.
+
+        The chi-square (n,) is per measured number of the feature that the observation belongs to.
+
+        The weight forgives what a bad calibration leaves (`RaySettings.rig_px`), the cost only what this one is
+        known to leave.
+
+        Args:
+            miss: (n, 2) by which the observations miss the pose [px].
+            lag_2: (n,) variance that the uncertainty of their times makes [px^2].
+        """
+        total = self._total + lag_2
+        squared = 0.5 * np.vecdot(miss, miss)
+        mean = np.bincount(self._whole, squared / total) / self._whole_size
+        forgiven = np.bincount(self._whole, squared / (total + RAYS.rig_px**2)) / self._whole_size
+        soft_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
+        weight = (1.0 + forgiven / soft_2) ** -2.0
+        cost = float((self._numbers * mean / (1.0 + mean / soft_2)).sum())
+        return mean[self._whole], weight[self._whole], cost
+
+    def normal(self, rows: Float, weight: Float, lag_2: Float) -> tuple[Float, Float]:
+        """Normal matrix (N, N) and gradient (N,), the errors that stay eliminated.
+
+        Args:
+            rows: (n, 2, N + 1) derivatives of what is seen by the unknowns; last, by what it is missed [px].
+            weight: (n,) of the observations.
+            lag_2: As of `weigh`.
+        """
+        size = rows.shape[2]
+        w = weight / (self._independent + lag_2)
+        weighted = rows * w[:, None, None]
+        both = weighted.reshape(-1, size).T @ rows.reshape(-1, size)
+        light = self._of_group @ weight / self._group_size
+        down = self._of_group @ w + light / self._correlated
+        sums = (self._of_group @ weighted.reshape(len(rows), -1)) / np.sqrt(down)[:, None]
+        sums = sums.reshape(-1, size)
+        both -= sums.T @ sums
+        return both[:-1, :-1], both[:-1, -1]
+
 
 _N = 6 * ORDERS
 # At rest on a table, held, waved: speeds and accelerations per axis, and of turns.

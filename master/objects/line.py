@@ -1,19 +1,35 @@
-"""Pipeline of one object.
+"""The pipeline of one object fits, filters and extrapolates its pose.
+
+Filter that smooths the pose of an object as it arrives.
+
+An object at rest thus does not tremble.
+
+The 1 € filter of its rig, as of the hand (`master.estimator.smoothing`), with position and rotation as its groups
+and the noise as it is measured. The position is that of the middle of the features, about which the rotation is
+unsure; at the object's own origin, a lever away, the noise of the rotation would shake the position as well. A
+rotation counts by how far it moves what is a decimetre away.
+
+Where an object went: the last poses that were fitted, and where they lead it.
+
+Led on for a fit, for what is seen too little of it, and for what is shown while nobody sees it: then its speed dies.
+
+Pipeline of one object.
 
 Detections of markers and tags go in, its pose at every frame of the leading camera comes out.
 
 `ObjectLine` is a push machine without clock, socket or thread. For each epoch (`master.objects.window`) the pose is
 fitted (`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most of
-what is seen in the wrong place, from what is seen alone (`master.objects.start`), the best of all starts.
+what is seen in the wrong place, from what is seen alone (`master.objects.association`), the best of all starts.
 
 **Too little is seen** to determine all of it, as two beads of three: then the prior estimate counts as well
-(`master.objects.trajectory`), as it was at a time before all frames of this fit, so that nothing counts twice.
+(`master.objects.line`), as it was at a time before all frames of this fit, so that nothing counts twice.
 
-**One tag** has two poses that nearly explain it (`master.objects.single_tag`).
+**One tag** has two poses that nearly explain it (`master.objects.association`).
 
 **Nothing is seen**: the pose is led on with dying speed, and after `HELD_S` there is none.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -23,21 +39,178 @@ from common.arrays import Float, Int
 from common.calibration import RigCalibration
 from common.calibration.object_profile import ObjectProfile
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import matrix_to_quaternion
+from common.geometry.transforms import (
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    rigid,
+    rotation_vector_to_matrix,
+)
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.depth import CalibrationResidual
-from master.fabrik.one_euro import OneEuroParameters
-from master.objects.association import Association, sighted_now
-from master.objects.features import Features
-from master.objects.fit import Fitted, PoseFit
-from master.objects.hidden import Hidden
-from master.objects.motion import Motion
-from master.objects.pose_filter import PoseFilter
-from master.objects.single_tag import SingleTag
-from master.objects.start import poses_of_beads, poses_of_tags
-from master.objects.trajectory import Trajectory, unheeded
-from master.objects.window import Window, Windows
+from master.fabrik.one_euro import NoiseEstimator, OneEuro, OneEuroParameters
+from master.objects.association import Association, SingleTag, poses_of_beads, poses_of_tags, sighted_now
+from master.objects.fit import Fitted, Motion, Past, PoseFit
+from master.objects.surface import Features
+from master.objects.window import Hidden, Window, Windows
+
+
+class PoseFilter:
+    """1 € filter of an object's pose.
+
+    Push machine. Holds the filter, the measured noise, and the pose that it output last.
+    """
+
+    def __init__(self, middle_m: Float, parameters: OneEuroParameters) -> None:
+        """Set up.
+
+        Args:
+            middle_m: (3,) middle of the features, object frame [m].
+            parameters: Of the 1 € filter [m, s].
+        """
+        self._middle, self._parameters = middle_m, parameters
+        self._filter: OneEuro | None = None
+        self._noise = NoiseEstimator()
+        self._t_ns, self._R, self._values = 0, np.eye(3), np.zeros(6)
+
+    def push(self, t_ns: int, T: Float, cov: Float) -> Float:
+        """The pose (4, 4) to show, of one that was measured with a covariance (6, 6)."""
+        reset_s = 0.5
+        if self._filter is None or (t_ns - self._t_ns) * 1e-9 > reset_s:
+            self._filter, self._noise = OneEuro(self._parameters, (3, 3)), NoiseEstimator()
+            self._R, self._values = T[:3, :3], np.zeros(6)
+        arm_m = 0.1
+        rotation = arm_m * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
+        signals = np.concatenate([T[:3, :3] @ self._middle + T[:3, 3], self._values[3:] + rotation])
+        independent_share = 0.15  # of the variance of a pose, new in each frame: most of its error stays
+        noise = independent_share * np.concatenate([np.diagonal(cov)[:3], arm_m**2 * np.diagonal(cov)[3:]])
+        values = self._filter.push(t_ns, signals, self._noise.push(t_ns, signals, noise))
+        self._R = rotation_vector_to_matrix((values - self._values)[3:] / arm_m) @ self._R
+        self._values, self._t_ns = values, t_ns
+        return rigid(self._R, values[:3] - self._R @ self._middle)
+
+    def held(self, t_ns: int, T: Float) -> Float:
+        """The pose to show of one that was led on: as it is."""
+        return T
+
+    def forget(self) -> None:
+        """Begin anew with the next pose."""
+        self._filter = None
+
+
+HELD_S = 0.5
+_DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
+_PUSHED: Float = np.repeat([5.0, 40.0], 3)  # [m/s^2, rad/s^2] what may happen to its speed meanwhile
+_ARM_M = 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
+_SCALE: Float = np.array([1.0] * 3 + [_ARM_M] * 3)
+_SIX, _TWELVE = np.arange(6), np.arange(12)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """A pose that was fitted."""
+
+    t_ns: int
+    fitted: Fitted
+
+
+class Trajectory:
+    """Recent fitted poses of an object, sixteen at most.
+
+    Push machine. Also holds when a pose was last fully constrained by the observations alone.
+    """
+
+    def __init__(self) -> None:
+        poses = 16
+        self._known: deque[_Known] = deque(maxlen=poses)
+        self._sure_ns = -(2**63)
+
+    def __bool__(self) -> bool:
+        """Whether there is any."""
+        return bool(self._known)
+
+    def push(self, t_ns: int, fitted: Fitted) -> bool:
+        """Add the pose of an epoch.
+
+        False: the pose has not been fully constrained for too long, and all poses are forgotten.
+        """
+        self._known.append(_Known(t_ns, fitted))
+        if fitted.measured_only:
+            self._sure_ns = t_ns
+        elif self.unsure_s(t_ns) > HELD_S:
+            self._known.clear()
+            return False
+        return True
+
+    def clear(self) -> None:
+        """What was known of where it went is of another thing."""
+        self._known.clear()
+
+    def unsure_s(self, t_ns: int) -> float:
+        """Return the time [s] since the pose was last fully constrained."""
+        return (t_ns - self._sure_ns) * 1e-9
+
+    def predicted(self, t_ns: int) -> Motion | None:
+        """Where the object is led to; None: it was not seen for long."""
+        if not self._known:
+            return None
+        last = self._known[-1]
+        dt = (t_ns - last.t_ns) * 1e-9
+        if dt > HELD_S:
+            self._known.clear()
+            return None
+        return last.fitted.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
+
+    def past(self, t_ns: int, oldest_ns: int) -> Past:
+        """Return the prior at an epoch from before all that is seen around it.
+
+        The oldest of these observations is at `oldest_ns`.
+        """
+        known = next((k for k in reversed(self._known) if k.t_ns <= oldest_ns), self._known[0])
+        dt = max((t_ns - known.t_ns) * 1e-9, 1e-3)
+        step = np.eye(12)
+        step[_SIX, _SIX + 6] = dt
+        grown = step @ known.fitted.cov @ step.T
+        grown[_TWELVE, _TWELVE] += np.concatenate([0.5 * dt * dt * _PUSHED, dt * _PUSHED]) ** 2
+        return Past(known.fitted.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
+
+    def held_cov(self, t_ns: int) -> Float | None:
+        """Return the covariance (6, 6) of the pose predicted without observations.
+
+        None: the pose is no longer to be held.
+        """
+        if not self._known or self.unsure_s(t_ns) > HELD_S:
+            return None
+        known = self._known[-1]
+        dt = (t_ns - known.t_ns) * 1e-9
+        cov = known.fitted.cov[:6, :6].copy()
+        grown = _PUSHED * 0.5 * dt * dt
+        speed = known.fitted.motion.rates[1].ravel() * (dt - _DIES_S * (1.0 - np.exp(-dt / _DIES_S)))
+        cov[_SIX, _SIX] += grown**2 + speed**2
+        return cov
+
+
+def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
+    """Grow a fit's covariance in the directions the observations do not constrain.
+
+    By what may have happened in these directions for so long [s].
+
+    A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
+    rest on: its covariance grows as that of a thing that nobody sees.
+
+    Args:
+        fitted: With the past.
+        alone: Without.
+        since_s: For how long.
+        poor_m: What is less sure than this is not reported [m].
+    """
+    size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
+    unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
+    cov = fitted.cov.copy()
+    unseen_m_s2 = 1.5  # how it moves unseen, a turn counting by what it does a decimetre away
+    cov[:6, :6] += (0.5 * unseen_m_s2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
+    return replace(fitted, cov=cov, measured_only=False)
+
 
 # What light does to a ball's centroid beyond what a slave reports, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03

@@ -1,4 +1,13 @@
-"""Surface of an object: distances of points, and occlusion.
+"""An object has a surface and features, and occludes some of them.
+
+All parts of one kind of an object's surface, as arrays.
+
+They give distances to them, nearest points on them, and intersections of rays with them.
+
+Each part is about its own origin, along its own axes. Coordinates come first in `own` (K, D, N), so that sums over them
+are sums of rows: a hand asks for hundreds of points at once, and most of what that costs is the number of calls.
+
+Surface of an object: distances of points, and occlusion.
 
 How far points are from it, and what it hides from an eye.
 
@@ -8,18 +17,186 @@ least of theirs, exactly; inside of two at once it is that of the one whose surf
 A body of round cones is a union of balls along its bones, so its distance to a surface is the least of "distance of the
 middle less radius" along the bone (`nearest_to_capsules`). For one convex part that is a convex function of where on
 the bone, which a search on a grid and a second on the cell around its best narrows to a 256th of the bone.
+
+Visible features of an object.
+
+Its beads and the corners of its tags are one list of points; it states which of them face a camera.
+
+A camera is *expected* to see a feature that lies in its image, is turned to it, is large enough and is not behind the
+object itself. Some are at the edge of that, and a slave may find them or not: that these are missing is no evidence.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.calibration.object_profile import Shape
+from common.calibration.object_profile import (
+    BoxShape,
+    CylinderShape,
+    ObjectProfile,
+    Shape,
+    SphereShape,
+    tag_corners,
+)
+from common.errors import CalibrationError
+from common.geometry.camera_model import CameraModel
+from common.geometry.tag_family import GRIDS
 from common.geometry.tapered_capsules import Capsules
-from common.geometry.transforms import invert
-from master.objects.parts import Parts, by_kind
+from common.geometry.transforms import cross, invert, transform
+
+_GRAZES_M = 1e-3  # a sight that goes no deeper is not hidden: a tag lies on the surface itself
+_TINY = 1e-12
+
+
+class Parts(Protocol):
+    """K parts of one kind. Hold no state."""
+
+    def distances(self, own: Float) -> Float:
+        """(K, N) [m], negative inside, of points (K, 3, N) in the frame of each part."""
+        ...
+
+    def feet(self, part: Int, own: Float) -> Float:
+        """Return nearest points (N, 3) on the surfaces of parts (N,) to points (N, 3).
+
+        Each is in the frame of its part.
+        """
+        ...
+
+    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        """Return from where to where rays are inside a part.
+
+        The rays are ways (K, 3, N) from starts (K, 3); inside is a little below the part's skin.
+
+        Both (K, N) are shares of the way; where the second is not above the first, the sight passes by.
+        """
+        ...
+
+
+class Boxes:
+    """Boxes, by the halves of their sides (K, 3)."""
+
+    def __init__(self, shapes: Sequence[BoxShape]) -> None:
+        self._half = 0.5 * np.array([shape.size_m for shape in shapes])
+
+    def distances(self, own: Float) -> Float:
+        """As of `Parts`."""
+        deep = np.abs(own) - self._half[:, :, None]
+        off = np.maximum(deep, 0.0)
+        return np.sqrt((off * off).sum(axis=1)) + np.minimum(deep.max(axis=1), 0.0)
+
+    def feet(self, part: Int, own: Float) -> Float:
+        """As of `Parts`."""
+        return _feet_of_box(self._half[part], own)
+
+    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        """As of `Parts`."""
+        return _through_slabs(self._half - _GRAZES_M, start, way)
+
+
+class Cylinders:
+    """Closed cylinders along z, by radius and half their length."""
+
+    def __init__(self, shapes: Sequence[CylinderShape]) -> None:
+        self._size = np.array([[shape.radius_m, 0.5 * shape.length_m] for shape in shapes])
+
+    def distances(self, own: Float) -> Float:
+        """As of `Parts`: in the plane of axis and point a cylinder is a box."""
+        x, y, z = own.swapaxes(0, 1)
+        out = np.sqrt(x * x + y * y) - self._size[:, :1]
+        up = np.abs(z) - self._size[:, 1:]
+        side, end = np.maximum(out, 0.0), np.maximum(up, 0.0)
+        return np.sqrt(side * side + end * end) + np.minimum(np.maximum(out, up), 0.0)
+
+    def feet(self, part: Int, own: Float) -> Float:
+        """As of `Parts`."""
+        out = np.sqrt(np.vecdot(own[:, :2], own[:, :2]))
+        foot = _feet_of_box(self._size[part], np.stack([out, own[:, 2]], axis=1))
+        return np.concatenate([foot[:, :1] * _unit(own[:, :2], out), foot[:, 1:]], axis=1)
+
+    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        """As of `Parts`."""
+        side = _through_round(self._size[:, 0] - _GRAZES_M, start[:, :2], way[:, :2])
+        ends = _through_slabs(self._size[:, 1:] - _GRAZES_M, start[:, 2:], way[:, 2:])
+        return np.maximum(side[0], ends[0]), np.minimum(side[1], ends[1])
+
+
+class Balls:
+    """Balls, by their radii (K,)."""
+
+    def __init__(self, shapes: Sequence[SphereShape]) -> None:
+        self._radius = np.array([shape.radius_m for shape in shapes])
+
+    def distances(self, own: Float) -> Float:
+        """As of `Parts`."""
+        return np.sqrt((own * own).sum(axis=1)) - self._radius[:, None]
+
+    def feet(self, part: Int, own: Float) -> Float:
+        """As of `Parts`."""
+        return self._radius[part, None] * _unit(own, np.sqrt(np.vecdot(own, own)))
+
+    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
+        """As of `Parts`."""
+        return _through_round(self._radius - _GRAZES_M, start, way)
+
+
+def by_kind(shapes: Sequence[Shape]) -> list[tuple[list[Shape], Parts]]:
+    """The parts of each kind that there is."""
+    boxes = [shape for shape in shapes if isinstance(shape, BoxShape)]
+    bars = [shape for shape in shapes if isinstance(shape, CylinderShape)]
+    balls = [shape for shape in shapes if isinstance(shape, SphereShape)]
+    kinds: list[tuple[list[Shape], Parts]] = []
+    if bars:
+        kinds.append(([*bars], Cylinders(bars)))
+    if boxes:
+        kinds.append(([*boxes], Boxes(boxes)))
+    if balls:
+        kinds.append(([*balls], Balls(balls)))
+    return kinds
+
+
+def _feet_of_box(half: Float, points: Float) -> Float:
+    """Return nearest points (N, D) on the surfaces of boxes.
+
+    The boxes have these halves of their sides (N, D), of any dimension.
+    """
+    foot = np.minimum(np.maximum(points, -half), half)
+    inside = np.flatnonzero((foot == points).all(axis=1))
+    if len(inside):
+        own, most = points[inside], half[inside]
+        rows: Int = np.arange(len(inside))
+        face: Int = np.argmin(most - np.abs(own), axis=1)
+        foot[inside, face] = np.where(own[rows, face] < 0.0, -most[rows, face], most[rows, face])
+    return foot
+
+
+def _through_slabs(half: Float, start: Float, way: Float) -> tuple[Float, Float]:
+    """Intersect rays with slabs, as `Parts.through`.
+
+    The slabs are between planes at plus and minus `half` (K, D) along each axis.
+    """
+    by = np.where(np.abs(way) > _TINY, way, _TINY)
+    one, other = (-half - start)[:, :, None] / by, (half - start)[:, :, None] / by
+    return np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+
+
+def _through_round(radius: Float, start: Float, way: Float) -> tuple[Float, Float]:
+    """As of `Parts.through`, within circles or balls (K,) about the origin."""
+    a, b = np.maximum((way * way).sum(axis=1), 1e-18), (way * start[:, :, None]).sum(axis=1)
+    inside = b * b - a * (np.vecdot(start, start) - radius * radius)[:, None]
+    root = np.sqrt(np.maximum(inside, 0.0))
+    missed = inside <= 0.0
+    return np.where(missed, np.inf, (-b - root) / a), np.where(missed, -np.inf, (-b + root) / a)
+
+
+def _unit(vectors: Float, length: Float) -> Float:
+    """Vectors (N, D) by their lengths (N,); that of length 0 along the first axis."""
+    unit = vectors / np.maximum(length, _TINY)[:, None]
+    unit[length <= _TINY, 0] = 1.0
+    return unit
+
 
 _STEPS = 17
 _GRID: Float = np.linspace(0.0, 1.0, _STEPS)
@@ -138,3 +315,159 @@ class Surface:
             for kind in self._kinds:
                 hidden |= kind.hides(eye, flat)
         return hidden.reshape(points.shape[:-1])
+
+
+# Of a tag that is found nearly always, by what the finder of the slaves finds of rendered ones: how it is turned to the
+# camera, and how short its shortest edge may be by cells.
+_TAG_COSINE, _CELL_PX = 0.65, 3.4
+_DISC: Float = np.array(
+    [[0.0, 0.0]]
+    + [[r * np.cos(a), r * np.sin(a)] for r in (0.45, 0.85) for a in np.arange(6) * np.pi / 3 + r]
+)
+
+_BULGE: Float = np.sqrt(1.0 - (_DISC * _DISC).sum(axis=1))[:, None]  # of a ball's near half over its disc
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """The points of an object.
+
+    Attributes:
+        names: (F,) of beads, then of tags.
+        points: (P, 3) [m], object frame: one of each bead, four corners of each tag.
+        feature: (P,) to which feature each belongs.
+        radius_m: (P,) of beads; 0: a corner.
+        rows: (B,) which rows of `MarkerDetections` are the beads.
+        tag_ids: (N,) numbers of the tags.
+        normals: (F, 3) outward of tags; 0: a bead.
+        cells: Along an edge of a tag, its black border included; 0: there are none.
+        surface: What hides features of the object itself.
+    """
+
+    names: tuple[str, ...]
+    points: Float
+    feature: Int
+    radius_m: Float
+    rows: Int
+    tag_ids: tuple[int, ...]
+    normals: Float
+    cells: int
+    surface: Surface
+
+    @classmethod
+    def of(cls, profile: ObjectProfile, markers: tuple[str, ...]) -> "Features":
+        """The features of a profile in a rig with these markers.
+
+        Raises:
+            CalibrationError: The rig has no marker of the name of a bead.
+        """
+        for name in profile.markers:
+            if name not in markers:
+                raise CalibrationError(
+                    f"object {profile.name!r}: markers: {name!r} is not one of the rig's markers, {', '.join(markers)}"
+                )
+        beads = list(profile.markers.values())
+        tags = () if profile.tags is None else profile.tags.tags
+        points = [np.array([bead.position_m]) for bead in beads]
+        points += [transform(np.array(tag.T_object_tag), tag_corners(tag.edge_m)) for tag in tags]
+        sizes = [1] * len(beads) + [4] * len(tags)
+        return cls(
+            names=(*profile.markers, *(f"tag{tag.id}" for tag in tags)),
+            points=np.concatenate(points) if points else np.empty((0, 3)),
+            feature=np.repeat(np.arange(len(sizes)), sizes),
+            radius_m=np.array([bead.radius_m for bead in beads] + [0.0] * 4 * len(tags)),
+            rows=np.array([markers.index(name) for name in profile.markers], np.int64),
+            tag_ids=tuple(tag.id for tag in tags),
+            normals=np.array(
+                [[0.0] * 3] * len(beads) + [[row[2] for row in tag.T_object_tag[:3]] for tag in tags]
+            ).reshape(-1, 3),
+            cells=0 if profile.tags is None else GRIDS[profile.tags.family].cells + 2,
+            surface=Surface(profile.shape),
+        )
+
+    @property
+    def count(self) -> int:
+        """How many features there are."""
+        return len(self.names)
+
+    @property
+    def _first(self) -> Int:
+        """(F,) the first point of each feature."""
+        return np.concatenate([np.arange(self.beads), np.arange(self.beads, len(self.points), 4)])
+
+    @property
+    def beads(self) -> int:
+        """How many of them are beads: the first."""
+        return len(self.rows)
+
+    def corners_of(self, tag: int) -> Int:
+        """Rows (4,) of `points` of the tag in that place of `tag_ids`."""
+        return self.beads + 4 * tag + np.arange(4)
+
+    def expected(self, T_rig_object: Float, camera: CameraModel, ease: float = 1.0) -> Bool:
+        """Return (F,) which features a camera sees of the object at a pose (4, 4).
+
+        Nothing is in front of the object.
+
+        Args:
+            T_rig_object: The pose.
+            camera: The camera.
+            ease: By what all that is asked of a feature is multiplied; below 1 those are returned that may be seen.
+        """
+        eye = (camera.centre - T_rig_object[:3, 3]) @ T_rig_object[:3, :3]
+        uv = camera.project(transform(T_rig_object, self.points))
+        margin_px = 6.0  # from the image's border
+        last = np.array([camera.width_px, camera.height_px]) - 1.0 - ease * margin_px
+        inside = ((uv >= ease * margin_px) & (uv <= last)).all(axis=1)
+        shows = np.concatenate(
+            [self._beads_show(eye, float(camera.matrix[0, 0]), ease), self._tags_show(eye, uv, ease)]
+        )
+        if len(self.points):
+            shows &= np.logical_and.reduceat(inside, self._first)
+        return shows
+
+    def _tags_show(self, eye: Float, uv: Float, ease: float) -> Bool:
+        """Return (N,) which tags face an eye and are large in its image.
+
+        The eye is (3,) [m], object frame; the image is (P, 2) [px].
+        """
+        count = len(self.tag_ids)
+        if not count:
+            return np.zeros(0, np.bool_)
+        corners, seen = self.points[self.beads :].reshape(count, 4, 3), uv[self.beads :].reshape(count, 4, 2)
+        normal = self.normals[self.beads :]
+        line_of_sight = eye - corners.mean(axis=1)
+        facing_camera = np.vecdot(normal, line_of_sight) >= ease * _TAG_COSINE * np.linalg.norm(
+            line_of_sight, axis=1
+        )
+        edges = np.linalg.norm(seen - np.roll(seen, 1, axis=1), axis=2).min(axis=1)
+        # A little off the paper, which lies on the surface.
+        lifted = (
+            np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1) + 1e-4 * normal[:, None]
+        )
+        return (
+            facing_camera
+            & (edges >= ease * _CELL_PX * self.cells)
+            & ~self.surface.hides(eye, lifted).any(axis=1)
+        )
+
+    def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
+        """Return (B,) which beads an eye sees.
+
+        They are large enough for an eye (3,) [m], object frame, and not behind the object.
+        """
+        if not self.beads:
+            return np.zeros(0, np.bool_)
+        points, radius = self.points[: self.beads], self.radius_m[: self.beads]
+        line_of_sight = eye - points
+        away = np.linalg.norm(line_of_sight, axis=1)
+        ahead = line_of_sight / away[:, None]
+        across = cross(ahead, np.eye(3)[np.argmin(np.abs(ahead), axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        # The near half of the ball, so that the rod that it is on is not before it.
+        off = _DISC[:, :1] * across[:, None] + _DISC[:, 1:] * cross(ahead, across)[:, None]
+        off += _BULGE * ahead[:, None]
+        hidden = self.surface.hides(eye, points[:, None] + radius[:, None, None] * off)
+        bead_px = 2.5  # radius of a bead that is found nearly always
+        bead_seen = 0.75  # share of a bead that must not be behind the object
+        return (radius * focal_px >= ease * bead_px * away) & ((~hidden).mean(axis=1) >= ease * bead_seen)

@@ -25,8 +25,7 @@ from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
 from common.geometry.transforms import invert, matrix_to_quaternion, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from master.objects.line import SolvedObject
-from master.objects.trajectory import HELD_S
+from master.objects.line import HELD_S, SolvedObject
 
 _UNKNOWN_RAD = np.radians(1.5)  # of a registration without figures, such as one made by hand
 _NOWHERE = (np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan))

@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from common.arrays import Float
 from common.hand.model import FINGERS, HandModel
-from master.outputs.palette import Rgb, series_rgb
-from master.outputs.poses import Poses
-from master.outputs.truth import PosesTruth, distance_m, mean_known
+from master.outputs.drawing import Rgb, series_rgb
+from master.outputs.poses import Poses, PosesTruth, distance_m, mean_known
 
 Colour = tuple[float, float, float]
 

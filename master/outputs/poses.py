@@ -1,15 +1,34 @@
-"""Many poses as arrays.
+"""Poses holds a run as arrays, its truth beside it, and its file poses.npz.
+
+Many poses as arrays.
 
 What poses.npz holds, and what pictures, viewers and scores read.
+
+True motion of the hand, row by row beside the poses.
+
+Where a simulation or a recording knows it.
+
+Writer and reader of poses.npz, the record of a run readable with numpy.
+
+Also writes and reads all files of a run at once.
+
+Each appears under its name complete or not at all, and identical poses make identical bytes (`table_file`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.messages import FINGER_COUNT, JOINT_COUNT, HandPose
+from common.errors import RecordingError
+from common.hand.model import MIDDLE_METACARPAL, MIDDLE_PROXIMAL
+from common.messages import FINGER_COUNT, JOINT_COUNT, Gesture, HandPose, ObjectPose, ResultMessage
+from common.recording.recorded_files import read_npz
+from master.outputs.result_files import GesturesFile, TableFile, contact_file, object_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,3 +165,219 @@ def record(marker_count: int) -> np.dtype[np.void]:
             ("wrist_angles_sigma_rad", "<f8", (2,)),
         ]
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosesTruth:
+    """True joints and caps at the times of T poses.
+
+    NaN: unknown there.
+
+    Attributes:
+        joints_m: (T, 26, 3) [m], rig frame.
+        markers_m: (T, M, 3) [m], centroids of the painted caps, rig frame.
+        laser_m: (T, 5, 3) [m], where the laser meets each finger, of a wrist device; None: a marker rig.
+    """
+
+    joints_m: Float
+    markers_m: Float
+    laser_m: Float | None = None
+
+    @classmethod
+    def of_webxr(cls, joints_m: Float, markers_m: Float, laser_m: Float | None = None) -> "PosesTruth":
+        """Build the truth from the 25 WebXR joints (T, 25, 3) of a rendered recording.
+
+        The palm is derived.
+        """
+        palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
+        return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m, laser_m)
+
+    def rows(self, start: int, stop: int) -> "PosesTruth":
+        """Rows start..stop-1, without copying."""
+        laser_m = None if self.laser_m is None else self.laser_m[start:stop]
+        return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop], laser_m)
+
+    def errors_m(self, poses: Poses) -> dict[str, Float]:
+        """Return the distances (T, K) [m] from the truth for each measured quantity.
+
+        A mapping from quantity to distances; NaN where either of the two is not known.
+        """
+        joints = {"joints": self.joint_error_m(poses)}
+        if self.laser_m is None:
+            return joints | {"markers": self.marker_error_m(poses)}
+        return joints | {"laser": distance_m(poses.laser_m, self.laser_m)}
+
+    def joint_error_m(self, poses: Poses) -> Float:
+        """Return the distance (T, 25) [m] of every joint but the palm from the truth.
+
+        NaN where the pose is not valid or there is no truth.
+        """
+        error = distance_m(poses.position_m, self.joints_m)
+        return np.where(poses.valid, error, np.nan)[:, 1:]
+
+    def marker_error_m(self, poses: Poses) -> Float:
+        """Distance (T, M) [m] of the unfiltered caps; NaN where not seen."""
+        return distance_m(poses.markers_raw_m, self.markers_m)
+
+
+def distance_m(a: Float, b: Float) -> Float:
+    """Distances (...) of points (..., 3), same unit; NaN where either is."""
+    return np.asarray(np.linalg.norm(a - b, axis=-1), np.float64)
+
+
+def mean_known(values: Float) -> Float:
+    """Return the mean (T,) over the second axis of (T, K), ignoring NaN values.
+
+    NaN where no value is known.
+    """
+    known = ~np.isnan(values)
+    count = known.sum(axis=1)
+    total = np.where(known, values, 0.0).sum(axis=1)
+    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+
+
+class PosesFile:
+    """poses.npz of one hand; holds the spool of rows written so far."""
+
+    def __init__(self, path: Path, hand: str, marker_count: int) -> None:
+        """Open the spool in the folder of `path`.
+
+        Args:
+            path: The .npz to write.
+            hand: Name of the hand profile; every pose must carry it.
+            marker_count: M; every pose must have as many markers.
+
+        Raises:
+            RecordingError: The folder is missing or read-only.
+        """
+        self._path, self._hand = path, hand
+        self._markers = (marker_count, 3)
+        self._file = TableFile(path, record(marker_count), {"hand": hand})
+
+    def write(self, pose: HandPose) -> None:
+        """Append one row.
+
+        Raises:
+            RecordingError: Disk full; the run's file is given up, see `close`.
+            ValueError: Another hand or marker count than the file was opened for, or it is closed.
+        """
+        if pose.hand != self._hand or pose.markers_m.shape != self._markers:
+            what = f"{pose.hand!r} with {len(pose.markers_m)} markers"
+            raise ValueError(f"{self._path}: a pose of {what} does not fit, opened for {self._hand!r}")
+        self._file.write(pose)
+
+    def close(self) -> None:
+        """Write the .npz; an older file of that name is replaced only by a complete one.
+
+        Raises:
+            RecordingError: Disk full or folder gone; no part of a file is left.
+        """
+        self._file.close()
+
+
+class RunFiles:
+    """A `Sink` that writes the files of a run.
+
+    A poses.npz for each hand, and beside it the other results.
+
+    The first hand's poses stand at the path itself, those of others beside it under their names; objects, contact and
+    gestures in the same folder (`told_files`).
+    """
+
+    def __init__(self, path: Path, marker_counts: Mapping[str, int], objects: Sequence[str] = ()) -> None:
+        """Open the spools.
+
+        Args:
+            path: Of the first hand's poses.
+            marker_counts: Name of the hand profile -> M.
+            objects: Names of the objects.
+
+        Raises:
+            RecordingError: The folder is missing or read-only.
+        """
+        first, folder = next(iter(marker_counts)), path.parent
+        self._hands = {
+            hand: PosesFile(path if hand == first else path_of_hand(path, hand), hand, count)
+            for hand, count in marker_counts.items()
+        }
+        self._objects = {name: object_file(folder, name) for name in objects}
+        self._contacts = {
+            (hand, name): contact_file(folder, hand, name)
+            for hand, count in marker_counts.items()
+            if count  # a wrist device alone measures no contact
+            for name in objects
+        }
+        self._gestures = GesturesFile(folder)
+
+    def write(self, message: ResultMessage) -> None:
+        """Append a row to the file of its hand or object.
+
+        Raises:
+            RecordingError: Disk full; the file is given up.
+            ValueError: A hand or object that they were not opened for, or another marker count, or they are closed.
+        """
+        if isinstance(message, Gesture):
+            self._gestures.write(message)
+        elif isinstance(message, HandPose):
+            if message.hand not in self._hands:
+                raise ValueError(
+                    f"a pose of {message.hand!r} does not fit, opened for {', '.join(self._hands)}"
+                )
+            self._hands[message.hand].write(message)
+        elif isinstance(message, ObjectPose):
+            if message.object not in self._objects:
+                opened = ", ".join(self._objects) or "none"
+                raise ValueError(f"a pose of object {message.object!r} does not fit, opened for {opened}")
+            self._objects[message.object].write(message)
+        else:
+            if (message.hand, message.object) not in self._contacts:
+                raise ValueError(f"contact of {message.hand!r} and {message.object!r} does not fit")
+            self._contacts[message.hand, message.object].write(message)
+
+    def close(self) -> None:
+        """Write each file.
+
+        A file that cannot be completed does not keep any other from being written.
+
+        Raises:
+            RecordingError: Disk full or folder gone; no part of a file is left.
+        """
+        with ExitStack() as all_of_them:
+            files = (*self._hands.values(), *self._objects.values(), *self._contacts.values(), self._gestures)
+            for file in files:
+                all_of_them.callback(file.close)
+
+
+def path_of_hand(path: Path, hand: str) -> Path:
+    """Return the poses file of a hand other than the first.
+
+    poses.npz -> poses-HAND.npz.
+    """
+    return path.with_name(f"{path.stem}-{hand}{path.suffix}")
+
+
+def save_poses(path: Path, poses: Poses) -> None:
+    """Write poses.npz in one call.
+
+    Raises:
+        RecordingError: As `PosesFile`.
+    """
+    file = PosesFile(path, poses.hand, poses.marker_count)
+    for index in range(len(poses)):
+        file.write(poses.pose(index))
+    file.close()
+
+
+def load_poses(path: Path) -> Poses:
+    """Read a poses.npz.
+
+    Raises:
+        RecordingError: Missing, not an .npz, a key missing or of the wrong type or shape.
+    """
+    names = [*(record(0).names or ()), "hand"]
+    arrays = read_npz(path, names, "not a poses.npz of ours")
+    hand = str(arrays.pop("hand"))
+    try:
+        return Poses(hand=hand, **cast(dict[str, Any], arrays))
+    except (ValueError, AttributeError) as error:
+        raise RecordingError(f"{path}: not a poses.npz: {error}") from error

@@ -27,12 +27,18 @@ from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
 from common.hand.model import TIPS
 from common.messages import FINGER_COUNT, Source, WristDetections
-from master.outputs.device_place import DevicePlace
-from master.outputs.laser_fan import LASER_RGB, fan
-from master.outputs.palette import RAY_RGB, SOURCE_RGB, TRUTH_RGB, pack, series_rgb
+from master.outputs.drawing import (
+    LASER_RGB,
+    RAY_RGB,
+    SOURCE_RGB,
+    TRUTH_RGB,
+    DevicePlace,
+    fan,
+    pack,
+    series_rgb,
+)
 from master.outputs.poses import Poses
-from master.outputs.rerun_blueprint import WORLD, camera_path
-from master.outputs.rerun_columns import Columns, seen
+from master.outputs.rerun_blueprint import WORLD, Columns, camera_path, seen
 from master.rig.wrist import WristSetup
 
 _FAN_LINE_M = 0.0003

@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from common.errors import RecordingError
-from common.recording.messages import MessageRecording
-from common.recording.parts import plain_names
-from master.rig.files import RigFiles, load_setups
-from master.rig.setup import RigSetup
+from common.recording.messages import MessageRecording, plain_names
+from master.rig.setup import RigFiles, RigSetup, load_setups
 
 
 def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, bytes]:

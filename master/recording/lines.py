@@ -1,15 +1,21 @@
-"""Text output about a recording.
+"""`phalanx info` and its neighbours describe a recording in lines of text.
+
+Text output about a recording.
 
 The progress line, and the table of what is in a file.
+
+`phalanx info`.
 """
 
+from argparse import Namespace
 from typing import TextIO
 
 import msgspec
 
-from common.calibration.plain_names import is_plain
+from common.calibration.files import is_plain
+from common.command_line import echo
 from common.messages import WIRE_VERSION, Health
-from common.recording.messages import MessageRecording
+from common.recording.messages import MessageRecording, open_messages
 from master.recording.recorder import Progress
 
 RAW_FOLDERS = msgspec.json.Decoder(dict[str, str])
@@ -172,3 +178,13 @@ class EventMonitor:
                 lines.append(f"{at} {missing - self._missing} messages were not recorded")
             self._missing = max(missing, self._missing)
         return lines
+
+
+def info(options: Namespace) -> None:
+    """Show the contents of a recording of messages.
+
+    Streams, rates, length, files, and what happened.
+    """
+    recording = open_messages(options.file)
+    events = events_of(recording)
+    echo("\n".join(table(recording, events)))

@@ -1,13 +1,19 @@
-"""Player as a process.
+"""`phalanx play` runs the player as a process of its own.
+
+Player as a process.
 
 On the bus it acts as the master whose messages it plays, with commands of its own.
 
 Whatever listens to a live master (viewer, console, outputs) sees the recording as if it were live, with the times of
 then.
+
+`phalanx play`.
 """
 
 import secrets
+import sys
 import threading
+from argparse import Namespace
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,17 +24,19 @@ import msgspec
 
 from common.bus.bus import Bus
 from common.clock import SystemClock, now_ns
+from common.command_line import echo
 from common.errors import PhalanxError, RecordingError
 from common.machine import program
 from common.messages import WIRE_VERSION, Command, Health, Message
 from common.messages.streams import MASTER
 from common.recording.messages import MessageRecording, open_messages
-from master.outputs.bus import BusSink
-from master.outputs.files import RunFiles
-from master.outputs.sink import Sink
+from master.outputs.bus import BusSink, Sink
+from master.outputs.poses import RunFiles
 from master.recording.files import recorded_setups
+from master.recording.lines import ProgressLine, bar
 from master.recording.player import Passed, Player
 from master.recording.probe import Probe
+from master.run.process import host_bus, stop_on_signals
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,3 +270,53 @@ def _number(command: Command, key: str) -> float:
     if set(body) != {key} or not isfinite(body[key]):
         raise ValueError(text)
     return body[key]
+
+
+def play(options: Namespace) -> None:
+    """Play a recording."""
+    settings = PlaySettings(
+        options.file,
+        _speed(options.speed),
+        options.from_s,
+        options.to_s,
+        options.out,
+        options.loop,
+        options.solved,
+    )
+    stop, line = stop_on_signals(), ProgressLine(sys.stderr, "play")
+
+    def show(position_s: float, length_s: float) -> None:
+        done = position_s / length_s if length_s > 0.0 else 1.0
+        line.show(f"{bar(done)} {position_s:.1f} of {length_s:.1f} s")
+
+    connection = None if options.no_bus else host_bus(options.bus)
+    try:
+        passed = run_play(settings, connection, stop, _player_status, show)
+    finally:
+        if connection is not None:
+            connection.close()
+    poses = passed.digest.counts["poses"]
+    line.end(f"{poses} poses in {passed.seconds:.2f} s, {passed.poses_per_s:.0f} poses/s")
+    if not passed.whole:
+        echo("played in part, or with jumps: these are not the sums of the whole recording")
+    for text in passed.digest.lines():
+        echo(text)
+
+
+def _speed(text: str) -> float:
+    """The factor that was asked for; 0: as fast as it goes.
+
+    Raises:
+        PhalanxError: It is something else.
+    """
+    try:
+        factor = 0.0 if text == "max" else float(text)
+    except ValueError:
+        factor = -1.0
+    if not 0.0 < factor <= 1000.0 and text != "max":
+        raise PhalanxError(f"--speed {text}: must be max, or a number above 0 and at most 1000")
+    return factor
+
+
+def _player_status(line: str) -> None:
+    echo(f"play: {line}")

@@ -1,4 +1,19 @@
-"""Player of a recording.
+"""The player turns a recording into the same results on a replay clock.
+
+Playback clock of a recording.
+
+Where in the recording the player is; it can be paused, moved, and run at any speed.
+
+It reads no clock itself: it is passed the time.
+
+Digest of a run: SHA-256 over all poses in their order.
+
+Another is over objects, contact and gestures.
+
+Each message counts as it is encoded for the wire, with `latency_ns` set to 0: how long the machine took is no part of
+the result.
+
+Player of a recording.
 
 What the master received goes through the very same `Dispatcher` again, at any speed, from any time.
 
@@ -8,26 +23,125 @@ begin anywhere but at the start, a new world is shown what came two seconds befo
 settled by then, but what it publishes from there on is near to that of a whole pass, not equal to it.
 """
 
+import hashlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
+import msgspec
+
 from common.clock import now_ns
 from common.errors import PhalanxError
-from common.messages import Backlog, Contact, Gesture, HandPose, Message, ResultMessage
+from common.messages import Backlog, Contact, Gesture, HandPose, Message, ObjectPose, ResultMessage, encode
 from common.recording.messages import MessageRecording, Recorded
-from master.outputs.sink import Sink
-from master.recording.clock import ReplayClock
-from master.recording.digest import ResultDigest
+from master.outputs.bus import Sink
 from master.recording.lines import EventMonitor
 from master.rig.setup import RigSetup
-from master.run.app import Solved
+from master.run.app import Solved, StageTimes
 from master.run.dispatcher import Dispatcher
 from master.run.link_senders import SensorMessage
-from master.run.load_shedding import LoadShedding, Shedding
-from master.run.stages import StageTimes
+from master.run.solver_supervisor import LoadShedding, Shedding
 from master.run.tuning import LivePipeline
+
+
+class ReplayClock:
+    """Map from local time to time in the recording.
+
+    Holds a pair of both that belong together, the speed and the pause.
+
+    At speed 0 there is no such map: everything is due at once.
+    """
+
+    def __init__(self, begin_t_ns: int, speed: float, now_ns: int) -> None:
+        """Stand at `begin_t_ns` of the recording at `now_ns` here.
+
+        Raises:
+            ValueError: A speed below 0, or none.
+        """
+        self.paused = False
+        self._at_ns, self._since_ns = begin_t_ns, now_ns
+        self.speed = _checked(speed)
+
+    def position_ns(self, now_ns: int) -> int:
+        """Where it is [ns], recording's time."""
+        if self.paused or self.speed == 0.0:
+            return self._at_ns
+        return self._at_ns + round((now_ns - self._since_ns) * self.speed)
+
+    def wait_s(self, t_ns: int, now_ns: int) -> float | None:
+        """How long until what came at `t_ns` is due [s]; None: not before `resume`."""
+        if self.paused:
+            return None
+        if self.speed == 0.0:
+            self._at_ns = max(self._at_ns, t_ns)
+            return 0.0
+        return max((t_ns - self.position_ns(now_ns)) * 1e-9 / self.speed, 0.0)
+
+    def pause(self, now_ns: int) -> None:
+        """Stand still."""
+        self.seek(self.position_ns(now_ns), now_ns)
+        self.paused = True
+
+    def resume(self, now_ns: int) -> None:
+        """Go on."""
+        self._since_ns = now_ns
+        self.paused = False
+
+    def set_speed(self, factor: float, now_ns: int) -> None:
+        """Go on at another speed; 0: as fast as it goes.
+
+        Raises:
+            ValueError: Below 0, or no number.
+        """
+        factor = _checked(factor)
+        self.seek(self.position_ns(now_ns), now_ns)
+        self.speed = factor
+
+    def seek(self, t_ns: int, now_ns: int) -> None:
+        """Stand at `t_ns` now."""
+        self._at_ns, self._since_ns = t_ns, now_ns
+
+
+def _checked(speed: float) -> float:
+    if not 0.0 <= speed <= 1000.0:
+        raise ValueError(f"speed {speed:g}: must be 0 (as fast as it goes) to 1000")
+    return speed
+
+
+KINDS = {HandPose: "poses", ObjectPose: "objects", Contact: "contacts", Gesture: "gestures"}
+
+
+class ResultDigest:
+    """Holds a sum for each kind of message, and how many there were."""
+
+    def __init__(self, results: Iterable[ResultMessage] = ()) -> None:
+        """Begin with `results`."""
+        self._sums = {name: hashlib.sha256() for name in KINDS.values()}
+        self.counts = dict.fromkeys(KINDS.values(), 0)
+        for message in results:
+            self.take(message)
+
+    def take(self, message: ResultMessage) -> None:
+        """Count one message."""
+        name = KINDS[type(message)]
+        if isinstance(message, HandPose | ObjectPose) and message.latency_ns:
+            message = msgspec.structs.replace(message, latency_ns=0)
+        self._sums[name].update(encode(message))
+        self.counts[name] += 1
+
+    def hex(self, name: str = "poses") -> str:
+        """The sum of one kind, as 64 characters."""
+        return self._sums[name].hexdigest()
+
+    def lines(self) -> list[str]:
+        """A line for each kind that there was, poses always."""
+        return [
+            f"sha256 of {count} {name}: {self.hex(name)}"
+            for name, count in self.counts.items()
+            if count or name == "poses"
+        ]
+
 
 SOLVED = ("hand", "object", "contact", "gesture")
 AUXILIARY = ("health", "checklist", "preview", "still")  # published again as they were

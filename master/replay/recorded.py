@@ -1,17 +1,36 @@
-"""Reader of detections_<camera>.npz of a recording.
+"""Reader loads detections, tags and IMU samples of a recording.
+
+Reader of detections_<camera>.npz of a recording.
 
 Written by `phalanx-slave run -o`; returned as the messages of its rows.
+
+IMU data of a recording for one hand.
+
+With the setup that has the accuracy of these data.
+
+Reader of tags_<camera>.npz of a recording.
+
+Tag detections written by `phalanx-slave run -o`; returned as messages of its frames.
 """
 
+import logging
 from collections.abc import Iterator
+from dataclasses import replace as with_fields
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float, Int
+from common.calibration import ImuCalibration
 from common.errors import RecordingError
-from common.messages import FINGER_COUNT, MarkerDetections, WristDetections
-from common.recording.npz import read_npz
+from common.imu.fusion import OrientationFilter
+from common.imu.recording import IMU, read_imu
+from common.messages import FINGER_COUNT, ImuSample, MarkerDetections, TagDetections, WristDetections
+from common.recording.frame_recording import FrameRecording
+from common.recording.recorded_files import read_npz
+from master.rig.setup import RigSetup
 from master.run.sequence import CYCLE_FRAMES
 
 # Sigma of detections that state none: of full quality, and added where it is 0.
@@ -136,3 +155,109 @@ def _sigma_of(uv: Float, quality: Float) -> Float:
     """
     quality_loss = 1.0 - np.clip(np.nan_to_num(quality, nan=0.0), 0.0, 1.0)
     return np.where(np.isnan(uv[..., 0]), np.nan, _CLEAR_PX + _POOR_PX * quality_loss)
+
+
+_UNPLACED = (
+    "imu.q_palm_imu and imu.q_rig_world do not both state how the IMU is mounted and how its world lies to the rig; a "
+    "wrist rig alone needs the former"
+)
+_LOG = logging.getLogger(__name__)
+
+
+def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[ImuSample, ...], RigSetup]:
+    """Return the recording's IMU samples with orientation, and their setup.
+
+    The setup has the accuracy of these samples.
+
+    A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live slave makes
+    its orientation of them. The heading of that begins anywhere, whatever the rig's file states of it.
+
+    Raises:
+        RecordingError: imu.csv is broken.
+    """
+    imu = _imu_of(setup)
+    if imu is None or not (imu.placed if setup.has_markers else imu.q_palm_imu is not None):
+        others = imu is None and any(rig.imu is not None for rig in recording.manifest.all_rigs)
+        if (path := recording.folder / IMU).exists() and not others:
+            _LOG.warning("%s: not used: rig %r: %s", path, setup.rig.name, _UNPLACED)
+        return (), setup
+    samples = read_imu(recording.folder, imu.name)
+    oriented = any(np.isfinite(one.orientation_wxyz).all() for one in samples)
+    reckoned = not oriented or any(isfinite(one.heading_sigma_rad) for one in samples)
+    if reckoned and samples and imu.heading_sigma_rad is not None:
+        _LOG.warning(
+            "%s: orientations of rates and forces: imu.heading_sigma_rad not used", recording.folder / IMU
+        )
+        setup = _with_imu(setup, replace(imu, heading_sigma_rad=None))
+    if oriented:
+        return samples, setup
+    fusion = OrientationFilter(imu.rate_hz)
+    return tuple(fusion.push(one) for one in samples), setup
+
+
+def _imu_of(setup: RigSetup) -> ImuCalibration | None:
+    """The hand's IMU: on the palm, or on the forearm."""
+    if setup.rig.imu is not None or setup.wrist_rig is None:
+        return setup.rig.imu
+    return setup.wrist_rig.imu
+
+
+def _with_imu(setup: RigSetup, imu: ImuCalibration) -> RigSetup:
+    """Return the setup with the accuracy of its IMU replaced."""
+    if setup.has_markers and setup.rig.imu is not None:
+        return with_fields(setup, rig=replace(setup.rig, imu=imu))
+    if setup.wrist is None or setup.wrist_rig is None:
+        return setup
+    wrist_rig = replace(setup.wrist_rig, imu=imu)
+    rig = setup.rig if setup.has_markers else wrist_rig
+    return with_fields(setup, rig=rig, wrist=with_fields(setup.wrist, imu=imu), wrist_rig=wrist_rig)
+
+
+_ARRAYS = ("t_ns", "seq", "ids", "uv", "sigma_px", "row")
+
+
+def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
+    """The searched frames of tags_<camera>.npz.
+
+    It holds of T frames `t_ns` and `seq` (T,), and of N tags, frame by frame, `ids` (N,), `uv` (N, 4, 2), `sigma_px`
+    (N,) and `row` (N,), which of the frames each is of.
+
+    Raises:
+        RecordingError: The file is missing or broken.
+    """
+    path, fix = folder / f"tags_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
+    data = read_npz(path, _ARRAYS, fix)
+    try:
+        t_ns, seq, row, ids = (
+            data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq", "row", "ids")
+        )
+        uv, sigma = (data[name].astype(np.float64) for name in ("uv", "sigma_px"))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}: {fix}") from error
+    tags = len(ids) if ids.ndim == 1 else -1
+    for name, array, shape in (
+        ("t_ns", t_ns, (len(seq) if seq.ndim == 1 else -1,)),
+        ("uv", uv, (tags, 4, 2)),
+        ("sigma_px", sigma, (tags,)),
+        ("row", row, (tags,)),
+    ):
+        if array.shape != shape:
+            raise RecordingError(f"{path}: {name} has shape {array.shape}, expected {shape}: {fix}")
+    if ((row < 0) | (row >= len(t_ns))).any() or ((ids < 0) | (ids > 65535)).any():
+        raise RecordingError(f"{path}: row or ids: out of range: {fix}")
+    for frame in range(len(t_ns)):
+        own = np.flatnonzero(row == frame)
+        own = own[np.argsort(ids[own], kind="stable")]
+        try:
+            yield TagDetections(
+                camera=camera,
+                session=0,
+                seq=int(seq[frame]),
+                t_ns=int(t_ns[frame]),
+                ready_t_ns=int(t_ns[frame]),
+                ids=ids[own].astype(np.uint16),
+                uv=uv[own],
+                sigma_px=sigma[own],
+            )
+        except ValueError as error:
+            raise RecordingError(f"{path}: frame {frame}: {error}: {fix}") from error

@@ -1,20 +1,36 @@
-"""Rigs grouped by the hand that they observe.
+"""Rigs of one hand merge in one frame, with their objects and volume.
+
+Rigs grouped by the hand that they observe.
 
 Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Objects are
 those of all of them together.
 
 Each pair of cameras is calibrated in a frame of its own; `T_world_rig` is where that lies in the one they share. What
 rigs of one hand specify twice must be specified alike: a silent choice between two filters would be nobody's.
+
+Objects and gestures of a rig.
+
+Their files, and what must fit between them and the rig.
+
+Test volume of a rig.
+
+The box, stated by the rig and in the rig frame, in which its accuracy was tested.
+
+Outside it a hand is tracked as well as the cameras see it, but how well is unknown. So a joint reports whether it lies
+inside; that it does not, alone makes no pose invalid.
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
 
-from common.arrays import Float
-from common.calibration import ImuCalibration, Provenance, RigCalibration, Volume
-from common.calibration.parts import Matrix4, Quaternion, Row4, Vector3
+from common.arrays import Bool, Float
+from common.calibration import ImuCalibration, Provenance, RigCalibration, Volume, load
+from common.calibration.files import Matrix4, Quaternion, Row4, Vector3
+from common.calibration.gesture_settings import GestureSettings, default_gestures
+from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import check_places
 from common.errors import CalibrationError
 from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix, transform
@@ -207,3 +223,145 @@ def _quaternion(q_wxyz: Float) -> Quaternion:
 def _vector(point: Float) -> Vector3:
     x, y, z = (float(value) for value in point)
     return x, y, z
+
+
+DEFAULT_GESTURES = "default"
+
+
+def objects_of(rig: RigCalibration, objects: Mapping[str, ObjectProfile]) -> tuple[ObjectProfile, ...]:
+    """The objects that a rig names, in its order.
+
+    Raises:
+        CalibrationError: One has no file, its file calls it otherwise, a bead of it is not among the rig's
+            `free_markers`, or two share a bead, a tag or a tracker.
+    """
+    found: list[ObjectProfile] = []
+    for name in rig.objects:
+        if name not in objects:
+            raise CalibrationError(f"rig {rig.name!r}: objects: no object file for {name!r}")
+        one = objects[name]
+        if one.name != name:
+            raise CalibrationError(
+                f"rig {rig.name!r}: objects: the file of {name!r} calls it {one.name!r}: name"
+            )
+        for bead in one.markers:
+            if bead not in rig.free_markers:
+                raise CalibrationError(
+                    f"rig {rig.name!r}: free_markers: {bead!r} is missing, a marker of object {name!r}"
+                )
+        found.append(one)
+    _refuse_shared_features(rig.name, found)
+    return tuple(found)
+
+
+def _refuse_shared_features(rig: str, objects: Sequence[ObjectProfile]) -> None:
+    """Refuse objects that could be taken for each other."""
+    owner: dict[str, str] = {}
+    for one in objects:
+        tags = (
+            () if one.tags is None else tuple(f"tag {tag.id} of {one.tags.family}" for tag in one.tags.tags)
+        )
+        tracker = () if one.tracker is None else (f"tracker {one.tracker!r}",)
+        for feature in (*(f"marker {bead!r}" for bead in one.markers), *tags, *tracker):
+            if feature in owner:
+                raise CalibrationError(
+                    f"rig {rig!r}: objects {owner[feature]!r} and {one.name!r} both have {feature}"
+                )
+            owner[feature] = one.name
+
+
+def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]) -> None:
+    """Refuse an object or a tracker that the rigs of two hands share.
+
+    Its poses would come twice.
+
+    Args:
+        watched: Of each hand the name of its rig, and its objects.
+
+    Raises:
+        CalibrationError: With both rigs and the object.
+    """
+    owner: dict[str, str] = {}
+    for rig, objects in watched:
+        for one in objects:
+            for what in (
+                f"object {one.name!r}",
+                *(() if one.tracker is None else (f"tracker {one.tracker!r}",)),
+            ):
+                if what in owner:
+                    raise CalibrationError(
+                        f"rigs {owner[what]!r} and {rig!r} both have {what}: objects: let one of them have it"
+                    )
+                owner[what] = rig
+
+
+def load_objects(
+    calibration: Path | None, rigs: Sequence[RigCalibration], known: Mapping[str, ObjectProfile]
+) -> dict[str, ObjectProfile]:
+    """Load the objects that these rigs name.
+
+    From `known`, else <calibration>/objects/<name>.json.
+
+    Raises:
+        CalibrationError: One is in neither, or its file is broken.
+    """
+    found: dict[str, ObjectProfile] = {}
+    for rig in rigs:
+        for name in rig.objects:
+            if name in known:
+                found[name] = known[name]
+            elif calibration is None:
+                raise CalibrationError(
+                    f"rig {rig.name!r}: object {name!r}: give --calibration DIR with objects/{name}.json"
+                )
+            else:
+                found[name] = load(calibration / "objects" / f"{name}.json", ObjectProfile)
+    return found
+
+
+def load_gestures(calibration: Path | None, name: str | None) -> GestureSettings:
+    """Load <calibration>/gestures/<name>.json.
+
+    For a rig that names none, default.json, and where that does not exist either, the shipped settings.
+
+    Raises:
+        CalibrationError: A file that is named is missing, or one is broken.
+    """
+    if calibration is None:
+        if name is not None:
+            raise CalibrationError(f"gestures {name!r}: give --calibration DIR with gestures/{name}.json")
+        return default_gestures()
+    path = gestures_file(calibration, name)
+    return load(path, GestureSettings) if name is not None or path.exists() else default_gestures()
+
+
+def gestures_file(calibration: Path, name: str | None) -> Path:
+    """Where the gestures of a rig stand, that names them or does not."""
+    return calibration / "gestures" / f"{name or DEFAULT_GESTURES}.json"
+
+
+_EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1)
+
+
+def inside(volume: Volume | None, points_m: Float) -> Bool:
+    """Return which of the points lie in the volume.
+
+    Points (..., 3) [m] in the rig frame; the result is (...). The faces belong to the volume.
+
+    All do where the rig states none. A point that is NaN lies nowhere.
+    """
+    if volume is None:
+        return np.ones(points_m.shape[:-1], np.bool_)
+    low, high = np.array(volume.low_m), np.array(volume.high_m)
+    return np.asarray(((points_m >= low) & (points_m <= high)).all(axis=-1), np.bool_)
+
+
+def corners(volume: Volume) -> Float:
+    """The eight corners (8, 3) [m]; bit 0, 1, 2 of the row: high along x, y, z."""
+    ends = np.array([volume.low_m, volume.high_m])
+    return np.array([[ends[row >> axis & 1, axis] for axis in range(3)] for row in range(8)])
+
+
+def edges(volume: Volume) -> Float:
+    """The twelve edges (12, 2, 3) [m], to be drawn."""
+    return corners(volume)[np.array(_EDGES)]

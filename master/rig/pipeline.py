@@ -14,21 +14,18 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry.transforms import cross
 from common.messages import Detections
-from master.estimator.cameras import CameraArrays
-from master.estimator.cubic import CubicLaw
-from master.estimator.cycle_reader import CycleReader
+from master.estimator.epoch import CycleReader
 from master.estimator.estimator import Estimator
-from master.estimator.fused import FusedPipeline, WristSide
-from master.estimator.gate import rehearse
 from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
+from master.estimator.priors import CubicLaw, WristModel, loosened
+from master.estimator.sensors import CameraArrays
 from master.estimator.settings import Settings
-from master.estimator.smooth import HandOneEuro
-from master.estimator.wrist_model import WristModel, loosened
-from master.estimator.wrist_pipeline import WristPipeline
+from master.estimator.smoothing import HandOneEuro
+from master.estimator.wrist_pipeline import FusedPipeline, WristPipeline, WristSide
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
 from master.fabrik.depth import LAW_RESIDUAL, CalibrationResidual, depth_law, law_contradicts, law_residual
-from master.fabrik.intersection import RAYS, limits_of
+from master.fabrik.intersection import RAYS, limits_of, rehearse
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver

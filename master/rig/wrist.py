@@ -10,10 +10,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, FilterCalibration, ImuCalibration, RigCalibration, Volume
-from common.calibration.wrist import FingerLine
+from common.calibration.rig import FingerLine
 from common.hand.model import FINGERS, HandModel
-from common.hand.wrist_device import WristDevice
-from common.hand.wrist_joint import forearm_palm
+from common.hand.wrist import WristDevice, forearm_palm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +75,7 @@ class WristSetup(WristDevice):
     def flexed(self, wrist_angles_rad: Float) -> "WristSetup":
         """Return the setup with the palm of a flexed wrist.
 
-        The wrist is flexed by (2,) [rad] (`common.hand.wrist_joint`); all else is the same.
+        The wrist is flexed by (2,) [rad] (`common.hand.wrist`); all else is the same.
         """
         T = self.T_camera_palm.copy()
         T[:3, :3] = T[:3, :3] @ forearm_palm(wrist_angles_rad)

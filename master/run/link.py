@@ -2,7 +2,7 @@
 
 It has the sessions of all slaves, as a push machine without a socket.
 
-`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
+`common.link.session.RULES` defines what follows from each event; this file classifies datagrams as events.
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
 - A hello counts only with the proof that its sender has the secret of its name: a stolen device of the rig begins no
@@ -12,7 +12,7 @@ It has the sessions of all slaves, as a push machine without a socket.
 - A message whose time is yet to come, older than a second, or not after the last is not taken: the slave's clock was
   stepped, and the echoes will measure how far.
 - A message counts in the session of the process that sent the hello, within the bounds of its type and of the sender's
-  files (`master.run.admission`). One that makes something fail costs its sender a pause (`master.run.quarantine`).
+  files (`master.run.link_senders`). One that makes something fail costs its sender a pause (`master.run.link_senders`).
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
   first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
@@ -29,20 +29,23 @@ from types import MappingProxyType
 from common.clock import Clock
 from common.errors import BoundsError, MessageError
 from common.link.clock_offset import ClockEstimate
-from common.link.datagram import Address, Header, Kind, Opened, Opener, Refusal, parse
-from common.link.handshake import RULES, WELL_NS, Event, Role, State
-from common.link.link_key import LinkKey
+from common.link.datagram import Address, Header, Kind, LinkKey, Opened, Opener, Refusal, parse
 from common.link.session import (
     MAX_CAMERAS,
     NONCE_BYTES,
+    RULES,
+    WELL_NS,
     Beacon,
     EchoAnswer,
     EchoAsk,
+    Event,
     Hello,
     Random,
     RigKeys,
+    Role,
     Start,
     Started,
+    State,
     Unproven,
     Welcome,
     new_process_id,
@@ -59,10 +62,17 @@ from common.messages import (
     decode,
 )
 from common.messages.streams import sender_of
-from master.run.admission import SenderLimits
-from master.run.link_senders import ASKED, Sender, SensorMessage, Session, not_admitted, on_master_clock
-from master.run.quarantine import Quarantine
-from master.run.rejected_peers import RejectedPeers
+from master.run.link_senders import (
+    ASKED,
+    Quarantine,
+    RejectedPeers,
+    Sender,
+    SenderLimits,
+    SensorMessage,
+    Session,
+    not_admitted,
+    on_master_clock,
+)
 from master.run.sequence import CYCLE_FRAMES, CameraCounts
 
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten

@@ -1,21 +1,150 @@
-"""Sessions and senders as the master's link keeps them.
+"""Master's link admits senders, rejects them or silences them for a while.
+
+Bounds on what a sender may report, given the files of its rig.
+
+The message alone does not know these bounds. `common.messages` refuses what no sensor can measure. Here the
+picture's size, the number of markers and the rate are those of the sender's own files, and times are compared
+with the clock.
+
+Sessions and senders as the master's link keeps them.
 
 Besides, whether it takes a message of a sender.
+
+Who was rejected lately, by name.
+
+Second processes under one name, slaves of another wire version, slaves whose secret is not the one that the
+master has for their name, and slaves whose rig has other markers.
+
+A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
+the rig, and forgotten `LATELY_NS` after the last time.
+
+Silence senders for a while whose messages made the solver fail.
+
+Each failure is counted, and logged once with its cause.
+
+Bounds keep out what cannot be (`common.messages`, `master.run.link_senders`). What passes them and still makes
+something raise
+is a fault of this program; it costs the sender a pause, and the others nothing. The pause doubles with each fault from
+`FIRST_NS` to `LONGEST_NS`, and begins anew after a sender was well for `LONGEST_NS`.
 """
 
-from collections import deque
-from collections.abc import Mapping
+import logging
+import traceback
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import hypot
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
+from common.arrays import Float
+from common.clock import TokenBucket
 from common.link.clock_offset import ClockEstimate, OffsetEstimator
-from common.link.datagram import Address, Opener, Refusal, Sealer
-from common.link.session import Hello
-from common.link.token_bucket import TokenBucket
-from common.messages import ImuSample, TrackerPose, restamped
-from master.run.admission import OLD_NS, SenderLimits, Sensed, bucket_of, refused
-from master.run.sequence import Counted, Sequence
+from common.link.datagram import HEADER, MAGIC, Address, Header, Kind, Opener, Refusal, Sealer
+from common.link.session import Hello, RigKeys
+from common.messages import (
+    Detections,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+    restamped,
+)
+from master.rig.setup import RigSetup
+from master.run.sequence import CYCLE_FRAMES, Counted, Sequence
+
+READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
+OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
+
+Sensed = Detections | TagDetections | ImuSample | TrackerPose
+
+
+@dataclass(frozen=True, slots=True)
+class SenderLimits:
+    """Limits that the files state for one camera, IMU or tracker.
+
+    What is None is not known and not checked.
+
+    Attributes:
+        picture_px: Width and height.
+        markers: How many markers its rig names.
+        rate_hz: Messages per second and kind.
+    """
+
+    picture_px: tuple[int, int] | None = None
+    markers: int | None = None
+    rate_hz: float | None = None
+
+
+def bucket_of(rate_hz: float | None) -> TokenBucket:
+    """How many messages of one kind may come from a sender.
+
+    `rate_hz` is that of its files; None: they state none.
+    """
+    # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
+    faster = 2.0
+    any_hz = 10_000.0  # where no file states a rate
+    least_hz = 60.0
+    per_s = any_hz if rate_hz is None else max(faster * rate_hz, least_hz)
+    # of it may come at once: at the rate of the file, what a second's halt of the network held up
+    burst_s = 0.5
+    return TokenBucket(per_s, per_s * burst_s)
+
+
+def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
+    """Why a message cannot be of a sender with these files; None: it can."""
+    if isinstance(message, (ImuSample, TrackerPose)):  # a tuple: a union would be made anew for each message
+        return None
+    if abs(message.ready_t_ns - message.t_ns) > READY_NS:
+        return Refusal.READY_TIME
+    if isinstance(message, MarkerDetections) and limits.markers not in (None, len(message.area)):
+        return Refusal.MARKER_COUNT
+    if limits.picture_px is not None and any(_outside(uv, limits.picture_px) for uv in _points(message)):
+        return Refusal.OUTSIDE_PICTURE
+    return None
+
+
+def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
+    """Return the limits of all senders of these rigs.
+
+    Sender -> what its files state, of all cameras, IMUs and trackers of these rigs.
+    """
+    limits: dict[str, SenderLimits] = {}
+    for setup in setups:
+        for name, camera in setup.cameras.items():
+            size = camera.width_px, camera.height_px
+            own = None if name in setup.wrist_cameras else len(setup.rows.get(name, setup.markers))
+            before = limits[name].markers if name in limits else None  # of a rig that watches several hands
+            markers = own if before is None or own is None else own + before
+            rate_hz = camera.frame_rate_hz / (CYCLE_FRAMES if name in setup.wrist_cameras else 1)
+            limits[name] = SenderLimits(size, markers, rate_hz)
+        for rig in (setup.rig, setup.wrist_rig):
+            if rig is not None and rig.imu is not None:
+                # than its file: a sensor has its own rates, and takes the next that is enough
+                imu_faster = 2.0
+                limits[rig.imu.name] = SenderLimits(rate_hz=imu_faster * rig.imu.rate_hz)
+        tracker_hz = 500.0
+        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=tracker_hz))
+    return limits
+
+
+def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
+    if isinstance(message, WristDetections):
+        return message.laser_uv, message.tip_uv
+    if isinstance(message, MarkerDetections) and message.has_alternatives:
+        return message.uv, message.alt_uv
+    return (message.uv,)
+
+
+def _outside(uv: Float, size: tuple[int, int]) -> bool:
+    """Whether any point (..., 2) is far outside of a picture of this size [px].
+
+    Far: further out than one picture's size. NaN is not.
+    """
+    width, height = size
+    points: list[list[float]] = uv.reshape(-1, 2).tolist()
+    return any(u < -width or u > 2 * width or v < -height or v > 2 * height for u, v in points)
+
 
 OLD_NONCES = 64
 ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
@@ -132,4 +261,164 @@ def on_master_clock(
         t_ns=t_ns,
         ready_t_ns=clock.to_local(message.ready_t_ns),
         t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), stamped_ns - t_ns), max_sigma_ns),
+    )
+
+
+SeenT = TypeVar("SeenT")
+
+
+class RejectedPeer(NamedTuple):
+    """Where somebody who was rejected sends from: host, and what wire version."""
+
+    host: str
+    version: int
+
+
+class MarkerCounts(NamedTuple):
+    """How many markers a slave sends, and how many the master's rig has."""
+
+    sent: int
+    expected: int
+
+
+class RejectedPeers:
+    """Record of rejected senders of the rig.
+
+    Push machine. Holds for each sender when it was last rejected, and from where.
+    """
+
+    def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
+        """Nobody was, yet; `names` are those of the rig."""
+        self._keys, self._names = keys, frozenset(names)
+        self._duplicates: dict[str, tuple[int, RejectedPeer]] = {}
+        self._versions: dict[str, tuple[int, RejectedPeer]] = {}
+        self._unproven: dict[str, tuple[int, RejectedPeer]] = {}
+        self._markers: dict[str, tuple[int, MarkerCounts]] = {}
+        self._next_ns: int | None = None
+
+    def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
+        """Record a duplicate sender `name`, which sent a hello at `t_ns` [ns].
+
+        A second process under this name, while the first one was well.
+        """
+        self._duplicates[name] = t_ns, RejectedPeer(host, version)
+
+    def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
+        """Record a hello at `t_ns` [ns] as `name` without that device's secret.
+
+        The sender is at `host`.
+        """
+        self._unproven[name] = t_ns, RejectedPeer(host, version)
+
+    def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
+        """The slave `name` sent another number of markers than its rig has here.
+
+        It sent `sent` at `t_ns` [ns]; the rig has `expected`.
+        """
+        self._markers[name] = t_ns, MarkerCounts(sent, expected)
+
+    def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
+        """Take a datagram of another wire version.
+
+        What is not a rightly sealed hello of this rig is ignored.
+        """
+        if len(datagram) < HEADER.size or (self._next_ns is not None and t_ns < self._next_ns):
+            return
+        magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
+        if magic != MAGIC or kind != Kind.HELLO or rig != self._keys.rig_tag:
+            return
+        poll_ns = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
+        self._next_ns = t_ns + poll_ns
+        name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
+        if name in self._names:
+            self._versions[name] = t_ns, RejectedPeer(host, version)
+
+    def duplicates(self, t_ns: int) -> dict[str, RejectedPeer]:
+        """Name -> where its second process is, as of `t_ns` [ns]."""
+        return _lately(self._duplicates, t_ns)
+
+    def versions(self, t_ns: int) -> dict[str, RejectedPeer]:
+        """Name -> where it is and what it speaks, as of `t_ns` [ns]."""
+        return _lately(self._versions, t_ns)
+
+    def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
+        """Return where senders send a hello without their secret, as of `t_ns` [ns].
+
+        A mapping from name to where.
+        """
+        return _lately(self._unproven, t_ns)
+
+    def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:
+        """Name -> how many markers its slave sent lately and its rig has here.
+
+        Of those names alone where the two differ, as of `t_ns` [ns].
+        """
+        return _lately(self._markers, t_ns)
+
+
+def _lately(seen: dict[str, tuple[int, SeenT]], t_ns: int) -> dict[str, SeenT]:
+    lately_ns = 1_500_000_000  # both send a hello again within a second
+    return {name: what for name, (seen_ns, what) in seen.items() if t_ns - seen_ns < lately_ns}
+
+
+FIRST_NS = 1_000_000_000
+LONGEST_NS = 60_000_000_000
+MAX_CAUSES = 256  # that are remembered: later ones are counted, not logged
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Silence:
+    until_ns: int
+    length_ns: int
+
+
+class Quarantine:
+    """Push machine over faults.
+
+    Holds how often each sender's message failed, and until when it is silenced.
+
+    `fault` and `holds` may be called on several threads.
+    """
+
+    def __init__(self) -> None:
+        """Nobody is silenced."""
+        self._silences: dict[str, _Silence] = {}
+        self._causes: set[tuple[str, str]] = set()
+        self.faults: Counter[str] = Counter()
+
+    def fault(self, sender: str, error: Exception, t_ns: int) -> None:
+        """A message of `sender` made something raise `error` at `t_ns` [ns]."""
+        before = self._silences.get(sender)
+        again = before is not None and t_ns < before.until_ns + LONGEST_NS
+        length_ns = min(2 * before.length_ns, LONGEST_NS) if before is not None and again else FIRST_NS
+        self._silences[sender] = _Silence(t_ns + length_ns, length_ns)
+        self.note(sender, error)
+
+    def note(self, sender: str, error: Exception) -> None:
+        """Count a fault, and log it if its cause is news; nobody is silenced."""
+        self.faults[sender] += 1
+        cause = sender, _place(error)
+        if cause not in self._causes and len(self._causes) < MAX_CAUSES:
+            self._causes.add(cause)
+            _LOG.error("a message of %s could not be used: %r", sender, error, exc_info=error)
+
+    def release(self, sender: str) -> None:
+        """It was another one: forget that `sender` was silenced."""
+        self._silences.pop(sender, None)
+
+    def holds(self, sender: str, t_ns: int) -> bool:
+        """Whether `sender` is silenced at `t_ns` [ns]."""
+        silence = self._silences.get(sender)
+        return silence is not None and t_ns < silence.until_ns
+
+
+def _place(error: Exception) -> str:
+    """Kind and place of an error, by which a fault is known.
+
+    The same fault again is not news, whatever numbers its text has.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    return (
+        f"{type(error).__name__} {frames[-1].filename}:{frames[-1].lineno}" if frames else repr(type(error))
     )

@@ -13,32 +13,23 @@ from pathlib import Path
 
 from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock, SystemClock
-from common.link.link_key import LinkKey
-from common.service_manager import ServiceManager
-from common.supervisor import until
+from common.link.datagram import LinkKey
+from common.supervisor import ServiceManager, until
 from master.checklist.files import FileMonitor
 from master.checklist.publisher import ChecklistPublisher
 from master.commands.summary import write_summary
 from master.monitor.clocks import ClockMonitor
-from master.monitor.extrinsics import ExtrinsicsMonitor
-from master.monitor.loop import MonitoredLoop
-from master.monitor.report import Reporter, cameras_line, unplaced_line
-from master.outputs.bus import BusSink
-from master.outputs.devices import DevicePoses
-from master.outputs.files import RunFiles
-from master.outputs.sink import Sink
-from master.recording.child import RecorderProcess
-from master.recording.probe import Probe, Tapped
-from master.rig.files import RigFiles
-from master.rig.setup import RigSetup
-from master.run.admission import limits_of
-from master.run.app import Observed, RunFigures, run
+from master.monitor.report import ExtrinsicsMonitor, MonitoredLoop, Reporter, cameras_line, unplaced_line
+from master.outputs.bus import BusSink, DevicePoses, Sink
+from master.outputs.poses import RunFiles
+from master.recording.probe import Probe, RecorderProcess, Tapped
+from master.rig.setup import RigFiles, RigSetup
+from master.run.app import Observed, RunFigures, StageTimes, run
 from master.run.dispatcher import Dispatcher, new_dispatcher
 from master.run.ingest import Ingest
-from master.run.load_shedding import LoadShedding, Shedding
-from master.run.master_bus import host_bus
-from master.run.solver_supervisor import SolverSupervisor
-from master.run.stages import StageTimes
+from master.run.link_senders import limits_of
+from master.run.process import host_bus
+from master.run.solver_supervisor import LoadShedding, Shedding, SolverSupervisor
 from master.run.tuning import LivePipeline, RigTuning, renew
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]

@@ -26,13 +26,13 @@ from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras.grey import Pixels
-from slave.cameras.picamera2_library import open_library
 from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
     RATE_CONTROL,
     Picamera2Options,
     check_ranges,
     controls,
+    open_library,
     read_figures,
     wanted_settings,
 )

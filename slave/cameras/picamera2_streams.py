@@ -25,7 +25,7 @@ import numpy.typing as npt
 from common.arrays import Image
 from common.errors import CameraError
 from slave.cameras.grey import Pixels, grey, luma
-from slave.cameras.picamera2_library import Request
+from slave.cameras.picamera2_settings import Request
 
 ROUNDING_HZ = 0.005  # picamera2 rounds rates to two digits
 SAME_VIEW = 0.98  # crops that differ by a few rows of alignment show the same

@@ -11,9 +11,8 @@ from common.calibration import CameraCalibration
 from common.calibration.camera_settings import figures, same_exposed
 from common.clock import Clock
 from common.errors import CameraError, PictureError, RecordingError
-from common.recording.frame_pictures import FramePictures
 from common.recording.frame_recording import FrameRow, Manifest, open_recording
-from common.recording.pictures import decode, read_picture
+from common.recording.pictures import FramePictures, decode, read_picture
 from slave.sources import Frame
 
 

@@ -39,8 +39,8 @@ from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import Pixels
 from slave.cameras.settings import FrameObserver, change
+from slave.cameras.v4l2_controls import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
-from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 from slave.clocks import ForeignClock, clock_of, system_clock
 from slave.sources import Frame
 

@@ -1,11 +1,18 @@
-"""Options of several commands: rig, link, camera, simulated world."""
+"""Define the options of `run` and `record`, and what all commands share.
+
+Options of several commands: rig, link, camera, simulated world.
+
+Options of `phalanx-slave run`.
+
+Options of `phalanx-slave record`.
+"""
 
 from argparse import ArgumentParser
 from collections.abc import Callable
 from pathlib import Path
 
-from common.option_types import number, port
-from slave.drivers import LIGHTS
+from common.command_line import count, megabytes, number, port, positive
+from slave.drivers import CAMERAS, IMU_UNITS, IMUS, LIGHTS, REAL_IMUS, SCANS, TRACKERS
 
 BEACON_PORT = 47800
 BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
@@ -127,3 +134,224 @@ def add_simulated(command: ArgumentParser) -> None:
         metavar="Z",
         help="frames of a synthetic camera come later (default: %(default)g)",
     )
+
+
+def run(command: ArgumentParser) -> None:
+    """Send what a camera, an IMU or a tracker measures.
+
+    Detects markers, or fingers before a wrist device, in the frames of a camera, and sends where they are; or sends
+    what an IMU measures, or where a tracker on an object is. It waits for the master's start; then one sealed datagram
+    for each frame, sample or pose.
+
+    With -o it detects in all frames of a recording instead, and sends nothing: no clock, the same bytes on every run.
+
+    Examples:
+      phalanx-slave run --name left --rig desk --camera picamera2 --keys keys
+      phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
+            with a USB camera; docs/cameras.md states which settings are fixed and checked
+      PHALANX_RIG_KEY=$(cat rig.key) phalanx-slave run --name left --rig desk --camera replay:recordings/wave
+            a recording in place of a camera
+      phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
+            without hardware: renders the standard scene in real time
+      phalanx-slave run --name left --camera synthetic --calibration new --truth calib_json --key-file rig.key
+            a simulated camera that knows neither lens nor place nor colours yet, to practise setting it up
+      phalanx-slave run --name wrist --rig wrist --camera synthetic --scene grasp --scene-epoch-ns N --key-file rig.key
+            the camera of a wrist device, docs/wrist.md: the same hand as cameras of rig desk with the same scene, seed
+            and epoch; what they lose it still sees
+      phalanx-slave run --name left --rig desk --camera picamera2 --colours none --key-file rig.key
+            before there are colours: for `phalanx calibrate cameras capture`
+      phalanx-slave run --name left --rig desk --camera picamera2 --scan windows --key-file rig.key
+            only windows about the markers are scanned: for a board or a rate at which whole frames do not fit
+      phalanx-slave run --name left --rig desk --camera picamera2 --raw-folder recordings --key-file rig.key
+            keeps raw frames while it tracks whenever `phalanx record FILE --raw` asks; docs/recording.md
+      phalanx-slave run --rig wrist --imu ximu3:/dev/serial/by-id/PORT --key-file rig.key
+            an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md lists what is set and checked
+      phalanx-slave run --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
+            an LSM6DSOX on I2C bus 1 of a Pi; `phalanx-slave doctor --ports` lists ports and buses
+      phalanx-slave run --name tracker --rig desk-tracker --tracker openvr --key-file rig.key
+            by SteamVR on this PC: needs the extra `vive` and SteamVR running; docs/tracker.md
+      phalanx-slave run --name tracker --rig desk-tracker --tracker survive --serial LHR-1A2B3C4D --key-file rig.key
+            by libsurvive: starts survive-cli and reads its lines; survive:walk.rec.gz: what it recorded, at its pace
+      phalanx-slave run --name left --camera replay:recordings/wave --calibration calib_json -o detections_left.npz
+            offline: every frame of one camera; of a rig whose objects have tags those, too: tags_left.npz beside it;
+            of a wrist device laser points and fingertips of every strobe cycle. All cameras, and then the hand:
+            `phalanx replay`
+    """
+    add_place(
+        command,
+        "camera, IMU or tracker of this slave, as the rig's files call it (default: the rig's IMU)",
+        "calib_json; with -o what the recording has",
+    )
+    sensor = command.add_mutually_exclusive_group(required=True)
+    sensor.add_argument("--camera", metavar="DRIVER", help=CAMERAS)
+    sensor.add_argument("--imu", metavar="DRIVER", help=IMUS)
+    sensor.add_argument("--tracker", metavar="SYSTEM", help=TRACKERS)
+    add_link(command)
+    _add_detection(command)
+    add_camera(command)
+    vive = command.add_argument_group("tracker").add_argument
+    vive(
+        "--serial",
+        metavar="SERIAL",
+        help="which device: its serial number (LHR-...), for survive also its name there (WM0, T20); not needed if "
+        "there is one only",
+    )
+    vive("--program", default="survive-cli", metavar="PATH", help="survive-cli (default: that on the path)")
+    add_simulated(command)
+
+
+def _add_detection(command: ArgumentParser) -> None:
+    """What is done with the frames of a camera."""
+    add = command.add_argument_group("detection").add_argument
+    add(
+        "--colours",
+        choices=("follow", "fixed", "none"),
+        default="follow",
+        help="whether the colours of markers follow changes of the light (default: %(default)s; docs/light.md); none: "
+        "detect nothing, while the lens or the place of a camera is calibrated",
+    )
+    add(
+        "--engine",
+        choices=("numpy", "numba"),
+        default="numpy",
+        help="what detects markers, or fingers before a wrist device: numba is several times faster, needs the extra "
+        "`fast` (default: %(default)s)",
+    )
+    add(
+        "--scan",
+        choices=SCANS,
+        default="auto",
+        help="where markers are looked for: in the full frame; in windows about where they are expected, and strip by "
+        "strip where one is lost, which takes a lost marker a few frames more; auto: in the full frame as long as that "
+        "fits the time of a frame (default: %(default)s; docs/cameras.md)",
+    )
+    add(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="detect in all frames of --camera replay:FOLDER, and write detections_NAME.npz; nothing is sent",
+    )
+    add(
+        "--hand",
+        type=Path,
+        metavar="FILE",
+        help="with -o, for a wrist device: hand profile (default: DIR/hands/RIG'S HAND.json)",
+    )
+    add(
+        "--raw-folder",
+        type=Path,
+        metavar="DIR",
+        help="keep raw frames there, lossless, while it tracks, when `phalanx record FILE --raw` asks for them: a new "
+        "folder each time (docs/recording.md)",
+    )
+    add(
+        "--raw-reserve-mb",
+        type=megabytes,
+        default=200.0,
+        metavar="MB",
+        help="stay free on its disk (default: %(default)g)",
+    )
+    add(
+        "--faults",
+        type=Path,
+        metavar="FILE",
+        help="of a synthetic camera: what is wrong with it, JSON, read again whenever it changes (docs/checklist.md)",
+    )
+
+
+def record(command: ArgumentParser) -> None:
+    """Write raw frames of a camera to disk, and a real IMU beside it.
+
+    Without master or network: one folder per
+    camera. Or makes a recording of those of several cameras (--join), of videos or pictures that other programs made
+    (--from), or imu.csv of the table of an IMU (--imu-csv).
+
+    Examples:
+      phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
+      phalanx-slave record --name wrist --rig wrist --camera synthetic --imu ximu3:/dev/ttyACM0 --seconds 10 -o out
+            the rig's IMU beside the camera, as imu.csv on the clock of the frames
+      phalanx-slave record --join recordings/wave-left recordings/wave-right -o recordings/wave
+            one recording of all cameras, for `phalanx replay` and the calibrations
+      phalanx-slave record --join recordings/grasp-left recordings/grasp-right recordings/grasp-wrist -o grasp
+            of marker cameras and a wrist device: one of kind both
+      phalanx-slave record --from left.mp4 right.mp4 --calibration calib_json -o recordings/wave
+            videos named as the cameras of the rig; `phalanx replay left.mp4 right.mp4 ...` does this by itself
+      phalanx-slave record --from takes/7 --calibration calib_json --times takes/7/times.csv -o recordings/take7
+            a folder with a video, or a folder of pictures, for each camera; times.csv: camera,frame,time (seconds)
+      phalanx-slave record --from left=GOPR0012.MP4 right=GOPR0944.MP4 --calibration calib_json -o recordings/gopro
+            whose each one is, where its name does not state it
+      phalanx-slave record --imu-csv walk.csv --gyro-unit deg/s -o recordings/walk
+            reads a CSV with a header (docs/imu.md), reports its rate, gaps, bias and orientation, and writes imu.csv;
+            against a quaternion in it, how right the tilt is. Without -o it is only looked at
+    """
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("--camera", metavar="DRIVER", help=CAMERAS)
+    what.add_argument(
+        "--join", type=Path, nargs="+", metavar="RECORDING", help="recordings to join, one folder per camera"
+    )
+    what.add_argument(
+        "--from",
+        dest="foreign",
+        nargs="+",
+        metavar="[NAME=]PATH",
+        help="a video or a folder of pictures for each camera NAME (default: that of its name, else in the order of "
+        "the rig), or a folder of these",
+    )
+    what.add_argument(
+        "--imu-csv", type=Path, metavar="FILE", help="a CSV with a header: time, rates, forces of an IMU"
+    )
+    command.add_argument(
+        "-o", "--output", type=Path, metavar="FOLDER", help="new or empty; with --from also a former one"
+    )
+    add_place(
+        command,
+        "camera of this slave, a member of the rig; with --imu-csv its IMU (default: imu)",
+        rig="desk; with --from the one with these cameras",
+    )
+    command.add_argument("--seconds", type=positive, metavar="S", help="default: until Ctrl-C")
+    command.add_argument("--frames", type=count, metavar="N", help="end after so many recorded frames")
+    command.add_argument(
+        "--imu",
+        nargs="?",
+        const="synthetic",
+        metavar="DRIVER",
+        help=f"samples of the rig's IMU, too, as imu.csv: {REAL_IMUS}; without a driver, that of a synthetic camera",
+    )
+    command.add_argument(
+        "--every-frame",
+        action="store_true",
+        help="a synthetic camera does not keep time but draws every frame, however long that takes; all cameras of one "
+        "scene need the same --scene-epoch-ns",
+    )
+    command.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
+    command.add_argument(
+        "--reserve-mb", type=megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
+    )
+    command.add_argument(
+        "--queue-mb", type=megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
+    )
+    command.add_argument(
+        "--by-wall-clock",
+        action="store_true",
+        help="of --join: recorded on several machines: trust their wall clocks (keep them together by NTP or PTP)",
+    )
+    command.add_argument(
+        "--times",
+        type=Path,
+        metavar="FILE.csv",
+        help="of --from: when each frame was taken: camera,frame,time; frames from 0, time in seconds, or t_ns "
+        "(default: NAME.csv beside NAME.mp4, without the camera; else the video's time stamps, else the frame rate)",
+    )
+    table = command.add_argument_group("table of an IMU (--imu-csv)").add_argument
+    for measured, units in IMU_UNITS.items():
+        text = f"unit of {measured} where the header does not say it"
+        table(f"--{measured}-unit", choices=units, help=text)
+    table(
+        "--rate-hz",
+        type=positive,
+        metavar="HZ",
+        help="samples per second of a table without a column of time",
+    )
+    add_camera(command)
+    add_simulated(command)

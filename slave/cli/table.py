@@ -14,27 +14,31 @@ PROGRAM = Program(
     ABOUT,
     (
         Command(
-            "run", "run", "detect or measure live, and send", "slave.cli.run:run", "slave.commands.run:run"
+            "run",
+            "run",
+            "detect or measure live, and send",
+            "slave.cli.options:run",
+            "slave.commands.run:run",
         ),
         Command(
             "record",
             "record",
             "raw frames to disk; or a recording of several, or of your own videos",
-            "slave.cli.record:record",
+            "slave.cli.options:record",
             "slave.commands.record:run",
         ),
         Command(
             "colours",
             "set up",
             "colours of the markers of a camera, from a recording",
-            "slave.cli.colours:colours",
-            "slave.commands.colours:run",
+            "slave.cli.setup:colours",
+            "slave.commands.offline:run",
         ),
         Command(
             "doctor",
             "set up",
             "what of this device is well, and what is not; test of its lights",
-            "slave.cli.doctor:doctor",
+            "slave.cli.setup:doctor",
             "slave.doctor.command:run",
         ),
         Command(

@@ -16,21 +16,18 @@ import cv2
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
-from common.command_line import UsageError
+from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, CameraError, PhalanxError
-from common.terminal import echo, remark
-from slave import devices
-from slave.commands.camera import open_lit
-from slave.commands.importing import import_foreign
-from slave.commands.imu import import_table_of_imu
-from slave.commands.join import join
-from slave.commands.options import camera_of, camera_path, clock_of, objects_of, skew_of, world_of
-from slave.stopping import stop_by_signal
+from slave.commands import devices
+from slave.commands.join import import_foreign, join
+from slave.commands.options import camera_of, camera_path, clock_of, objects_of, open_lit, skew_of, world_of
+from slave.commands.run import import_table_of_imu
+from slave.service import stop_by_signal
 
 if TYPE_CHECKING:
     from common.recording.frame_recording import Manifest
     from slave.imu.recording import ImuRecorder
-    from slave.progress import Progress
+    from slave.recorder import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +71,7 @@ def record_camera(options: argparse.Namespace) -> int:
         PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
     """
     from common.recording.frame_writing import refuse_occupied
-    from slave.simulated import add_imu, imu_of
+    from slave.commands.simulated import add_imu, imu_of
 
     scene = _scene(options)
     manifest = _manifest(options, scene)
@@ -100,7 +97,7 @@ def record_camera(options: argparse.Namespace) -> int:
 
 
 def _scene(options: argparse.Namespace) -> _Scene:
-    from slave.simulated import FrameClock
+    from slave.commands.simulated import FrameClock
 
     rig, camera = camera_of(options)
     true_clock: Clock = SystemClock()
@@ -138,8 +135,7 @@ def _record(
 
     Returns how much was recorded, and the error that ended it early, if any.
     """
-    from slave.progress import Length, ProgressDisplay
-    from slave.recorder import Recorder, feed
+    from slave.recorder import Length, ProgressDisplay, Recorder, feed
 
     display = ProgressDisplay(options.name, sys.stderr)
     source = open_lit(options, scene.rig, scene.camera, scene.clock, scene.true_clock)

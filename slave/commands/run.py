@@ -1,4 +1,12 @@
-"""`phalanx-slave run`: detect and send in real time.
+"""Run `phalanx-slave run`: detect or measure live, and send.
+
+`phalanx-slave run --imu` and `record --imu-csv`.
+
+The first sends what an IMU measures, the second imports a table of IMU samples.
+
+`phalanx-slave run --tracker`: sends where a tracker on an object is.
+
+`phalanx-slave run`: detect and send in real time.
 
 It detects markers, or fingers before a wrist device, and sends where they are; or it sends the data of another
 sensor.
@@ -6,34 +14,149 @@ sensor.
 
 import argparse
 import os
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 
-from common.calibration import HandProfile, load
-from common.clock import Clock, SystemClock
-from common.command_line import UsageError
-from common.errors import CalibrationError, RecordingError
-from common.terminal import echo
-from slave.commands.camera import open_lit
+from common.calibration import HandProfile, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
+from common.clock import Clock, SkewedClock, SystemClock
+from common.command_line import UsageError, echo
+from common.errors import CalibrationError, PhalanxError, RecordingError
+from common.imu.csv_table import ACCEL, GYRO, MAG, TIME
+from slave.commands import devices
 from slave.commands.options import (
     camera_of,
     camera_path,
     clock_of,
+    epoch_of,
     objects_of,
+    open_lit,
+    rig_of,
     rig_path,
     secrets_of,
     skew_of,
     tree_of,
+    world_of,
 )
-from slave.service import COMPILE_S, Service
-from slave.stopping import stop_on_signals
+from slave.service import COMPILE_S, ConnectionLost, Service, stop_by_signal, stop_on_signals
+from slave.sources import TrackerSource
 
 if TYPE_CHECKING:
     from slave.raw import RawSettings
+    from slave.sources import ImuSource
     from slave.tuning import CameraFiles
+
+USUAL_NAME = "imu"
+
+
+def send_imu(options: argparse.Namespace) -> int:
+    """Send samples until stopped.
+
+    Raises:
+        PhalanxError: A file, the IMU, a key or the network is not as it must be.
+    """
+    from slave.commands.simulated import SyntheticSensor, imu_of
+    from slave.sender import Sender, send_samples
+    from slave.uplink import Uplink
+
+    rig = rig_of(options)
+    if options.name is None:
+        options.name = USUAL_NAME if rig.imu is None else rig.imu.name
+    if rig.imu is None or options.name != rig.imu.name:
+        has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
+        raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
+    orientation = devices.orientation_of(rig.imu)
+    true_clock = SystemClock()
+    clock = clock_of(options, true_clock)
+    key, access = secrets_of(options)
+
+    def print_line(line: str) -> None:
+        echo(f"{options.name}: {line}")
+
+    service = Service(os.environ, noun="samples")
+    with stop_by_signal() as stop:
+        if options.imu == "synthetic":
+            epoch_ns = epoch_of(options, true_clock)
+            imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
+            source: ImuSource = SyntheticSensor(imu.sample, imu.rate_hz, epoch_ns, clock, stop)
+        else:
+            source = devices.open_imu(
+                options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
+            )
+        uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+        send_samples(sender, source, orientation)
+    return 0
+
+
+def import_table_of_imu(options: argparse.Namespace) -> int:
+    """Notify what is in the table of an IMU, and write imu.csv if a folder is given.
+
+    Raises:
+        PhalanxError: It is missing or broken.
+    """
+    from common.imu.csv_table import read_csv
+    from slave.imu.recording import import_table
+
+    units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
+    table = read_csv(options.imu_csv, units, options.rate_hz)
+    import_table(table, options.name or USUAL_NAME, options.output, echo)
+    return 0
+
+
+def send_tracker(options: argparse.Namespace) -> int:
+    """Send poses until stopped.
+
+    Raises:
+        PhalanxError: A file, the tracker, a key or the network is not as it must be.
+    """
+    from slave.sender import Sender, send_poses
+    from slave.uplink import Uplink
+
+    rig = rig_of(options)
+    profile = devices.object_with(tree_of(options), rig, options.name)
+    true_clock = SystemClock()
+    clock = clock_of(options, true_clock)
+    key, access = secrets_of(options)
+
+    def print_line(line: str) -> None:
+        echo(f"{options.name}: {line}")
+
+    service = Service(os.environ, noun="poses")
+    with stop_by_signal() as stop:
+        source = _open(options, rig, profile, clock, true_clock, stop, service.connection_lost)
+        try:
+            uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+        except PhalanxError:
+            source.close()
+            raise
+        recorded = options.tracker.startswith("survive:")
+        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+        send_poses(sender, source, recorded)
+    return 0
+
+
+def _open(
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    profile: ObjectProfile,
+    clock: SkewedClock,
+    true_clock: SystemClock,
+    stop: threading.Event,
+    connection_lost: ConnectionLost,
+) -> TrackerSource:
+    if options.tracker != "synthetic":
+        named = options.tracker, options.serial, options.program
+        return devices.open_tracker(options.name, *named, clock, stop, connection_lost)
+    from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
+
+    epoch_ns = epoch_of(options, true_clock)
+    tracker = tracker_of(*world_of(options, rig), options.scene, options.seed, profile)
+    return SyntheticSensor(poses_of(options.name, tracker), TRACKER_HZ, epoch_ns, clock, stop)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -46,18 +169,18 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None and options.camera is None:
         raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
     if options.imu is not None:
-        from slave.commands.imu import send_imu
+        pass
 
         return send_imu(options)
     if options.name is None:
         raise UsageError("say which camera or tracker of the rig this is: --name NAME")
     if options.tracker is not None:
-        from slave.commands.tracker import send_tracker
+        pass
 
         return send_tracker(options)
     cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
     if options.output is not None:
-        from slave.commands.detect import detect
+        from slave.commands.offline import detect
 
         return detect(options)
     if options.hand is not None:

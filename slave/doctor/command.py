@@ -1,25 +1,166 @@
-"""`phalanx-slave doctor`: which slaves this machine has, and every check of each."""
+"""Run `phalanx-slave doctor`: every check of each slave, or test of its lights.
+
+The budget of a strobe as text, and a test of its lights without a camera.
+
+This is what `doctor --lights` prints and does.
+
+`phalanx-slave doctor --lights`: limits and test of a rig's lights.
+
+It shows what laser and LEDs may do, and tests them.
+
+`phalanx-slave doctor`: which slaves this machine has, and every check of each.
+"""
 
 import argparse
 import shlex
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from common.command_line import UsageError
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration.strobe import Limit, StrobeCalibration, limits_of
+from common.clock import SystemClock
+from common.command_line import UsageError, echo
+from common.errors import LightsError
 from common.machine import program
-from common.terminal import echo
+from common.recording.frame_recording import Illumination
 from slave.cli.table import PROGRAM
-from slave.doctor.camera import check_camera
-from slave.doctor.clock import check_clock
-from slave.doctor.devices import cameras_of, check_devices, check_groups
-from slave.doctor.finding import Finding, as_json, as_text, exit_code, fail, unseen
-from slave.doctor.host import check_host
-from slave.doctor.identity import check_keys, folder_of
-from slave.doctor.master import check_master
-from slave.doctor.programs import check_programs
-from slave.doctor.system import System, pairs
-from slave.doctor.unit import check_unit
+from slave.commands.devices import open_lights
+from slave.commands.options import camera_path, rig_of
+from slave.doctor.devices import cameras_of, check_camera, check_devices, check_groups
+from slave.doctor.finding import Finding, System, as_json, as_text, exit_code, fail, pairs, unseen
+from slave.doctor.host import check_clock, check_host, check_programs, check_unit
+from slave.doctor.master import check_keys, check_master, folder_of
 from slave.drivers import SWITCHED_LIGHTS
+from slave.lights.controller import CYCLE
+from slave.lights.interlock import Interlock
+from slave.lights.strobed import check_pulses, schedule_of
+from slave.service import stop_by_signal
+
+SHOWN = {"J": (1e6, "uJ"), "W": (1e3, "mW"), "W/m2/sr": (1e-3, "kW/m2/sr")}
+
+
+def budget(rig: RigCalibration, camera: CameraCalibration) -> str:
+    """Pulse, duty, power and every limit with its share, as lines.
+
+    Raises:
+        CalibrationError: The rig file has no strobe, or the exposure of the camera's file leaves no room for its light.
+    """
+    check_pulses(rig, camera)
+    strobe, laser = rig.strobe, rig.laser
+    assert strobe is not None
+    assert laser is not None
+    assert laser.fan_rad is not None  # the file was checked
+    period_s = len(CYCLE) / camera.frame_rate_hz
+    pulse_s = schedule_of(rig, camera).length_ns * 1e-9
+    duty = pulse_s / period_s
+    limits = limits_of(strobe, laser.fan_rad)
+    return "\n".join(
+        [
+            f"rig {rig.name}, camera {camera.name}: {1.0 / period_s:.1f} cycles/s, exposure {camera.exposure_us:g} us",
+            f"  each light  pulse {pulse_s * 1e6:.0f} us (at most {strobe.max_pulse_us:g})",
+            f"              duty {duty:.3f} (at most {strobe.max_duty:g} of any second)",
+            *_powers(strobe, duty),
+            "",
+            "at the longest pulse and the highest duty that the rig file allows:",
+            *_table([limit for limit in limits if not limit.fault]),
+            "",
+            "after a fault that leaves a light on:",
+            *_table([limit for limit in limits if limit.fault]),
+            "",
+            "Calculated from the numbers of the rig file; this is no certificate (docs/safety.md).",
+        ]
+    )
+
+
+def blink(
+    interlock: Interlock,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    stop: threading.Event,
+    seconds: float,
+) -> int:
+    """Switch laser and LEDs in turn and return the number of pulses.
+
+    They are switched as before a camera of that rate, through the guard.
+
+    Raises:
+        LightsError: The lights fail.
+    """
+    clock = SystemClock()
+    length_ns = schedule_of(rig, camera).length_ns
+    period_ns = round(1e9 / camera.frame_rate_hz)
+    next_ns = clock.now_ns()
+    end_ns = next_ns + round(seconds * 1e9)
+    frame = 0
+    while next_ns < end_ns and not stop.is_set():
+        lit = CYCLE[frame % len(CYCLE)]
+        if lit is not Illumination.AMBIENT and interlock.begin(lit, length_ns):
+            stop.wait(length_ns * 1e-9)
+            interlock.end()
+        frame, next_ns = frame + 1, max(next_ns + period_ns, clock.now_ns())
+        stop.wait((next_ns - clock.now_ns()) * 1e-9)
+    if interlock.counts["pulses"] == 0 and not stop.is_set():
+        raise LightsError("no pulse was allowed: the limits of the rig file refuse them all")
+    return interlock.counts["pulses"]
+
+
+def _powers(strobe: StrobeCalibration, duty: float) -> list[str]:
+    laser, led = strobe.laser, strobe.led
+    on_mw, mean_mw = laser.power_w * 1e3, laser.power_w * duty * 1e3
+    sr_mw, mean_sr_mw = led.intensity_w_sr * 1e3, led.intensity_w_sr * duty * 1e3
+    draws = [watts * duty * 1e3 for watts in (laser.electrical_w, led.electrical_w)]
+    others_mw, most_mw = strobe.others_w * 1e3, strobe.max_electrical_w * 1e3
+    return [
+        f"  laser       {on_mw:.3g} mW of light at {laser.wavelength_nm:g} nm while on, {mean_mw:.3g} mW in the mean",
+        f"  {led.count} LEDs      {sr_mw:.3g} mW/sr each at {led.wavelength_nm:g} nm, {mean_sr_mw:.3g} in the mean",
+        f"  supply      laser {draws[0]:.3g} + LEDs {draws[1]:.3g} + camera and IMU {others_mw:.3g} mW in the mean",
+        f"              together {sum(draws) + others_mw:.3g} mW (at most {most_mw:g})",
+    ]
+
+
+def _table(limits: list[Limit]) -> list[str]:
+    wide = max(len(limit.name) for limit in limits)
+    lines: list[str] = []
+    for limit in limits:
+        scale, unit = SHOWN.get(limit.unit, (1.0, limit.unit))
+        value, bound = scale * limit.value, scale * limit.bound
+        lines.append(
+            f"  {limit.name:<{wide}}  {value:8.3g} of {bound:8.3g} {unit:<8}{100.0 * limit.share:5.1f} %"
+            f"  {limit.source}"
+        )
+    return lines
+
+
+USUAL_RIG = "wrist"
+
+
+def look_at_lights(options: argparse.Namespace) -> int:
+    """Notify the budget; switch lights only where that is asked for.
+
+    Raises:
+        PhalanxError: A file is missing or broken, or the lights cannot be opened or switched.
+    """
+
+    rig = rig_of(options, USUAL_RIG)
+    camera = load(camera_path(options, rig.cameras[0]), CameraCalibration)
+    if not (options.blink or options.off):
+        echo(budget(rig, camera))
+        return 0
+    if not options.lights:
+        raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED_LIGHTS}")
+    with stop_by_signal() as stop:
+        interlock = open_lights(options.lights, rig)  # dark from here on
+        try:
+            if options.blink:
+                echo(budget(rig, camera))
+                blink(interlock, rig, camera, stop, options.blink)
+        finally:
+            interlock.close()
+    events = ", ".join(f"{event} {count}" for event, count in interlock.events().items())
+    echo(events if options.blink else "dark")
+    return 0
+
 
 ETC = "/etc/phalanx"
 
@@ -34,12 +175,12 @@ def run(options: argparse.Namespace) -> int:
         PhalanxError: The lights cannot be looked at or switched.
     """
     if options.ports:
-        from slave.devices import imu_places as places
+        from slave.commands.devices import imu_places as places
 
         echo(places())
         return 0
     if options.lights is not None:
-        from slave.commands.lights import look_at_lights
+        pass
 
         return look_at_lights(options)
     if options.blink or options.off:

@@ -1,17 +1,33 @@
-"""Checks of the machine itself.
+"""Check the machine: its system, clock, service and libraries.
+
+Checks of the machine itself.
 
 64 bit, which system on which board, Python, disk space, heat, supply.
+
+Checks of the system's clock.
+
+It matters for cameras in step and for people who read logs. Phalanx itself measures the clocks of its link.
+
+`chronyc -c tracking` is a line of 14 fields (chronyc(1)); the offset is seconds that the system is ahead of NTP.
+
+Checks of the service itself, as systemd reports it.
+
+Does it run, how often was it restarted, what did it print last.
+
+Checks of the libraries of the service, made by its own Python.
+
+Libraries that are installed for another Python do not help the service.
 """
 
 import platform
 import re
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from common.machine import Machine
-from slave.doctor.finding import Finding, fail, ok, unseen, warn
-from slave.doctor.system import System
+from slave.doctor.finding import Finding, System, fail, ok, pairs, unseen, warn
 
 RELEASES = {"trixie": "13", "bookworm": "12"}  # of Debian, and of the Raspberry Pi OS made from it
 PYTHONS = ((3, 11), (3, 13))
@@ -134,3 +150,162 @@ def _flags(system: System) -> int | None:
         return int(found[1], 16)
     flags = Machine(system.root, system.environment).metrics().get("throttled")
     return None if flags is None else int(flags)
+
+
+INSTALL = (
+    "sudo apt install chrony; the installer adds /etc/chrony/conf.d/phalanx.conf with the master's machine"
+)
+
+
+def check_clock(system: System, master: str | None) -> Iterator[Finding]:
+    """What keeps the clock, and how well."""
+    asked = system.run(("chronyc", "-c", "-n" if master is None else "-N", "tracking"), 5.0)
+    if asked.code is None:
+        yield _without_chrony(system)
+        return
+    fields = asked.out.strip().split(",")
+    # fields
+    if asked.code != 0 or len(fields) != 14:
+        stated = (asked.error or asked.out).strip().splitlines()[-1:] or ["no answer"]
+        yield warn("clock", f"chronyd: {stated[0]}", "sudo systemctl enable --now chrony")
+        return
+    try:
+        # offset s
+        # rms s
+        offset_s, rms_s = float(fields[4]), float(fields[6])
+    except ValueError:
+        yield warn("clock", f"chronyd reports {asked.out.strip()!r}", "sudo systemctl restart chrony")
+        return
+    yield _tracking(fields, offset_s, rms_s, master)
+
+
+def _tracking(fields: list[str], offset_s: float, rms_s: float, master: str | None) -> Finding:
+    reference, stratum, leap = 1, 2, 13
+    who = fields[reference] or "nobody"
+    if fields[leap] == "Not synchronised":
+        fix = "is the master's machine on, with `local stratum 8` and `allow` in its chrony.conf? `chronyc sources`"
+        return warn("clock", "chrony has found no time yet", fix)
+    stated = (
+        f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[stratum]}), {rms_s * 1e6:.0f} µs in the mean"
+    )
+    far_s = 1e-3  # libcamera brings cameras in step by the system's clock: its error adds to theirs
+    if abs(offset_s) > far_s:
+        return warn(
+            "clock", stated, "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`"
+        )
+    if master is not None and who != master:
+        return warn(
+            "clock", f"{stated}; not by {master}", "see /etc/chrony/conf.d/phalanx.conf, `chronyc sources`"
+        )
+    return ok("clock", stated)
+
+
+def _without_chrony(system: System) -> Finding:
+    asked = system.run(("timedatectl", "show", "--property=NTP", "--property=NTPSynchronized"), 5.0)
+    if asked.code is None or asked.code != 0:
+        return unseen("clock", "neither chronyc nor timedatectl answers")
+    stated = pairs(asked.out)
+    if stated.get("NTPSynchronized") == "yes":
+        return warn("clock", "by NTP, but how far off is not known without chrony", INSTALL)
+    return fail("clock", "nothing keeps it", INSTALL)
+
+
+ASKED = ("LoadState", "ActiveState", "SubState", "UnitFileState", "NRestarts", "ExecMainStatus", "StatusText")
+# Ends before the program begins (systemd.exec(5)): what is wrong, and what mends it.
+BEFORE = {
+    "203": ("its program cannot be run", "phalanx-slave install, or phalanx fleet deploy"),
+    "216": ("a group of the unit is missing", "sudo systemd-sysusers"),
+    "243": ("a key of /etc/phalanx/keys is missing", "phalanx fleet deploy brings the keys"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """How a service is.
+
+    Attributes:
+        finding: For people.
+        runs: Whether it has its device.
+    """
+
+    finding: Finding
+    runs: bool
+
+
+def check_unit(system: System, name: str) -> Unit:
+    """The service of the slave `name`."""
+    unit, check = f"phalanx-slave@{name}.service", "service"
+    asked = system.run(("systemctl", "show", unit, *(f"--property={one}" for one in ASKED)), 10.0)
+    if asked.code != 0:
+        return Unit(unseen(check, f"{unit}: systemd does not answer here"), False)
+    stated = pairs(asked.out)
+    if stated.get("LoadState") != "loaded":
+        install = "phalanx-slave install --master HOST, or phalanx fleet deploy from the PC"
+        return Unit(warn(check, f"{unit}: not installed", install), False)
+    state, status = stated.get("ActiveState", ""), stated.get("ExecMainStatus", "")
+    restarts, words = stated.get("NRestarts", "0"), stated.get("StatusText", "")
+    log = f"journalctl -u {unit} -n 50"
+    if state == "active":
+        if restarts != "0":
+            return Unit(warn(check, f"{words}; restarted {restarts} times since it was started", log), True)
+        if stated.get("UnitFileState") != "enabled":
+            return Unit(warn(check, f"{words}; not started at boot", f"sudo systemctl enable {unit}"), True)
+        return Unit(ok(check, words or "active"), True)
+    if state == "inactive":
+        return Unit(fail(check, f"{unit}: stopped", f"sudo systemctl start {unit}"), False)
+    why, fix = BEFORE.get(status, (words or f"it ended with {status}", log))
+    runs = state == "activating" and stated.get("SubState") == "start"
+    return Unit(fail(check, f"{state}, {restarts} restarts: {why}", fix), runs)
+
+
+CURRENT = "/opt/phalanx/current"
+TIMEOUT_S = 60.0  # numpy and cv2 from a cold SD card
+NEEDED = ("numpy", "cv2", "zenoh", "cryptography", "msgspec")
+# One name after another, each printed before the next is tried: one that crashes prints nothing.
+PROBE = """
+import ctypes, importlib, sys
+for name in sys.argv[1:]:
+    try:
+        if name == "libstdc++":
+            ctypes.CDLL("libstdc++.so.6")
+            said = "yes"
+        else:
+            said = "yes " + str(getattr(importlib.import_module(name), "__version__", ""))
+    except BaseException as error:
+        said = "no " + type(error).__name__ + ": " + str(error)
+    print(name, " ".join(said.split()), flush=True)
+"""
+FIXES = {
+    "picamera2": "sudo apt install python3-picamera2 --no-install-recommends; the service's environment must see the "
+    "system's packages (python3 -m venv --system-site-packages), and not bring a numpy of another major version",
+    "libstdc++": "sudo apt install libstdc++6",
+    "numba": "pip install 'phalanx-hand[fast]' into the service's environment, or leave --engine numba away",
+    "gpiod": "sudo apt install python3-libgpiod, version 2",
+}
+
+
+def check_programs(system: System, extra: Sequence[str]) -> Iterator[Finding]:
+    """Whether the service's Python can import what a slave needs, and `extra`."""
+    python = system.path(CURRENT) / "bin/python"
+    if python.exists():
+        where = f"in {CURRENT}"
+    else:
+        python, where = sys.executable, "in the doctor's own environment"
+        yield warn(
+            "installed",
+            f"no {CURRENT}: it is asked {where}",
+            "phalanx-slave install --master HOST, or phalanx fleet deploy from the PC",
+        )
+    names = ("libstdc++", *NEEDED, *extra)
+    asked = system.run((str(python), "-c", PROBE, *names), TIMEOUT_S)
+    stated = pairs(asked.out, " ")
+    for name in names:
+        fix = FIXES.get(
+            name, f"install again: the service's environment {where} lacks it, or has it for another Python"
+        )
+        if name not in stated:
+            end = asked.error.strip().splitlines()[-1:] or [f"it ended with {asked.code}"]
+            yield fail(name, f"crashed while it was imported {where}: {end[0]}", fix)
+            return
+        found, _, text = stated[name].partition(" ")
+        yield ok(name, text or "there") if found == "yes" else fail(name, f"{text} ({where})", fix)

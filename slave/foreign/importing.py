@@ -19,14 +19,21 @@ from common.arrays import Int
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
 from common.errors import PictureError, RecordingError
-from common.recording.frame_pictures import frame_name
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
 from common.recording.frame_writing import RecordingWriter, refuse_occupied
 from common.recording.picture_size import size_of
-from common.recording.pictures import decode, read_picture
-from common.recording.video import VideoFrames
-from slave.foreign.sources import Source, found_in, pictures_in, rig_for, sources_of
-from slave.foreign.times import Timed, by_rate, by_table, read_times
+from common.recording.pictures import VideoFrames, decode, frame_name, read_picture
+from slave.foreign.sources import (
+    Source,
+    Timed,
+    by_rate,
+    by_table,
+    found_in,
+    pictures_in,
+    read_times,
+    rig_for,
+    sources_of,
+)
 
 NOTE = "imported from "
 

@@ -1,4 +1,19 @@
-"""Driver of the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
+"""Drive the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
+
+Registers, rates and FIFO format of an ST LSM6DSOX.
+
+Pure: bytes in, measurements out.
+
+Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO's state the same, and what
+is used here is the same in it. A word of the FIFO is a tag and six bytes, little endian:
+
+    tag   7..3  what: 1 gyroscope, 2 accelerometer, 4 time stamp    2..1  number of the time slot, modulo 4    0  parity
+
+All words of one time slot were measured together; the time stamp is among them, so that none is torn and each has its
+own time. One part's clock is up to some percent off: `INTERNAL_FREQ_FINE` reports by how much, in steps of 0.15 %, for
+the time stamps and the rates alike.
+
+Driver of the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
 
 It reads the FIFO: every sample is whole and has its own time stamp.
 
@@ -8,24 +23,176 @@ its FIFO; whatever is there is fetched some hundred times a second. A process th
 208 Hz (512 words). It has no magnetometer. Its stamps become times by `DeviceClock`.
 """
 
+import struct
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import IntEnum
 from errno import EACCES, EIO, ENOENT, ENXIO, EREMOTEIO, ETIMEDOUT
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from smbus2 import SMBus, i2c_msg
 
+from common.arrays import Float
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.clocks import ClockSteppedError, DeviceClock
-from slave.imu import lsm6dsox_fifo as chip
-from slave.imu.lsm6dsox_fifo import Rate, Register
+
+
+class Fifo(NamedTuple):
+    """Registers' values and scales of the LSM6DSOX and its FIFO."""
+
+    standard_gravity: float = 9.80665  # m/s^2
+    identity: int = 0x6C
+    sw_reset: int = 0x01  # CTRL3_C, clears itself
+    fifo_continuous: int = 0x46  # newest words replace the oldest
+    overrun: int = 0x08  # FIFO_STATUS2: words were replaced since it was read
+    word: int = 7  # bytes
+    freq_fine_step: float = 0.0015
+    gyro: int = 1
+    accel: int = 2
+    stamp: int = 4
+
+
+FIFO = Fifo()
+
+
+class Register(IntEnum):
+    """Addresses, DS12814 section 8."""
+
+    FIFO_CTRL1 = 0x07
+    FIFO_CTRL2 = 0x08
+    FIFO_CTRL3 = 0x09
+    FIFO_CTRL4 = 0x0A
+    WHO_AM_I = 0x0F
+    CTRL1_XL = 0x10
+    CTRL2_G = 0x11
+    CTRL3_C = 0x12
+    CTRL9_XL = 0x18
+    CTRL10_C = 0x19
+    OUT_TEMP_L = 0x20
+    FIFO_STATUS1 = 0x3A
+    INTERNAL_FREQ_FINE = 0x63
+    FIFO_DATA_OUT_TAG = 0x78  # read on, it rolls over from 0x7E to here
+
+
+OTHERS = {
+    0x69: "LSM6DS3",
+    0x6A: "LSM6DSL or LSM6DS3TR-C",
+    0x6B: "ISM330DHCX",
+    0xEA: "ICM-20948",
+    0x68: "MPU-6050",
+}
+RAD_S_PER_LSB = float(np.radians(0.070))  # at 2000 deg/s, DS12814 table 2
+M_S2_PER_LSB = 0.488e-3 * FIFO.standard_gravity  # at 16 g
+
+
+class Rate(NamedTuple):
+    """An output data rate.
+
+    Its code in CTRL1_XL, CTRL2_G and FIFO_CTRL3, and its nominal value [Hz].
+    """
+
+    code: int
+    rate_hz: float
+
+
+RATES = [Rate(code, 6667.0 / (1 << (10 - code))) for code in range(1, 7)]  # 13 to 417 Hz, AN5272 section 6.4
+
+
+def settings(rate: Rate) -> dict[Register, int]:
+    """Return the register values written at the start, with the FIFO still off.
+
+    16 g, 2000 deg/s, blocks that do not tear, time stamps.
+    """
+    fifo_off = 0x40  # FIFO_CTRL4: a time stamp in every slot
+    return {
+        Register.CTRL9_XL: 0xE2,  # I3C off
+        Register.CTRL3_C: 0x44,  # block data update; addresses count on
+        Register.CTRL1_XL: rate.code << 4 | 0b01 << 2,
+        Register.CTRL2_G: rate.code << 4 | 0b11 << 2,
+        Register.CTRL10_C: 0x20,
+        Register.FIFO_CTRL1: 0,
+        Register.FIFO_CTRL2: 0,
+        Register.FIFO_CTRL3: rate.code << 4 | rate.code,
+        Register.FIFO_CTRL4: fifo_off,
+    }
+
+
+def temperature_c(data: bytes) -> float:
+    """Two bytes of OUT_TEMP; DS12814 section 4.3."""
+    [raw] = struct.unpack("<h", data)
+    return 25.0 + raw / 256.0
+
+
+class Measured(NamedTuple):
+    """Measurements of one time slot.
+
+    Its stamp [25 us nominally] since the start, rate (3,) [rad/s], force (3,) [m/s^2].
+    """
+
+    ticks: int
+    gyro_rad_s: Float
+    accel_m_s2: Float
+
+
+class Slots:
+    """Push machine that assembles FIFO words into time slots.
+
+    Holds the words of the slot that is not complete, and how often the stamps have wrapped.
+
+    Attributes:
+        counts: `broken.parity` of a tag, `broken.incomplete` slots, `clipped` axes, which are NaN.
+    """
+
+    def __init__(self) -> None:
+        """Begin between two slots."""
+        self.counts: Counter[str] = Counter()
+        self._slot = -1
+        self._words: dict[int, bytes] = {}
+        self._ticks: int | None = None
+
+    def push(self, data: bytes) -> Iterator[Measured]:
+        """The slots that whole words of the FIFO complete, in order."""
+        for start in range(0, len(data) - FIFO.word + 1, FIFO.word):
+            tag, word = data[start], data[start + 1 : start + FIFO.word]
+            if tag.bit_count() % 2:
+                self.counts["broken.parity"] += 1
+                continue
+            what, slot = tag >> 3, tag >> 1 & 3
+            if slot != self._slot:
+                self.counts["broken.incomplete"] += bool(self._words)
+                self._slot, self._words = slot, {}
+            if what in (FIFO.gyro, FIFO.accel, FIFO.stamp):
+                self._words[what] = word
+            if len(self._words) == 3:
+                yield self._measured(self._words)
+                self._words = {}
+
+    def _measured(self, words: dict[int, bytes]) -> Measured:
+        [raw] = struct.unpack("<I2x", words[FIFO.stamp])
+        if self._ticks is None:
+            self._ticks = raw
+        else:
+            self._ticks += (raw - self._ticks) % (1 << 32)  # it wraps after 30 hours
+        return Measured(
+            self._ticks,
+            self._vector(words[FIFO.gyro], RAD_S_PER_LSB),
+            self._vector(words[FIFO.accel], M_S2_PER_LSB),
+        )
+
+    def _vector(self, word: bytes, scale: float) -> Float:
+        raw = np.array(struct.unpack("<3h", word), float)
+        # clipped
+        clipped = np.abs(raw) >= 32767
+        self.counts["clipped"] += int(clipped.sum())
+        return np.where(clipped, np.nan, raw * scale)
+
 
 ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply
 POLL_S = 0.004
@@ -86,10 +253,10 @@ def rate_of(rate_hz: float) -> Rate:
     Raises:
         ImuError: It has none.
     """
-    for rate in chip.RATES:
+    for rate in RATES:
         if rate.rate_hz >= rate_hz:
             return rate
-    most = chip.RATES[-1].rate_hz
+    most = RATES[-1].rate_hz
     raise ImuError(f"imu.rate_hz: {rate_hz:g} Hz: an LSM6DSOX on I2C gives at most {most:.0f} Hz")
 
 
@@ -128,7 +295,7 @@ class Lsm6dsoxImu:
         """
         self._name, self._place, self._clock, self._stop = name, place, clock, stop
         rate = rate_of(rate_hz)
-        self._slots = chip.Slots()
+        self._slots = Slots()
         self._came: deque[ImuSample] = deque()
         self._counts: Counter[str] = Counter()
         self._temperature_c = float("nan")
@@ -174,24 +341,24 @@ class Lsm6dsoxImu:
     def _begin(self, rate: Rate) -> float:
         """Set it up; how much faster than nominal its clock runs."""
         identity = self._get(Register.WHO_AM_I)[0]
-        if identity != chip.FIFO.identity:
-            other = chip.OTHERS.get(identity, "another part")
+        if identity != FIFO.identity:
+            other = OTHERS.get(identity, "another part")
             raise ImuError(
-                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {chip.FIFO.identity:#04x}"
+                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX reports {FIFO.identity:#04x}"
             )
-        self._put(Register.CTRL3_C, chip.FIFO.sw_reset)
+        self._put(Register.CTRL3_C, FIFO.sw_reset)
         reset_polls = 20
         for _ in range(reset_polls):
-            if not self._get(Register.CTRL3_C)[0] & chip.FIFO.sw_reset:
+            if not self._get(Register.CTRL3_C)[0] & FIFO.sw_reset:
                 break
             self._stop.wait(POLL_S)
-        for register, value in chip.settings(rate).items():
+        for register, value in settings(rate).items():
             self._set(register, value)
         fine = int.from_bytes(self._get(Register.INTERNAL_FREQ_FINE), signed=True)
         settle_s = 0.1  # a gyroscope starts within 70 ms
         self._stop.wait(settle_s)
-        self._set(Register.FIFO_CTRL4, chip.FIFO.fifo_continuous)
-        return 1.0 + chip.FIFO.freq_fine_step * fine
+        self._set(Register.FIFO_CTRL4, FIFO.fifo_continuous)
+        return 1.0 + FIFO.freq_fine_step * fine
 
     def _fetch(self) -> None:
         """Take from the FIFO what is there, or wait a little."""
@@ -199,11 +366,11 @@ class Lsm6dsoxImu:
         arrival_ns = self._clock.now_ns()
         most_words = 90  # of one read: half a kilobyte
         words = min((high & 3) << 8 | low, most_words)
-        self._counts["imu.overrun"] += bool(high & chip.FIFO.overrun)
+        self._counts["imu.overrun"] += bool(high & FIFO.overrun)
         temperature_ns = 1_000_000_000
         if self._heated_ns is None or arrival_ns - self._heated_ns >= temperature_ns:
             self._heated_ns = arrival_ns
-            self._temperature_c = chip.temperature_c(self._get(Register.OUT_TEMP_L, 2))
+            self._temperature_c = temperature_c(self._get(Register.OUT_TEMP_L, 2))
         if not words:
             self._silent += 1
             if self._silent > SILENT_POLLS:
@@ -211,7 +378,7 @@ class Lsm6dsoxImu:
             self._stop.wait(POLL_S)
             return
         self._silent = 0
-        fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * chip.FIFO.word))
+        fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * FIFO.word))
         dated = [(stamp, one) for one in fresh if (stamp := self._stamp(one.ticks, arrival_ns)) is not None]
         self._came.extend(self._sample(stamp, one) for stamp, one in dated)
 
@@ -225,7 +392,7 @@ class Lsm6dsoxImu:
         self._counts["broken.time"] += not possible
         return stamp_ns if possible else None
 
-    def _sample(self, stamp_ns: int, one: chip.Measured) -> ImuSample:
+    def _sample(self, stamp_ns: int, one: Measured) -> ImuSample:
         passed = max(1, round((stamp_ns - self._stamp_ns) / self._period_ns)) if self._seq >= 0 else 1
         self._seq, self._stamp_ns = self._seq + passed, stamp_ns
         t_ns = self._device_clock.at(stamp_ns)

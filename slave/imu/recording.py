@@ -1,18 +1,30 @@
-"""Recorder of a real IMU beside the camera that is recorded.
+"""Record an IMU beside the camera, or import the table of a foreign one.
+
+Recorder of a real IMU beside the camera that is recorded.
 
 Its samples go to imu.csv, row by row, on a thread of their own.
+
+`phalanx-slave record --imu-csv FILE`: import of a foreign IMU table.
+
+The table becomes an imu.csv, and its content is reported.
 """
 
 import csv
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
+
+from common.arrays import Float
 from common.errors import ImuError, PhalanxError, RecordingError
-from common.imu.fusion import OrientationFilter
-from common.imu.recording import HEADERS, IMU, row
-from slave.counters import imu_counters
+from common.imu.csv_table import QUATERNION, Table
+from common.imu.fusion import OrientationFilter, TiltErrors
+from common.imu.recording import HEADERS, IMU, row, write_imu
+from common.messages import ImuSample
+from slave.report import imu_counters
 from slave.sources import ImuSource
 
 
@@ -89,3 +101,93 @@ class ImuRecorder:
             self.failure = error
         except OSError as error:
             self.failure = RecordingError(f"{IMU}: ended: {error.strerror}")
+
+
+_NO_QUATERNION = np.full(4, np.nan)
+
+
+def import_table(table: Table, source: str, folder: Path | None, notify: Callable[[str], None]) -> None:
+    """Compute the orientation of every sample and write imu.csv.
+
+    What the recording has is reported.
+
+    Args:
+        table: The recording.
+        source: What the IMU is called.
+        folder: Where imu.csv goes; None: it is only looked at.
+        notify: Called with line by line.
+
+    Raises:
+        RecordingError: There is an imu.csv already, or it cannot be written.
+    """
+    if folder is not None and (folder / IMU).exists():
+        raise RecordingError(f"{folder / IMU}: is there already: give another folder to --out")
+    step_s = 1e-9 * np.diff(table.t_ns)
+    period_s = float(np.median(step_s))
+    fusion = OrientationFilter(1.0 / period_s)
+    samples: list[ImuSample] = []
+    sigma_rad: list[float] = []
+    rest_s = 0.0
+    for k, t_ns in enumerate(table.t_ns.tolist()):
+        try:
+            sample = ImuSample(
+                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_QUATERNION
+            )
+        except ValueError as error:
+            raise RecordingError(f"sample {k + 1}, at {1e-9 * t_ns:.3f} s: {error}") from error
+        samples.append(fusion.push(sample))
+        sigma_rad.append(fusion.tilt_sigma_rad)
+        rest_s += period_s if fusion.at_rest else 0.0
+    for what, names in table.columns.items():
+        notify(f"{what + ':':12s} {names}{' in ' + table.units[what] if what in table.units else ''}")
+    gaps = step_s > 1.5 * period_s
+    longest = f", the longest {step_s.max():.3f} s" if gaps.any() else ""
+    notify(
+        f"samples:     {len(samples)} in {float(step_s.sum()):.2f} s, {1.0 / period_s:.1f} Hz; "
+        f"{int(gaps.sum())} gaps{longest}; {table.incomplete} rows with NaN, {table.late} not after the last, left out"
+    )
+    bias = np.degrees(fusion.bias_rad_s)
+    notify(f"bias:        {bias[0]:.3f}, {bias[1]:.3f}, {bias[2]:.3f} deg/s; at rest for {rest_s:.1f} s")
+    _send_orientation(
+        np.array([one.orientation_wxyz for one in samples]), np.array(sigma_rad), fusion, table, notify
+    )
+    if fusion.counts:
+        notify(
+            "filter:      " + ", ".join(f"{name} {count}" for name, count in sorted(fusion.counts.items()))
+        )
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{folder}: cannot be made: {error.strerror}") from error
+        write_imu(folder, samples)
+        notify(f"written:     {folder / IMU}")
+
+
+def _send_orientation(
+    found: Float, sigma_rad: Float, fusion: OrientationFilter, table: Table, notify: Callable[[str], None]
+) -> None:
+    """Report the final orientation and its uncertainty.
+
+    Where there is a truth, the error of the tilt is reported, too.
+    """
+    known = np.isfinite(found).all(axis=1)
+    if not known.any():
+        notify("orientation: never known: too short, or forces are missing")
+        return
+    last = ", ".join(f"{value:.4f}" for value in found[known][-1])
+    notify(
+        f"orientation: known for {100 * known.mean():.1f} % of the samples, wxyz {last} at the end; "
+        f"tilt to {np.degrees(sigma_rad[known][-1]):.2f} deg per axis, heading drifted by "
+        f"{np.degrees(fusion.heading_sigma_rad):.1f} deg (one sigma)"
+    )
+    errors = TiltErrors.of(found, table.truth_wxyz, sigma_rad)
+    if QUATERNION not in table.columns:
+        return
+    if not len(errors.sigma_rad):
+        notify("inclination: no sample has both an orientation and the table's quaternion")
+        return
+    notify(
+        f"inclination: {errors.rms_deg:.2f} deg rms against {table.columns[QUATERNION]}, taken for true (z axis up), "
+        f"{len(errors.sigma_rad)} samples; stated {errors.stated_deg:.2f}, {100 * errors.within:.1f} % within 95 %"
+    )

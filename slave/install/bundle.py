@@ -9,7 +9,7 @@ import stat
 import zipfile
 from pathlib import Path
 
-from slave.install.errors import InstallError
+from slave.install.arguments import InstallError
 
 KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"
 _SHARED = stat.S_IRWXG | stat.S_IRWXO

@@ -17,12 +17,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from slave.install import bundle, steps
-from slave.install.arguments import add_install
-from slave.install.errors import InstallError
-from slave.install.options import READY_S, SETTLE_S, plan_of
+from slave.install.arguments import READY_S, SETTLE_S, InstallError, add_install, plan_of
 from slave.install.probe import judge, probe
 from slave.install.release import Source
-from slave.install.removal import packages, uninstall
+from slave.install.steps import packages, uninstall
 from slave.install.systemd import Systemd
 from slave.install.wanted import ETC
 

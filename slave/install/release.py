@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from importlib.metadata import distributions
 from pathlib import Path
 
-from slave.install.errors import InstallError
+from slave.install.arguments import InstallError
 from slave.install.systemd import run_command
 from slave.install.wanted import OPT
 
@@ -31,7 +31,7 @@ RELEASES = f"{OPT}/releases"
 OURS = "phalanx-hand"
 _PACKAGES = ("slave", "common", "master", "deploy")
 # What a slave loads; its service may not write, so what is not compiled now is compiled at each start.
-_LOADS = "import slave.__main__, slave.live, slave.sender, slave.devices, slave.simulated"
+_LOADS = "import slave.__main__, slave.live, slave.sender, slave.commands.devices, slave.commands.simulated"
 _SCRIPT = """\
 #!{python}
 import sys

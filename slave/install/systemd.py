@@ -1,4 +1,10 @@
-"""systemd, as an installer needs it.
+"""Run systemd and other programs, as an installer needs them.
+
+Other programs, run to their end.
+
+Installer and doctor query the system by them. Standard library only.
+
+systemd, as an installer needs it.
 
 It restarts a slave, waits until it is ready and stays so, and reads its last log lines.
 """
@@ -11,8 +17,26 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from slave.install.errors import InstallError, NotReadyError
-from slave.install.program import finished
+from slave.install.arguments import InstallError, NotReadyError
+
+
+def finished(command: Sequence[str], timeout_s: float) -> subprocess.CompletedProcess[str]:
+    """Run a program without input to its end and return it with its output.
+
+    Raises:
+        OSError: It cannot be run; `FileNotFoundError`: it is not there.
+        subprocess.TimeoutExpired: It did not end in `timeout_s` and was killed.
+    """
+    return subprocess.run(
+        list(command),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout_s,
+        check=False,
+    )
+
 
 # Where systemd ends a service before its program begins (systemd.exec(5)): status -> what is wrong.
 _STATUS = {

@@ -1,24 +1,34 @@
-"""Changes of files that can be rolled back.
+"""Change files so that they can be rolled back, one installation at a time.
+
+Changes of files that can be rolled back.
 
 The former content is kept until the next installation.
 
 The notes are a folder below /opt/phalanx. While its manifest is open, a change is under way: whoever finds it so (the
 power went) takes it back first.
+
+Lock that allows one installation at a time on a machine.
+
+An installation whose PC went away goes on to its end, and the next waits for it.
+
+The lock is on a folder that is always there, so no file of it comes and goes, and it ends with whoever has it. That one
+has an end, too: each command that an installer runs has a time limit.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import shutil
 import stat
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from slave.install.errors import InstallError
+from slave.install.arguments import InstallError
 from slave.install.wanted import OPT, File
 
 NOTES = f"{OPT}/before"
@@ -257,3 +267,43 @@ def _as_wanted(root: Path, path: str, file: File | None) -> bool:
         return file is there
     # What the slave owns, and a FAT partition, have modes of their own.
     return there.content == file.content and (not path.startswith("etc/") or there.mode == file.mode)
+
+
+LOCKED = "opt"
+
+
+@contextlib.contextmanager
+def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
+    """Hold the machine below `root` for oneself.
+
+    Args:
+        root: Where the machine's files are.
+        notify: Notified that it has to wait.
+        sleep: Waits so many seconds.
+
+    Raises:
+        InstallError: Another one still has it after ten minutes.
+    """
+    (root / LOCKED).mkdir(parents=True, exist_ok=True)
+    folder = os.open(root / LOCKED, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        wait_s = 600
+        for look in range(wait_s):
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if look == 0:
+                    notify(
+                        f"another installation runs on this machine: waiting for its end, at most {wait_s} s"
+                    )
+                poll_s = 1.0
+                sleep(poll_s)
+        else:
+            raise InstallError(
+                f"another installation still runs on this machine after {wait_s} s; to see it there: "
+                "pgrep -af 'slave.*install'"
+            )
+        yield
+    finally:
+        os.close(folder)

@@ -1,4 +1,19 @@
-"""Switch ambient -> laser -> LED in step with a camera.
+"""Predict the exposures of a camera, and switch its lights in step.
+
+Predict the next exposures of a camera, and which light each one gets.
+
+The strobe is that of Kim et al. 2012: ambient, laser, LED in turn.
+
+The stamps of a camera that runs freely lie on a line: mid-exposure = first + number x period. A line is fitted to the
+last ones by least squares, numbers counted by time alone (so that lost frames and drivers that number only what they
+deliver do no harm), and read where the next frames will be. There is no schedule until the stamps lie on a line well
+enough that an exposure is known to a part of the lead, and none beyond `AHEAD` periods after the last frame: a camera
+that stalls is not lit.
+
+Frame number k of the strobe's cycle is ambient, laser, LED as k modulo 3 is 0, 1, 2. Which frame is number 0 is agreed
+with nobody: a frame is classified by its content (`slave.wrist.strobe`).
+
+Switch ambient -> laser -> LED in step with a camera.
 
 `Strober.step` does what is due and returns when to call it again; it never waits. The thread only waits and steps.
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
@@ -8,12 +23,170 @@ frame might become a wrong one. A light that came on only after the exposure had
 
 import logging
 import threading
-from collections import Counter
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
 
 from common.clock import Clock
 from common.errors import LightsError
+from common.recording.frame_recording import Illumination
 from slave.lights.interlock import Interlock
-from slave.lights.schedule import Pulse, StrobeSchedule
+
+CYCLE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+LEAST = 9  # stamps before anything is predicted
+AHEAD = 9  # periods after the last stamp: a frame is handed over late, and some may be lost
+OFF_LINE = 0.25  # periods; a stamp farther from the line belongs to another one
+MARGIN_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """One light for one exposure; times on the clock of the stamps [ns].
+
+    Attributes:
+        number: Frame number in the cycle's count.
+        lit: The light.
+        on_ns: When to switch it on.
+        latest_ns: Later than this it must not go on any more: the exposure would begin without it.
+        off_ns: When to switch it off.
+    """
+
+    number: int
+    lit: Illumination
+    on_ns: int
+    latest_ns: int
+    off_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Stamp of frame k: t_ns + off_ns + (k - number) x period_ns."""
+
+    number: int
+    t_ns: int
+    off_ns: float
+    period_ns: float
+
+    def at(self, number: int) -> float:
+        """Stamp of a frame [ns]."""
+        return self.t_ns + (self.off_ns + (number - self.number) * self.period_ns)
+
+
+class StrobeSchedule:
+    """Predicts. Holds the last stamps with their numbers, and the line through them.
+
+    Attributes:
+        restarts: How often the stamps left the line, or were away too long, and a new one was begun.
+    """
+
+    def __init__(
+        self, frame_rate_hz: float, exposure_us: float, lead_us: float, offset_us: float = 0.0
+    ) -> None:
+        """Know of no frame yet.
+
+        Args:
+            frame_rate_hz: Of the camera file: single frames.
+            exposure_us: Exposure and, of a rolling shutter, the reading of all rows [us].
+            lead_us: How much before an exposure a light goes on [us].
+            offset_us: How much later exposures are than their time stamps [us].
+        """
+        self._nominal_ns = 1e9 / frame_rate_hz
+        self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)
+        self.expose(exposure_us)
+        kept = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by a microsecond
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=kept)
+        self._line: _Line | None = None
+        self.restarts = 0
+
+    def expose(self, exposure_us: float) -> None:
+        """Take another exposure time [us], from the next pulse on."""
+        self._half_ns = round(exposure_us * 500.0)
+
+    @property
+    def length_ns(self) -> int:
+        """Of a pulse as planned [ns]."""
+        return self._lead_ns + 2 * self._half_ns + MARGIN_NS
+
+    @property
+    def ready(self) -> bool:
+        """Whether exposures are known well enough."""
+        return self._line is not None
+
+    def push(self, seq: int, t_ns: int) -> bool:
+        """Take the time stamp of a frame, its mid-exposure [ns].
+
+        Returns whether a new line is begun, whose numbers start again.
+
+        The number `seq` matters for the first frame of a line only.
+        """
+        if not self._stamps:
+            self._stamps.append((seq, t_ns))
+            return True
+        number, last_ns = self._stamps[-1]
+        line = self._line or _Line(number, last_ns, 0.0, self._nominal_ns)
+        periods = (t_ns - line.at(number)) / line.period_ns
+        step = round(periods)
+        # After 90 periods without a frame a new line is begun
+        if abs(periods - step) > OFF_LINE or not 0 <= step <= 90:
+            self.restarts += 1
+            self._stamps.clear()
+            self._stamps.append((seq, t_ns))
+            self._line = None
+            return True
+        if step > 0:  # else it is the last one again
+            self._stamps.append((number + step, t_ns))
+            if self._line is None or (number + step) % len(CYCLE) == 0:  # once a cycle is often enough
+                self._line = self._fitted()
+        return False
+
+    def forget(self) -> None:
+        """The camera has stopped: predict nothing until its frames are known anew."""
+        self._stamps.clear()
+        self._line = None
+
+    def before(self, now_ns: int) -> int:
+        """Number of the last frame whose exposure has begun; -1: not known."""
+        if self._line is None:
+            return -1
+        number = self._stamps[-1][0]
+        begun_ns = self._line.at(number) + self._offset_ns - self._half_ns
+        return number + int((now_ns - begun_ns) // self._line.period_ns)
+
+    def after(self, number: int) -> Pulse | None:
+        """Return the first pulse of a frame after frame `number`.
+
+        None: not known, or too far ahead.
+        """
+        if self._line is None:
+            return None
+        for k in range(number + 1, self._stamps[-1][0] + AHEAD + 1):
+            lit = CYCLE[k % len(CYCLE)]
+            if lit is not Illumination.AMBIENT:
+                middle_ns = round(self._line.at(k)) + self._offset_ns
+                start_ns, stop_ns = middle_ns - self._half_ns, middle_ns + self._half_ns
+                return Pulse(k, lit, start_ns - self._lead_ns, start_ns - MARGIN_NS // 2, stop_ns + MARGIN_NS)
+        return None
+
+    def _fitted(self) -> _Line | None:
+        """The line through the stamps; None: not known well enough."""
+        if len(self._stamps) < LEAST:
+            return None
+        first_number, first_ns = self._stamps[0]
+        k = np.array([number - first_number for number, _ in self._stamps], np.float64)
+        t = np.array([t_ns - first_ns for _, t_ns in self._stamps], np.float64)
+        middle, mean = k.mean(), t.mean()
+        spread = float(((k - middle) ** 2).sum())
+        slope = float(((k - middle) * (t - mean)).sum()) / spread
+        at_first = float(mean - slope * middle)
+        rms = float(np.sqrt(((t - at_first - slope * k) ** 2).sum() / (len(k) - 2)))
+        farthest = k[-1] + AHEAD - middle
+        sigma = rms * float(np.sqrt(1.0 / len(k) + farthest**2 / spread))
+        # Three standard deviations of the prediction must fit into the margin
+        if 3.0 * sigma > MARGIN_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
+            return None
+        return _Line(first_number, first_ns, at_first, slope)
+
 
 FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
 EVENTS = ("skipped", "late")

@@ -1,18 +1,31 @@
-"""Coloured things in one frame.
+"""Find the coloured things of a frame, and what all frames share.
+
+Coloured things in one frame.
 
 Connected pixels of one hue, more saturated than the desk and not of the skin's hue.
+
+What all frames of a moving hand share.
+
+Its skin, the desk, and the coloured things that stand on it.
+
+background   median over the frames: what stands still for most of the time
+skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
+floor        saturation per hue that the desk itself has, noise included; marker colours have more
+clutter      things of the background that stay whole in one place while the hand moves: a mug, a pen
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image, Int
+from common.errors import FitError
 from slave.markers.classify import HUES
-from slave.markers.colours import HUE_GROW, SMALLEST, circular_median, hue_distance, hue_separation
+from slave.markers.colours import HUE_GROW, PALE, SMALLEST, circular_median, hue_distance, hue_separation
 
 SKIN_VALUE = 60
 SKIN_HALF_WIDTH = 12  # in hue; nearer than this no marker colour can be distinguished from skin
@@ -168,3 +181,194 @@ def _thing(hsv: Image, skin: Bool, part: Bool, corner: tuple[int, int], frame: i
     colours = hsv[y, x]
     hue = circular_median(colours[:, 0])
     return Thing(frame, float(x.mean()), float(y.mean()), hue, y * width + x, colours, share)
+
+
+class SurroundingsSettings(NamedTuple):
+    """Numbers that part a painted hand from its surroundings."""
+
+    median_frames: int = 25  # enough for a median; more only cost memory
+    different: int = 25  # grey levels that no noise reaches, in any channel
+    tiles: int = 8  # the image in so many rows and columns:
+    # a thing that went farther, plus this share of its size, has moved
+    shift_px: float = 2.0
+    shift_share: float = 0.05
+    whole: float = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
+    moved_frames: int = 3
+    skin_around: float = (
+        0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
+    )
+    resting_skin: float = (
+        0.5  # share of skin around a thing that never moved, from which it is painted on the hand
+    )
+
+
+SETTINGS = SurroundingsSettings()
+SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
+SKIN_SATURATION = 30, 210
+
+
+def background_of(images: Sequence[Image]) -> Image:
+    """Median over at most `MEDIAN_FRAMES` frames, evenly taken; (H, W, 3)."""
+    chosen = [images[k] for k in spread(len(images), SETTINGS.median_frames)]
+    rows = [np.median([image[v] for image in chosen], axis=0) for v in range(chosen[0].shape[0])]
+    return np.stack(rows).astype(np.uint8)
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return at most `most` of the indices below `count`, evenly spread.
+
+    First and last are among them.
+    """
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+def skin_of(images: Sequence[Image], background: Image) -> Skin:
+    """Skin, from what differs from the background and has a skin's hue.
+
+    Raises:
+        FitError: Nothing moves, or no skin moves.
+    """
+    samples: list[Image] = []
+    moving = 0.0
+    chosen = spread(len(images), SETTINGS.median_frames)
+    for k in chosen:
+        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > SETTINGS.different
+        moving += float(differs.mean()) / len(chosen)
+        hsv = hsv_of(images[k])[differs]
+        hue, saturation = hsv[:, 0], hsv[:, 1]
+        skin = (hue >= SKIN_HUES[0]) | (hue <= SKIN_HUES[1])
+        skin &= (saturation >= SKIN_SATURATION[0]) & (saturation <= SKIN_SATURATION[1])
+        samples.append(hsv[skin & (hsv[:, 2] >= SKIN_VALUE)])
+    moving_least = 0.002  # share of the image that must differ from the background in a typical frame
+    if moving < moving_least:
+        raise FitError(
+            f"nothing moves in these frames ({moving:.2%} of the image on average): record a few seconds of the open, "
+            f"painted hand, back to the camera, moving about by more than its width"
+        )
+    pixels = np.concatenate(samples)
+    if len(pixels) < moving_least * moving * background.shape[0] * background.shape[1] * len(chosen):
+        raise FitError("what moves in these frames has no skin: record the bare, painted hand")
+    hue, saturation = circular_median(pixels[:, 0]), float(np.median(pixels[:, 1]))
+    return Skin(hue, (max(0.5 * saturation, SKIN_SATURATION[0] * 0.8), 1.6 * saturation))
+
+
+def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> Surroundings:
+    """Desk and clutter: what of the background is coloured."""
+    empty = Surroundings(skin, _floor(images, background, skin), ())
+    standing = things_of(background, 0, empty, border=True)
+    # share of the background that has the colour of skin, from which skin proves nothing: wood
+    skin_desk = 0.2
+    wooden = float(skin.mask(hsv_of(background)).mean()) > skin_desk
+    clutter: list[Thing] = []
+    for thing in standing:
+        if _moved(thing, images):
+            continue
+        resting = thing.skin >= SETTINGS.resting_skin or (
+            thing.skin >= SETTINGS.skin_around and _uncovered(thing, images, background, skin)
+        )
+        if wooden or not resting:
+            clutter.append(thing)
+    return Surroundings(skin, empty.floor, tuple(clutter), wooden)
+
+
+def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
+    """Return the saturation (180,) above which a pixel of that hue is coloured.
+
+    It is more than what the whole desk shows of the hue.
+    """
+    height, width = background.shape[:2]
+    samples: list[Image] = []
+    tiles = np.zeros((HUES, SETTINGS.tiles * SETTINGS.tiles))
+    row: Int = np.arange(height, dtype=np.int64) * SETTINGS.tiles // height
+    column: Int = np.arange(width, dtype=np.int64) * SETTINGS.tiles // width
+    tile: Int = row[:, None] * SETTINGS.tiles + column
+    desk_frames = 3  # from which the saturation of the desk is measured, noise included
+    for k in spread(len(images), desk_frames):
+        hsv = hsv_of(images[k])
+        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= SETTINGS.different
+        desk &= (hsv[..., 1] >= PALE) & (hsv[..., 2] >= DARK)
+        samples.append(hsv[desk])
+        desk_tile = 100.0  # where one pixel in so many has it
+        np.add.at(tiles, (hsv[desk][:, 0], tile[desk]), desk_tile / desk_frames)
+    hue_near = 3  # hues of one tint
+    # A hue belongs to the desk where it and its neighbours are seen all over it.
+    around = np.stack(
+        [
+            tiles.take(range(h - hue_near, h + hue_near + 1), axis=0, mode="wrap").sum(axis=0)
+            for h in range(HUES)
+        ]
+    )
+    desk_share = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
+    everywhere = (around >= height * width / SETTINGS.tiles**2).mean(axis=1) >= desk_share
+    floor = np.full(HUES, float(PALE))
+    pixels = np.concatenate(samples)
+    for hue in np.flatnonzero(everywhere):
+        near = pixels[hue_distance(pixels[:, 0], float(hue)) <= hue_near, 1]
+        desk_tail = 99.9  # percentile of the desk's saturation that a marker colour must exceed
+        floor[hue] = float(np.percentile(near, desk_tail))
+    floor[hue_distance(np.arange(HUES), skin.hue) <= SKIN_HALF_WIDTH] = 256.0
+    return floor
+
+
+def _moved(thing: Thing, images: Sequence[Image]) -> bool:
+    """Return whether a thing of the background is a marker colour of a resting hand.
+
+    It is one if it is seen whole, but elsewhere.
+
+    Clutter only gets covered, and then it is smaller.
+    """
+    height, width = images[0].shape[:2]
+    rows, columns = np.divmod(thing.pixels, width)
+    reach = round(2.0 * thing.size) + 8  # it is searched for where it could still touch its place
+    top, bottom = max(int(rows.min()) - reach, 0), min(int(rows.max()) + reach + 1, height)
+    left, right = max(int(columns.min()) - reach, 0), min(int(columns.max()) + reach + 1, width)
+    place = np.zeros((bottom - top, right - left), np.bool_)
+    place[rows - top, columns - left] = True
+    saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
+    seen: list[tuple[float, float, float]] = []  # area and centroid of what touches its place, per frame
+    for image in images:
+        hsv = hsv_of(image[top:bottom, left:right])
+        same = hue_distance(hsv[..., 0], thing.hue) <= HUE_GROW
+        same &= (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+        count, labels, stats, centres = cv2.connectedComponentsWithStats(
+            same.astype(np.uint8), connectivity=4
+        )
+        overlap = np.bincount(labels[place], minlength=count)
+        overlap[0] = 0
+        best = int(np.argmax(overlap))
+        if overlap[best]:
+            seen.append((float(stats[best, cv2.CC_STAT_AREA]), *centres[best].tolist()))
+    if len(seen) < SETTINGS.moved_frames:
+        return False
+    area, u, v = np.array(seen).T
+    whole = (area >= SETTINGS.whole * np.median(area)) & (area <= np.median(area) / SETTINGS.whole)
+    shift = np.hypot(u - np.median(u), v - np.median(v))
+    return (
+        int((whole & (shift > SETTINGS.shift_px + SETTINGS.shift_share * thing.size)).sum())
+        >= SETTINGS.moved_frames
+    )
+
+
+def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
+    """Return whether the desk appeared in the place of a background thing.
+
+    The thing was then a finger tip that was flexed away.
+
+    The desk is what lies around the thing in the background and is not skin.
+    """
+    height, width = background.shape[:2]
+    place = np.zeros(height * width, np.uint8)
+    place[thing.pixels] = 1
+    inner, outer = (
+        cv2.dilate(place.reshape(height, width), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING
+    )
+    ring = background[np.asarray(outer != inner)]
+    desk = ring[~skin.mask(hsv_of(ring[None]))[0]]
+    if len(desk) == 0:
+        return False
+    colour = np.median(desk, axis=0)
+    bare = 0
+    for image in images:
+        away = np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) <= SETTINGS.different
+        bare += bool(away.mean() > 0.5)
+    return bare >= SETTINGS.moved_frames

@@ -21,27 +21,32 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HsvRange
-from slave.markers.ambiguity import ColourAmbiguityMonitor
-from slave.markers.blobs import Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
-from slave.markers.classify import ColourTable, table_of
-from slave.markers.edge import Ellipse, centre_of, fits_occlusion
+from slave.markers.classify import Blob, ColourTable, table_of, with_fragments
 from slave.markers.engine import NUMPY, Engine
 from slave.markers.group import (
     CLICKED,
     TRACKED,
     Candidate,
+    ColourAmbiguityMonitor,
     candidate,
     choose,
     connected,
     on_fringe,
 )
-from slave.markers.outline import Outline
-from slave.markers.outlines import Outlines
+from slave.markers.outline import Outline, Outlines
 from slave.markers.quality import CLEAR_CONTRAST, Evidence, clarity_of, evidence_of, probability_of
-from slave.markers.roi import Track, Window, advance
 from slave.markers.scan import Scanned, Scanner
-from slave.markers.sigma import COVERED_PX, sigma_of
+from slave.markers.track import (
+    COVERED_PX,
+    Ellipse,
+    Track,
+    Window,
+    advance,
+    centre_of,
+    fits_occlusion,
+    sigma_of,
+)
 
 NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
 

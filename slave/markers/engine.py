@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from common.arrays import Image
-from slave.engines import engine_of
-from slave.markers.blobs import SCALE, Blob, find_blobs
+from slave.drivers import engine_of
 from slave.markers.centroid import Measured, measure
-from slave.markers.classify import Codes, ColourTable
+from slave.markers.classify import SCALE, Blob, Codes, ColourTable, find_blobs
 
 ScanBlobs: TypeAlias = Callable[
     [Image, ColourTable, Sequence[int], int, int, int, tuple[int, int] | None],

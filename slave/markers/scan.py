@@ -1,4 +1,6 @@
-"""Scan for blobs of the markers' colours: a whole frame, or windows of it.
+"""Scan whole frames, or windows of them, and choose which by their cost.
+
+Scan for blobs of the markers' colours: a whole frame, or windows of it.
 
     whole    one table look-up on every fourth pixel of every fourth row, and on a further grid where a colour shows on
              none of these points
@@ -8,18 +10,27 @@
 
 A blob has the same points, and so the same centroid and box, in both: a window is widened until it holds the blob and
 all around it that may be a fragment of it.
+
+Choose whole frames or windows: by name, or by what whole frames cost.
+
+What counts is the processor time of the detection, of which a busy machine takes nothing away, against the time between
+two frames of the camera's file. Windows are for where a whole frame does not fit; from time to time one frame is
+scanned whole then, so that it shows when they fit again.
 """
 
+import logging
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeAlias
+from statistics import median
+from typing import Literal, NamedTuple, TypeAlias
 
 from common.arrays import Image
-from slave.markers.blobs import FRAGMENT_GAP, MAX_CANDIDATES, SCALE, Blob
-from slave.markers.classify import Codes, ColourTable
+from common.calibration import CameraCalibration
+from slave.drivers import SCANS
+from slave.markers.classify import FRAGMENT_GAP, MAX_CANDIDATES, SCALE, Blob, Codes, ColourTable
 from slave.markers.engine import Engine
 from slave.markers.group import skin_share
-from slave.markers.roi import Window
+from slave.markers.track import Window
 
 FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
 OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
@@ -211,3 +222,78 @@ def _gathered(found: Sequence[list[list[Blob]]], count: int) -> list[list[Blob]]
         return found[0]
     every = [[blob for part in found for blob in part[m]] for m in range(count)]
     return [sorted(options, key=lambda blob: -blob.area)[:MAX_CANDIDATES] for options in every]
+
+
+Scan: TypeAlias = Literal["auto", "full", "windows"]
+JUDGED = 30  # whole frames whose median is judged
+PROBE_EVERY = 600  # frames, 10 s at 60 Hz: one of so many is scanned whole while windows are chosen
+PROBES = 3  # of them whose median is judged then
+_LOG = logging.getLogger(__name__)
+
+
+class ScanChoice:
+    """Push machine. Holds the choice, and what whole frames of late cost.
+
+    Attributes:
+        frames: Frames that were scanned in windows only.
+    """
+
+    def __init__(self, scan: Scan, camera: CameraCalibration) -> None:
+        """Choose for the frames of `camera`; "auto" begins with whole frames.
+
+        Raises:
+            ValueError: No such name.
+        """
+        if scan not in SCANS:
+            raise ValueError(f"scan {scan!r}, not one of {', '.join(SCANS)}")
+        self._scan, self._name = scan, camera.name
+        self._windows = scan == "windows"
+        self._costs: list[int] = []  # of whole frames [ns], until enough are there to be judged
+        self._since = 0  # frames since one was scanned whole
+        self.frames = 0
+        self.tune(camera)
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """The camera has another rate. From any thread."""
+        self._period_ns = 1e9 / camera.frame_rate_hz
+
+    @property
+    def windows(self) -> bool:
+        """Whether only windows are scanned in the next frame."""
+        return self._windows and not self._probes
+
+    @property
+    def _probes(self) -> bool:
+        return self._scan == "auto" and self._since >= PROBE_EVERY
+
+    def push(self, spent_ns: int) -> None:
+        """Record the processor time [ns] of a frame scanned as `windows` specified."""
+        if self.windows:
+            self.frames += 1
+            self._since += 1
+            return
+        self._since = 0
+        if self._scan != "auto":
+            return
+        self._costs.append(spent_ns)
+        if len(self._costs) < (PROBES if self._windows else JUDGED):
+            return
+        full_share = 0.9  # of the time between two frames: where whole frames take more, they do not fit
+        fits_share = 0.7  # and where they take less again, they do
+        cost_ns, share = median(self._costs), fits_share if self._windows else full_share
+        self._costs.clear()
+        if (cost_ns > share * self._period_ns) != self._windows:
+            self._switch(cost_ns)
+
+    def _switch(self, cost_ns: float) -> None:
+        self._windows = not self._windows
+        took = f"to scan a whole frame takes {cost_ns * 1e-6:.1f} ms of the {self._period_ns * 1e-6:.1f} ms of a frame"
+        if self._windows:
+            _LOG.warning(
+                "%s: %s: from now on only windows about the markers are scanned, and a lost marker is sought strip by "
+                "strip (--scan auto, docs/cameras.md)",
+                self._name,
+                took,
+            )
+        else:
+            _LOG.warning("%s: %s again: from now on whole frames are scanned", self._name, took)

@@ -1,4 +1,28 @@
-"""Tracker source that reads libsurvive's own program, survive-cli.
+"""Read a tracker through libsurvive's own program, survive-cli.
+
+Decode libsurvive's lines to poses of one device on the slave's clock.
+
+Every line that --record-stdout or --record writes begins with the program's time [s since its start], then who, then
+what (src/survive_recording.c of https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
+
+    8.042091 WM0 POSE -0.284080 0.936063 0.374069 0.707107 0.000000 0.000000 0.707107 CR LF
+    0.331402 WM0 CONFIG {... "device_serial_number": "LHR-1A2B3C4D" ...} CR LF
+    9.112874 WM0 DISCONNECT CR LF
+    8.042070 WM0 VELOCITY ...     0.001240 OPTION ...     7.120011 0 LH_POSE ...     0.001000 INFO LOG ...
+
+A pose is the device's in libsurvive's world, metres, its quaternion with w first. The world is z up, its origin and
+heading those of its calibration. Numbers are decimals, or hexadecimal where it was built with SURVIVE_HEX_FLOATS. Lines
+carry no checksum: that a quaternion has length 1 is what shows a line whose end was cut or run into by another thread.
+
+Devices are called by kind and order of appearance (WM0, T20), which a restart may turn about; what stays is the serial
+number. Without a choice there must be one device only: with two, a guess would show one object as the other.
+
+A stamp is the program's own time when it wrote the line. The clock behind it is this machine's wall clock, which may be
+set or slewed, so stamps become times of the slave's clock as those of any foreign device do (`DeviceClock`): by the
+least delay, whatever jitter and bunches the arrivals have. How late a pose is when its line is written is unknown; it
+is constant, and `phalanx-master calibrate tracker` measures it.
+
+Tracker source that reads libsurvive's own program, survive-cli.
 
 The program is started here and its lines are read; or the lines of a file are.
 
@@ -10,23 +34,253 @@ terminal is that of its session, and hangs up when nobody has the other end any 
 
 import gzip
 import logging
+import math
 import os
 import pty
+import re
 import select
 import shutil
 import subprocess
 import threading
 import tty
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from enum import Enum
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO, NamedTuple, TypeAlias, cast
+
+import numpy as np
 
 from common.clock import Clock
-from common.errors import TrackerError
+from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
-from slave.objects.survive_lines import LineDecoder, Pose, Serial, SurviveDevice
+from slave.clocks import ClockSteppedError, DeviceClock
+
+LONGEST = 1 << 17  # bytes; the longest lines are CONFIG, some 10 kB
+_SERIAL = re.compile(rb'"device_serial_number"\s*:\s*"([^"]{1,64})"')
+_DEVICE = re.compile(rb"[A-Za-z0-9_.-]{1,32}")
+
+
+class Pose(NamedTuple):
+    """Where a device is: time [s] of the program, place [m], quaternion wxyz.
+
+    NaN: it does not know.
+    """
+
+    device: str
+    t_s: float
+    position_m: tuple[float, float, float]
+    orientation_wxyz: tuple[float, float, float, float]
+
+
+class Serial(NamedTuple):
+    """Which device hides behind a name that is given in the order of appearance."""
+
+    device: str
+    serial: str
+
+
+class Gone(NamedTuple):
+    """A device was unplugged or switched off."""
+
+    device: str
+
+
+class Fault(Enum):
+    """Why a line about a pose is none."""
+
+    OVERRUN = "a line without end"
+    LENGTH = "not seven numbers"
+    NUMBER = "not a number"
+    QUATERNION = "quaternion not of length 1"
+    PLACE = "farther than any base station reaches"
+
+
+Found: TypeAlias = Pose | Serial | Gone | Fault
+
+
+class LineDecoder:
+    """Push machine. Holds the bytes of the line that has not ended."""
+
+    def __init__(self) -> None:
+        """Begin between two lines."""
+        self._rest = b""
+
+    def push(self, data: bytes) -> Iterator[Found]:
+        """Parse the lines that end in `data`, in order.
+
+        Other lines yield nothing.
+        """
+        lines = (self._rest + data).split(b"\n")
+        self._rest = lines.pop()
+        if len(self._rest) > LONGEST:
+            self._rest = b""
+            yield Fault.OVERRUN
+        for line in lines:
+            found = read_line(line)
+            if found is not None:
+                yield found
+
+
+def read_line(line: bytes) -> Found | None:
+    """Parse one line without its end.
+
+    None: nothing that matters here.
+    """
+    words = line.split(None, 3)
+    if len(words) < 3:
+        return None
+    who, what = words[1], words[2]
+    if what not in (b"POSE", b"CONFIG", b"DISCONNECT") or not _DEVICE.fullmatch(who):
+        return None
+    device = who.decode("ascii")
+    if what == b"DISCONNECT":
+        return Gone(device)
+    if what == b"CONFIG":
+        found = _SERIAL.search(line)
+        return None if found is None else Serial(device, found[1].decode("ascii", "replace"))
+    return _pose(device, words[0], b"" if len(words) < 4 else words[3])
+
+
+def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
+    words = rest.split()
+    size = 7  # numbers of a pose
+    if len(words) != size:
+        return Fault.LENGTH
+    try:
+        t_s = _number(stamp)
+        values = [_number(word) for word in words]
+    except (ValueError, OverflowError):
+        return Fault.NUMBER
+    if not math.isfinite(t_s) or t_s < 0.0:
+        return Fault.NUMBER
+    if any(math.isnan(value) for value in values):  # it writes them when its solver fails
+        values = [math.nan] * size
+    x, y, z, *quaternion = values
+    place, (qw, qx, qy, qz) = (x, y, z), quaternion
+    length = math.hypot(*quaternion)
+    # Six decimals are within 3e-6 of length 1; a component that lost its last digits is not within 1e-3
+    if abs(length - 1.0) > 1e-3:
+        return Fault.QUATERNION
+    if math.hypot(*place) > 100.0:  # m: no base station reaches so far
+        return Fault.PLACE
+    return Pose(device, t_s, place, (qw / length, qx / length, qy / length, qz / length))
+
+
+def _number(word: bytes) -> float:
+    """A number as C's printf writes it by %f or %a."""
+    text = word.decode("ascii")
+    if "_" in text:  # Python's own spelling, which nobody sends
+        raise ValueError(text)
+    return float.fromhex(text) if "0x" in text else float(text)
+
+
+SLEWED = 600e-6  # at most 500 ppm by NTP, and the crystals
+
+
+class SurviveDevice:
+    """Push machine that dates the poses of one device.
+
+    Holds who is there, the clock of the program, and number and time of the newest pose.
+    """
+
+    def __init__(self, name: str, wanted: str | None) -> None:
+        """Begin with a program that was just started.
+
+        Args:
+            name: Of the device in our messages.
+            wanted: Its serial number, or what libsurvive calls it; None: there is one only.
+        """
+        self._name, self._wanted = name, wanted
+        self._decoder = LineDecoder()
+        self._clock = DeviceClock(SLEWED)
+        self._serials: dict[str, str] = {}
+        self._posed: list[str] = []
+        self._seq = -1
+        self._last_ns: int | None = None
+        self._counts: Counter[str] = Counter()
+
+    def push(self, data: bytes, arrival_ns: int) -> list[TrackerPose]:
+        """Take bytes that were there at `arrival_ns`; return the poses in them.
+
+        Raises:
+            TrackerChoiceError: A second device has poses, and none was selected.
+        """
+        ours = [one for found in self._decoder.push(data) if (one := self._ours(found)) is not None]
+        dated = [(one, self._observe(one, arrival_ns)) for one in ours]  # all, before one becomes a time
+        poses: list[TrackerPose] = []
+        for one, possible in dated:
+            t_ns = self._clock.at(round(one.t_s * 1e9))
+            if not possible or (self._last_ns is not None and t_ns <= self._last_ns):
+                self._counts["broken.time"] += 1
+                continue
+            poses.append(self.numbered(t_ns, one))
+        return poses
+
+    def numbered(self, t_ns: int, pose: Pose | None) -> TrackerPose:
+        """The next message; None: it does not know where it is."""
+        self._seq += 1
+        self._last_ns = t_ns
+        place = np.full(3, np.nan) if pose is None else np.array(pose.position_m)
+        quaternion = np.full(4, np.nan) if pose is None else np.array(pose.orientation_wxyz)
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
+
+    @property
+    def last_ns(self) -> int | None:
+        """When its newest message holds [ns]; None: there is none yet."""
+        return self._last_ns
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Events: `broken.` lines by reason, `clock_steps`, `gone`.
+
+        `others`: poses of other devices.
+        """
+        return self._counts
+
+    def there(self) -> str:
+        """Return the devices that have reported anything, as text for people."""
+        names = list(dict.fromkeys([*self._posed, *self._serials]))
+        return ", ".join(self._called(one) for one in names) or "no device at all"
+
+    def _ours(self, found: Found) -> Pose | None:
+        """The pose if it is one of the device that is meant."""
+        if isinstance(found, Fault):
+            self._counts[f"broken.{found.name.lower()}"] += 1
+        elif isinstance(found, Serial):
+            self._serials[found.device] = found.serial
+        elif isinstance(found, Gone):
+            self._counts["gone"] += self._is_ours(found.device)
+        else:
+            if found.device not in self._posed:
+                self._posed.append(found.device)
+            if self._is_ours(found.device):
+                return found
+            self._counts["others"] += 1
+        return None
+
+    def _is_ours(self, device: str) -> bool:
+        if self._wanted is not None:
+            return self._wanted in (device, self._serials.get(device))
+        if len(self._posed) > 1:
+            raise TrackerChoiceError(
+                f"several devices have poses: {self.there()}; say with --serial which one sits on the object"
+            )
+        return True
+
+    def _called(self, device: str) -> str:
+        serial = self._serials.get(device)
+        return device if serial is None else f"{device} (serial {serial})"
+
+    def _observe(self, pose: Pose, arrival_ns: int) -> bool:
+        try:
+            return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)
+        except ClockSteppedError:  # somebody set the wall clock
+            self._counts["clock_steps"] += 1
+            self._clock = DeviceClock(SLEWED)
+            return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)
+
 
 PROGRAM = "survive-cli"
 OPTIONS = ("--record-stdout", "1", "--record-rawlight", "0", "--record-imu", "0", "--record-angle", "0")

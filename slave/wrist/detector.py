@@ -1,28 +1,40 @@
-"""Complete pipeline of a wrist camera.
+r"""Detect five fingers in the frames of a wrist camera.
+
+Complete pipeline of a wrist camera.
 
 From frames to what its laser and its LEDs show of five fingers.
 
 frame -> strobe -> cycle --- LED less ambient ---> seams between the fingers
-                         \\-- laser less ambient -> where the laser meets each finger -> fingertips
+                         \-- laser less ambient -> where the laser meets each finger -> fingertips
+
+Detector that sees no finger, for a wrist slave being calibrated.
+
+The wrist device's lens, laser or palm is still being measured.
+
+Device and hand data of a wrist device, from the files of a slave.
+
+Also when the files change while it runs.
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from common.arrays import Float
+from common.errors import CalibrationError
 from common.messages import WristDetections
 from slave.sources import Frame
-from slave.wrist.background import lit, lit_line
+from slave.tuning import CameraFiles, Prepare
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
 from slave.wrist.palm_pose import prepare
 from slave.wrist.postures import postures_of
-from slave.wrist.search_bands import search_bands_of
-from slave.wrist.strobe import Strobe, StrobeCycle
+from slave.wrist.seams import search_bands_of
+from slave.wrist.strobe import Strobe, StrobeCycle, lit, lit_line
 from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
@@ -145,3 +157,39 @@ def find(cycle: StrobeCycle, view: WristView, engine: Engine = NUMPY) -> WristFo
     if fingers.palm_pose.straight:
         tips = fingertips(led, cycle.led.image, laser.uv, view, engine.candidates)
     return WristFound(cycle, laser, tips)
+
+
+class NullWristDetector:
+    """Detector that never completes a strobe cycle."""
+
+    def push(self, frame: Frame) -> None:
+        """Nothing, whatever there is."""
+        del frame
+
+
+def view_of(files: CameraFiles) -> WristView:
+    """The view that camera, rig and hand make together.
+
+    Raises:
+        CalibrationError: Something is not calibrated; the text names files and key.
+    """
+    if files.hand is None:
+        raise CalibrationError(
+            f"{files.rig_path}: hand: the profile {files.rig.hand!r} of a wrist rig is not loaded"
+        )
+    try:
+        return WristView.of(files.rig, files.camera, files.hand)
+    except CalibrationError as error:
+        raise CalibrationError(f"{', '.join(map(str, files.paths))}: {error}") from error
+
+
+def wrist_changes(detector: WristDetector) -> Prepare:
+    """Return how changed files reach `detector`: with the next strobe cycle."""
+
+    def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
+        if (old.camera.intrinsics, old.rig, old.hand) == (new.camera.intrinsics, new.rig, new.hand):
+            return None
+        view = prepared(view_of(new))  # a second or two, and the last thing that may refuse
+        return lambda: detector.replace(view)
+
+    return prepare

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from common.arrays import Bool, Image, Int
-from slave.engines import engine_of
-from slave.wrist.cost_map import energy
-from slave.wrist.finger_lines import FingerLines, measure
+from slave.drivers import engine_of
 from slave.wrist.fingertips import Search, candidates
-from slave.wrist.runs import Runs, lines
-from slave.wrist.seams import minimum_cost_paths
-from slave.wrist.search_bands import Float32
+from slave.wrist.runs import FingerLines, Runs, lines, measure
+from slave.wrist.seams import Float32, energy, minimum_cost_paths
 
 Energy: TypeAlias = Callable[[Image, int], Float32]
 MinimumCostPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]

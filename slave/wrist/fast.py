@@ -1,4 +1,12 @@
-"""Seams between fingers as machine code by numba.
+"""Run the inner loops of seams and laser lines as machine code by numba.
+
+Laser line as machine code by numba.
+
+Its runs, how they link up, and the pieces of each finger's line.
+
+What it makes is what `runs` and `finger_lines` make, but for sums added up in another order.
+
+Seams between fingers as machine code by numba.
 
 And the whole of the engine of that name.
 
@@ -6,15 +14,237 @@ What it makes is what `valleys` and `paths` make, but for sums added up in anoth
 hundred numbers each become one.
 """
 
+import math
+
 import cv2
 import numpy as np
 
-from common.arrays import Image, Int
+from common.arrays import Bool, Float, Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import cost_map, fast_tips, seams
+from slave.wrist import fast_tips, runs, seams
 from slave.wrist.engine import Engine
-from slave.wrist.fast_lines import lines, measure
-from slave.wrist.search_bands import MARGIN, Float32
+from slave.wrist.runs import NO_RUNS, FingerLines, Runs
+from slave.wrist.seams import MARGIN, Float32
+
+
+def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
+    """As `runs.lines`."""
+    band, least, corner = runs.bright(laser, first_row)
+    if not band.size:
+        return NO_RUNS, np.empty(0, dtype=np.bool_)
+    most = band.size // 2 + band.shape[0] + 1
+    whole = np.empty((most, 3), dtype=np.int64)
+    parts = np.empty((most, 2))
+    limits = (
+        runs.SETTINGS.thickest_px,
+        runs.SETTINGS.flat_px,
+        runs.SETTINGS.top,
+        runs.SETTINGS.of_peak,
+        runs.SETTINGS.of_flat,
+    )
+    count = _scan(np.asarray(band, np.uint8), np.asarray(least, np.uint8), corner, limits, whole, parts)
+    if not count:
+        return NO_RUNS, np.empty(0, dtype=np.bool_)
+    whole, parts = whole[:count], parts[:count]
+    order, line, joins = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
+    number = _link(whole, parts, runs.SETTINGS.jump_px, order, line, joins)
+    column, start, end = np.ascontiguousarray(whole[order].T)
+    row, peak = np.ascontiguousarray(parts[order].T)
+    found = Runs(column, row, start, end, peak, line[:number].copy(), joins[:number].copy())
+    return found, runs.in_lines(found)
+
+
+@compiled
+def _scan(
+    band: Image,
+    least: Image,
+    corner: tuple[int, int],
+    limits: tuple[int, int, float, float, float],
+    whole: Int,
+    parts: Float,
+) -> int:
+    """Scan an image on its side for runs.
+
+    Fills in column, first row and the one after the last (N, 3), sub-pixel row and peak (N, 2).
+    """
+    thickest, flat_px, top, of_peak, of_flat = limits
+    left, first = corner
+    count = 0
+    width, height = band.shape
+    for x in range(width):
+        y = 0
+        while y < height:
+            if band[x, y] <= least[x, y]:
+                y += 1
+                continue
+            begin, peak = y, 0
+            while y < height and band[x, y] > least[x, y]:
+                peak = max(peak, int(band[x, y]))
+                y += 1
+            if y - begin > thickest:
+                continue
+            flat = 0
+            for k in range(begin, y):
+                flat += band[x, k] > top * peak
+            base = (of_flat if flat >= flat_px else of_peak) * peak
+            weight = moment = 0.0
+            for k in range(begin, y):
+                above = max(band[x, k] - base, 0.0)
+                weight += above
+                moment += above * (k - begin)
+            whole[count, 0], whole[count, 1], whole[count, 2] = x + left, begin + first, y + first
+            parts[count, 0], parts[count, 1] = begin + first + moment / weight, peak
+            count += 1
+    return count
+
+
+@compiled
+def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: Int) -> int:
+    """Link runs to lines and return their number.
+
+    Fills in the order of runs line by line, the first run of each line, and which line it joins.
+    """
+    count = len(whole)
+    to, off = np.full(count, -1), np.full(count, math.inf)
+    from_ = np.full(count, -1)
+    lost = np.full(count, -1)
+    low = 0  # the first run that may be of the next column, and no farther above
+    for i in range(count):
+        while low < count and (
+            whole[low, 0] < whole[i, 0] + 1
+            or (whole[low, 0] == whole[i, 0] + 1 and parts[low, 0] < parts[i, 0])
+        ):
+            low += 1
+        for j in (low - 1, low):
+            if j < count and whole[j, 0] == whole[i, 0] + 1:
+                away = abs(parts[j, 0] - parts[i, 0])
+                if away < off[i]:
+                    off[i], to[i] = away, j
+        j = to[i]
+        if j < 0 or off[i] >= jump or whole[j, 1] > whole[i, 2] or whole[j, 2] < whole[i, 1]:
+            to[i] = -1
+        elif from_[j] >= 0 and off[from_[j]] <= off[i]:
+            lost[i], to[i] = j, -1
+        else:
+            if from_[j] >= 0:
+                lost[from_[j]], to[from_[j]] = j, -1
+            from_[j] = i
+    number = done = 0
+    of = np.empty(count, np.int64)
+    for last in range(count):  # lines in the order of their last runs
+        if to[last] >= 0:
+            continue
+        length, k = 1, last
+        while from_[k] >= 0:
+            k = from_[k]
+            length += 1
+        line[number] = done
+        k = last
+        for place in range(done + length - 1, done - 1, -1):
+            order[place] = k
+            of[k] = number
+            k = from_[k]
+        done += length
+        number += 1
+    for n in range(number):
+        joins[n] = n
+    for i in range(count - 1, -1, -1):
+        if lost[i] >= 0:
+            joins[of[i]] = joins[of[lost[i]]]
+    return number
+
+
+def measure(runs_: Runs, finger: Int, width_px: int) -> FingerLines:
+    """As `finger_lines.measure`."""
+    out = np.zeros((6, 5))
+    limits = (runs.STEEPEST, runs.LONG, width_px)
+    _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, limits, out)
+    line, u, v, apart, cut, brightest = out
+    return FingerLines(line, np.stack([u, v], axis=-1), apart, cut > 0.0, brightest)
+
+
+@compiled
+def _measure(
+    column: Int,
+    row: Float,
+    peak: Float,
+    first: Int,
+    finger: Int,
+    limits: tuple[float, int, int],
+    out: Float,
+) -> None:
+    """Over the parts of lines: sums, then centroids."""
+    longest = np.zeros(5)
+    mean, middle, columns = np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(5)
+    parts = np.zeros(5)
+    for n in range(len(first)):
+        stop = first[n + 1] if n + 1 < len(first) else len(row)
+        left = first[n]
+        while left < stop:
+            of, right = int(finger[left]), left
+            if of < 0:
+                left += 1
+                continue
+            while right + 1 < stop and finger[right + 1] == of:
+                right += 1
+            count = right - left + 1
+            u = v = 0.0
+            for k in range(left, right + 1):
+                u += column[k]
+                v += row[k]
+                out[5, of] = max(out[5, of], peak[k])
+                if column[k] < 1 or column[k] > limits[2] - 2:
+                    out[4, of] = 1.0
+            parts[of] += 1
+            columns[of] += count
+            mean[of, 0] += u
+            mean[of, 1] += v
+            if count > longest[of]:
+                longest[of] = count
+                middle[of, 0], middle[of, 1] = u / count, v / count
+            _part(column, row, left, right, of, limits, out)
+            left = right + 1
+    for of in range(5):
+        out[1, of], out[2, of] = out[1, of] / out[0, of], out[2, of] / out[0, of]
+        out[3, of] = np.nan
+        if parts[of] > 1:
+            du = mean[of, 0] / columns[of] - middle[of, 0]
+            dv = mean[of, 1] / columns[of] - middle[of, 1]
+            out[3, of] = 0.5 * math.hypot(du, dv)
+
+
+@compiled
+def _part(
+    column: Int,
+    row: Float,
+    left: int,
+    right: int,
+    of: int,
+    limits: tuple[float, int, int],
+    out: Float,
+) -> None:
+    """Add the pieces of one part, from its left end to its right one."""
+    inner = 2 if right - left >= limits[1] else 0
+    for k in range(left - 1, right + 1):
+        if k < left or k == right:  # beyond the last run
+            end, aside = (left, 1) if k < left else (right, -1)
+            at = end + inner * aside
+            steepness = 0.0
+            if inner:
+                steepness = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
+                steepness = min(max(steepness, 0.0), limits[0])
+            u, v = column[end] - 0.5 * aside, row[at] - steepness * math.sqrt(2.5)
+            du, dv = u - column[at], v - row[at]
+            u, v = (u + column[at]) / 2.0, (v + row[at]) / 2.0
+        else:
+            if k < left + inner or k >= right - inner:
+                continue
+            du, dv = 1.0, row[k + 1] - row[k]
+            u, v = column[k] + 0.5, (row[k] + row[k + 1]) / 2.0
+        segment = math.hypot(du, dv)
+        out[0, of] += segment
+        out[1, of] += segment * u
+        out[2, of] += segment * v
 
 
 def minimum_cost_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
@@ -55,12 +285,12 @@ def _minimum_cost_paths(energy: Float32, widths: Int, step_cost: np.float32, out
 
 def energy(straightened: Image, crossed: int) -> Float32:
     """As `cost_map.energy`."""
-    before = np.asarray(cv2.dilate(straightened, cost_map.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
-    behind = np.asarray(cv2.dilate(straightened, cost_map.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
-    around = np.asarray(cv2.dilate(straightened, cost_map.AROUND), np.uint8)
+    before = np.asarray(cv2.dilate(straightened, seams.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
+    behind = np.asarray(cv2.dilate(straightened, seams.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
+    around = np.asarray(cv2.dilate(straightened, seams.AROUND), np.uint8)
     out = np.empty(straightened.shape, dtype=np.float32)
-    limits = (cost_map.DARK, cost_map.SURFACE, cost_map.OPEN, cost_map.BEYOND_THUMB)
-    _energy(straightened, before, behind, around, cost_map.PRIOR, cost_map.STARTS[3], crossed, limits, out)
+    limits = (seams.DARK, seams.SURFACE, seams.OPEN, seams.BEYOND_THUMB)
+    _energy(straightened, before, behind, around, seams.PRIOR, seams.STARTS[3], crossed, limits, out)
     return out
 
 
@@ -105,8 +335,8 @@ def prepare() -> None:
     drawn[40:43, 100:400] = 200
     runs, _ = lines(drawn, 0)
     measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
-    straightened = np.zeros((2, len(cost_map.PRIOR)), np.uint8)
-    minimum_cost_paths(energy(straightened, 0), (len(cost_map.PRIOR),))
+    straightened = np.zeros((2, len(seams.PRIOR)), np.uint8)
+    minimum_cost_paths(energy(straightened, 0), (len(seams.PRIOR),))
     fast_tips.prepare()
 
 

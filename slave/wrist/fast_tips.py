@@ -12,10 +12,9 @@ import numpy as np
 
 from common.arrays import Float, Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import fingertips, outline, postures
+from slave.wrist import fingertips, led_image, postures
 from slave.wrist.fingertips import Candidates, Ends, LedImage, light_scale, on_plane, reported
-from slave.wrist.led_depth import SHRINK, Float32
-from slave.wrist.outline import Circles
+from slave.wrist.led_image import SHRINK, Circles, Float32
 from slave.wrist.postures import Postures, postures_of
 from slave.wrist.view import WristView
 
@@ -154,20 +153,20 @@ _LIMITS = _Limits(
     SHRINK,
 )
 _OUTLINE = _Outline(
-    outline.LOG,
-    outline.WAY,
-    outline.SHARE,
-    outline.WEIGHT,
-    outline.MIDDLES,
-    outline.WIDTHS,
-    outline.SETTINGS.width,
-    outline.STEP,
-    outline.SETTINGS.rim,
-    outline.SETTINGS.least_drop,
-    outline.SETTINGS.firm_drop,
-    outline.SETTINGS.edge_sigma,
-    outline.SETTINGS.middle_sigma,
-    outline.SETTINGS.radius_sigma,
+    led_image.LOG,
+    led_image.WAY,
+    led_image.SHARE,
+    led_image.WEIGHT,
+    led_image.MIDDLES,
+    led_image.WIDTHS,
+    led_image.SETTINGS.width,
+    led_image.STEP,
+    led_image.SETTINGS.rim,
+    led_image.SETTINGS.least_drop,
+    led_image.SETTINGS.firm_drop,
+    led_image.SETTINGS.edge_sigma,
+    led_image.SETTINGS.middle_sigma,
+    led_image.SETTINGS.radius_sigma,
 )
 
 

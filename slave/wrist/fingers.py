@@ -3,7 +3,7 @@
 Seams of least energy by dynamic programming, as in Kim et al. 2012.
 
 How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
-fingers of this hand can do sets the search band of each of the four seams (`slave.wrist.search_bands`). Along the
+fingers of this hand can do sets the search band of each of the four seams (`slave.wrist.seams`). Along the
 stations of a search band a seam is the path of least energy, found by dynamic programming: first the three among index
 ... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
 minimum, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
@@ -19,11 +19,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
-from slave.wrist.cost_map import DARK, STARTS, WIDTHS
 from slave.wrist.engine import NUMPY, Engine
-from slave.wrist.finger_lines import NONE
 from slave.wrist.palm_pose import PalmPose, find_palm_pose
-from slave.wrist.search_bands import STATION_PX, Float32, SearchBands, search_bands_of
+from slave.wrist.runs import NONE
+from slave.wrist.seams import DARK, STARTS, STATION_PX, WIDTHS, Float32, SearchBands, search_bands_of
 from slave.wrist.view import WristView
 
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs

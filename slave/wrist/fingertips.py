@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
-from slave.wrist.led_depth import SHRINK, Float32, depth_about, led_optics, nearness, shrink
-from slave.wrist.outline import SETTINGS as OUTLINE
-from slave.wrist.outline import Circles, fitted
+from slave.wrist.led_image import SETTINGS as OUTLINE
+from slave.wrist.led_image import SHRINK, Circles, Float32, depth_about, fitted, led_optics, nearness, shrink
 from slave.wrist.postures import (
     ABOVE,
     APEX,

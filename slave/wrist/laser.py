@@ -1,23 +1,201 @@
 """Find the laser segment of each finger and its centroid (Kim et al. 2012).
 
+Finger labels of the parts of the laser line.
+
+By where each part lies on the laser's plane, where the seams cannot be right.
+
+A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
+axis of its own (`LaserWorkspace.place`), even where seams lie in another minimum. A wrist that deviates by 5 degrees
+moves all of them by half a finger, and a palm that holds something does not show it; but where four lines lie side by
+side their middle is between the second and the third. The thumb crosses the plane near its MCP or beside the palm:
+what lies as near to its root is its own, and what lies before the knuckles and farther away than that never is.
+
+Separate the thumb's laser line from that of its ball (thenar).
+
+The two run into each other; the plane that halves the angle of the MCP parts them. When the metacarpal stands
+across the laser's plane, a millimetre decides whether all of the line is the thumb's or none: so the centroid is taken
+for borders from near to far, each as likely as the next, and their mean and spread are what is known.
+
+Find the laser segment of each finger and its centroid (Kim et al. 2012).
+
 The line runs from side to side, so each column of the image holds it as short bright runs (`slave.wrist.runs`), one
 per surface. The seams assign a line; where they cut one, the cut is moved to the crease. What is left to each
-finger is measured (`slave.wrist.finger_lines`).
+finger is measured (`slave.wrist.runs`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image, Int
 from slave.wrist.engine import NUMPY, Engine
-from slave.wrist.finger_labels import finger_labels
-from slave.wrist.finger_lines import NONE, FingerLines
 from slave.wrist.fingers import Fingers
-from slave.wrist.runs import SETTINGS
-from slave.wrist.thumb_line import beyond_ball, on_ball
+from slave.wrist.runs import NONE, SETTINGS, FingerLines, Runs
 from slave.wrist.view import WristView
-from slave.wrist.workspace import workspace_of
+from slave.wrist.workspace import LaserWorkspace, workspace_of
+
+# Where `LaserWorkspace.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
+# fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
+_FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
+_TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
+_ALL = (3.2, 4.4)  # place: from the outside of the index to that of the little finger
+_ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has not turned unseen
+
+
+def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
+    """Return the fingers (N,) of runs at pixels (N, 2).
+
+    From the labels (N,) that the seams give, `NONE` where there is no line.
+    """
+    beyond, place = workspace.on_plane(points)
+    on = finger != NONE
+    near = on & workspace.only_thumb(beyond, place)
+    thumb, index = 0, 1
+    out = np.where(near, thumb, finger)
+    place = place - _shift(place[out > thumb])
+    out = _at_creases(out, runs)
+    ends = out[1:] != out[:-1]
+    ends[runs.first[1:] - 1] = True
+    first = np.concatenate([[0], np.flatnonzero(ends) + 1])
+    count = np.diff(np.append(first, len(out)))
+    middle = np.add.reduceat(place, first) / count
+    of = out[first]
+    nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
+    no_thumb = (of == thumb) & workspace.no_thumb(np.add.reduceat(beyond, first) / count, middle)
+    aside = (of > thumb) & ((middle < _FROM[of]) | (middle > _TO[of]))
+    aside &= _room(of, nearest, aside | no_thumb)
+    of = np.where(no_thumb | aside, nearest, of)
+    if workspace.flexed:
+        outside_index = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
+        beyond_index = (of == index) & (middle < outside_index)
+        if ((of == index) & ~beyond_index).any():
+            of = np.where(beyond_index, thumb, of)
+    return np.repeat(of, count)
+
+
+def _shift(place: Float) -> float:
+    """Measure by how much all fingers lie beside their axes.
+
+    Args:
+        place: (N,) of their runs.
+
+    Returns:
+        As a place; 0 where they lie about there, or not all four are there.
+    """
+    if not len(place):
+        return 0.0
+    across = np.sort(place)
+    steps, wide = np.diff(across), float(across[-1] - across[0])
+    off = 0.5 * float(across[0] + across[-1]) - 2.5
+    gap = 0.08  # place: a larger step is no line
+    # share of that way that the lines of four fingers side by side fill, at least
+    full = float(steps[steps < gap].sum()) > 0.72 * wide
+    return off if full and _ALL[0] < wide < _ALL[1] and _ASIDE[0] < abs(off) < _ASIDE[1] else 0.0
+
+
+def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
+    """Return which parts (N,) of fingers `of` may go to the `nearest` finger.
+
+    Not all of a finger's line may go to a finger that has its own line.
+
+    Then the finger is spread, or the palm is not quite where it should be.
+    """
+    unmoved = np.zeros(6, np.bool_)
+    unmoved[of[~moving]] = True  # those of no finger come last
+    return unmoved[of] | ~unmoved[nearest]
+
+
+def _at_creases(finger: Int, runs: Runs) -> Int:
+    """Move each change of finger along a line to the crease near by.
+
+    Returns the fingers (N,) of runs.
+
+    A line bends away at the sides of every finger, so that between two that touch its farthest, in the image its
+    uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
+    """
+    out = finger.copy()
+    change = finger[1:] != finger[:-1]
+    change &= (finger[1:] >= 0) & (finger[:-1] >= 0)
+    change[runs.first[1:] - 1] = False
+    for i in np.flatnonzero(change).tolist():
+        of_line = int(np.searchsorted(runs.first, i, side="right"))
+        end = int(runs.first[of_line]) if of_line < len(runs.first) else len(finger)
+        begin = _climb(i, range(i - 1, int(runs.first[of_line - 1]) - 1, -1), runs.row, out == out[i])
+        stop = _climb(i + 1, range(i + 2, end), runs.row, finger == finger[i + 1]) + 1
+        top = begin + int(runs.row[begin:stop].argmin())
+        if stop - top < SETTINGS.short:
+            top = stop
+        elif top - begin < SETTINGS.short:
+            top = begin
+        out[begin:top], out[top:stop] = out[i], finger[i + 1]
+    return out
+
+
+def _climb(start: int, along: range, row: Float, same: Bool) -> int:
+    """Return the last run of the same finger from one run on along a line.
+
+    It covers some columns, and goes farther while the line rises.
+    """
+    last = start
+    for count, k in enumerate(along, 1):
+        crease_px = 20  # columns on either side of a seam in which the crease may be
+        if not (same[k] and (count < crease_px or row[k] < row[last])):
+            break
+        last = k
+    return last
+
+
+# Where the border lies, beyond where the skin over the MCP of a straight thumb is: bending it by 50 degrees takes the
+# plane that halves its angle back by half a radius on the palm's side, and nowhere at its side. It is known no better
+# than its bone (8 %, 3 mm), the device's shift (1 mm along the thumb) and turn (2.5 degrees at 6 cm).
+_BORDER_M, _BORDER_SIGMA_M = -1.5e-3, 4e-3
+# Middles of nine parts, alike in probability, of Student's t with three degrees of freedom: some hands are far off.
+_T3 = np.array([-2.23, -1.15, -0.66, -0.31, 0.0, 0.31, 0.66, 1.15, 2.23])
+_BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _T3
+
+
+def on_ball(beyond_m: Float) -> bool:
+    """Return whether a line (N,) is rather on the ball than on the thumb.
+
+    The line is so far beyond the MCP's skin [m].
+
+    Where the wrist is straight the thumb stands across the plane; a bent one can bring the ball there alone.
+    """
+    return float(np.median(beyond_m)) < _BORDER_M
+
+
+def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
+    """Return the centroid offset of the thumb's part of a line (2,).
+
+    It is how much this centroid lies beside that of the whole line; also its deviation [px].
+
+    Args:
+        runs: The runs.
+        of_thumb: (N,) which of them are on the thumb or its ball.
+        beyond_m: (N,) how far each is beyond the MCP's skin [m], from the thumb's root.
+    """
+    points: Float = np.stack([runs.column[of_thumb], runs.row[of_thumb]], axis=-1, dtype=np.float64)
+    length = np.ones(len(points))
+    least_px = 4.0  # of line, for a centroid
+    if len(points) > 2:
+        down = np.minimum(np.abs(np.diff(points[:, 1])), least_px)
+        step = np.sqrt(1.0 + down * down)
+        length[1:-1] = 0.5 * (step[1:] + step[:-1])
+    weights = (beyond_m > _BORDERS_M[:, None]) * length
+    total = weights.sum(axis=1)
+    seen = total >= least_px
+    # Sums, not products of matrices, and no hypot: they are the same bits on every processor.
+    whole = (length[:, None] * points).sum(axis=0) / length.sum()
+    if (
+        not seen.any()
+    ):  # all of it on the ball: nearest to the thumb is where it is seen farthest from the root
+        return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
+    off = (weights[seen, :, None] * points).sum(axis=1) / total[seen, None] - whole
+    mean = off.mean(axis=0)
+    # centroids lump at the whole line and at its end: 1.96 deviations of that hold less than 95 %
+    tails = 1.5
+    return mean, tails * float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))
+
 
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
 _LINE_PX = 0.6  # one whole line

@@ -21,10 +21,9 @@ import numpy as np
 from common.arrays import Bool, Float, Image, Int
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, METACARPALS
-from common.hand.wrist_joint import STRAIGHT, forearm_palm
-from slave.wrist.led_depth import SHRINK, Float32, shrink
-from slave.wrist.view import WristView
-from slave.wrist.workspace_samples import NEAREST_M, in_image
+from common.hand.wrist import STRAIGHT, forearm_palm
+from slave.wrist.led_image import SHRINK, Float32, shrink
+from slave.wrist.view import NEAREST_M, WristView, in_image
 
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees
@@ -51,7 +50,7 @@ class PalmPose:
     """How the palm lies now.
 
     Attributes:
-        wrist_angles_rad: (2,) bend of the wrist (`common.hand.wrist_joint`).
+        wrist_angles_rad: (2,) bend of the wrist (`common.hand.wrist`).
         T_camera_palm: (4, 4) with it [m].
         view: One as if the palm lay about like that: what search bands and reach are made of.
     """

@@ -21,11 +21,9 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry.tapered_capsules import Capsules, first_hits, terms
 from common.geometry.transforms import rotation_vector_to_matrix
-from common.hand.fingertips import Fingertips
-from common.hand.model import CHAINS, FINGER_JOINTS
-from slave.wrist.led_depth import Float32
-from slave.wrist.view import WristView
-from slave.wrist.workspace_samples import NEAREST_M, thumb_postures
+from common.hand.model import CHAINS, FINGER_JOINTS, Fingertips
+from slave.wrist.led_image import Float32
+from slave.wrist.view import NEAREST_M, WristView, thumb_postures
 
 MCP_RAD = np.radians(np.arange(-10.0, 111.0, 6.0))
 PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))

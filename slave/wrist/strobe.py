@@ -1,4 +1,23 @@
-"""Recognition of ambient, laser and LED frames by content.
+"""Recognise ambient, laser and LED frames by content, and subtract the ambient.
+
+Check by content that three strobed frames are ambient, laser and LED.
+
+In this order.
+
+All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
+ambient light that swings, explain:
+
+    broad      a square of 72 px fits into what is brighter: LEDs light a palm, which is wider than that
+    thin       much brighter, and in its column lower than 72 px: the line of the laser
+    flash      thin, and brighter than both other frames: light that was there in one frame alone
+
+LEDs are detected by broad light; the laser by a flash on what the LEDs light, or at its edge, and nowhere else: a
+window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
+hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds. Nothing is compared
+with a frame before them, so it does not matter what the ambient light was then.
+Where both frames are saturated neither is brighter: such cells measure nothing and are not counted.
+
+Recognition of ambient, laser and LED frames by content.
 
 The frames are joined to strobe cycles.
 
@@ -15,16 +34,243 @@ switched in, and no other. The last rule is for pictures that were exchanged whi
 swaps A1 L1 E0 may follow one another, of the right kinds and of two poses, but not where the cycle has them. A cycle
 that has slipped (a frame lost or added, unseen in the times) is known anew with its second cycle. Counting thus only
 ever rejects cycles. A frame that is a copy of the one before, pixel by pixel, is dropped.
+
+Subtraction of the ambient frame of a strobe cycle.
+
+The device's own light is left.
 """
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from math import inf, log2
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from common.arrays import Image
 from slave.sources import Frame
-from slave.wrist.illumination import NO_EVIDENCE, brighter, coarse, evidence, unlit
+
+_Cells = cv2.typing.MatLike  # of a coarse frame
+_SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
+
+
+class IlluminationSettings(NamedTuple):
+    """Numbers that tell laser, LED and ambient frames apart."""
+
+    noise: int = (
+        6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
+    )
+    swing: float = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
+    line: int = 20  # levels beyond that: a line that a centroid can be taken of
+    led_least: float = (
+        0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
+    )
+    led_never: float = (
+        0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
+    )
+    # How many times as many cells of flash on the hand as there are
+    laser_of_elsewhere: float = 4.0  # of flash elsewhere
+    valid_least: float = 0.25  # share of the cells that are not saturated: with fewer nothing is decided
+
+
+SETTINGS = IlluminationSettings()
+_NOISE_OF_LEVEL = (SETTINGS.noise + SETTINGS.swing * np.arange(256)).astype(
+    np.uint8
+)  # by the darker of two levels
+# Neighbourhoods, (rows, columns) of cells.
+_SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
+_COLUMN = np.ones((9, 1), np.uint8)
+_LINE_HIGH = np.ones((5, 1), np.uint8)  # a line hides so many from the LEDs
+_AROUND = np.ones((5, 5), np.uint8)
+_SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a window moves in one frame
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Evidence that three frames are ambient, laser, LED.
+
+    Base-2 logarithms of measures over their thresholds.
+
+    Attributes:
+        led: The LED frame has broad light that the ambient frame has not.
+        laser: The laser frame has a flash where the LEDs light.
+        alone: There are no such lines in the ambient frame, nor as many flashes there or elsewhere.
+        steady: Nothing broad came or went with the laser, or went with the LEDs.
+    """
+
+    led: float
+    laser: float
+    alone: float
+    steady: float
+
+    @property
+    def margin(self) -> float:
+        """The weakest of the four [octaves]; not positive: not sure."""
+        return min(self.led, self.laser, self.alone, self.steady)
+
+
+NO_EVIDENCE = Evidence(-inf, -inf, -inf, -inf)
+
+
+def coarse(image: Image) -> Image:
+    """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3).
+
+    By halves as far as that goes: means of two by two are what a processor is quickest at.
+    """
+    cells: _Cells = image
+    while cells.shape[1] % (2 * _SIZE[0]) == 0 and cells.shape[0] % (2 * _SIZE[1]) == 0:
+        cells = cv2.resize(cells, (cells.shape[1] // 2, cells.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    if cells.shape[1::-1] != _SIZE:
+        cells = cv2.resize(cells, _SIZE, interpolation=cv2.INTER_AREA)
+    return np.asarray(cells if cells.ndim == 2 else cells.max(axis=2), np.uint8)
+
+
+def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
+    """Return the evidence that three coarse frames (60, 80) are as they should be.
+
+    -inf: not evaluated, as another measure is not positive.
+    """
+    darker = cv2.min(ambient, led)
+    valid = _valid(darker)
+    if valid < SETTINGS.valid_least * ambient.size:
+        return NO_EVIDENCE
+    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
+    led_gain = cv2.subtract(cv2.subtract(led, ambient), noise)
+    if cv2.countNonZero(led_gain) <= SETTINGS.led_least * valid:
+        return NO_EVIDENCE
+    lit = _octaves(_broad(led_gain) / valid, SETTINGS.led_least)
+    laser_gain, laser_loss = _each_over(laser, ambient)
+    laser_least = 8  # cells of flash: the line on one finger
+    if not lit > 0.0 or cv2.countNonZero(laser_gain) <= laser_least:
+        return Evidence(lit, -inf, -inf, -inf)
+    led_loss = cv2.subtract(cv2.subtract(ambient, led), noise)
+    halo = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
+    above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=halo))
+    steady = -_octaves(
+        max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, SETTINGS.led_never
+    )
+    if not steady > 0.0:
+        return Evidence(lit, -inf, -inf, steady)
+    led_over_laser, laser_over_led = _each_over(led, laser)
+    line = cv2.subtract(
+        _above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=SETTINGS.line)
+    )
+    flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
+    if cv2.countNonZero(flash) <= laser_least:
+        return Evidence(lit, -inf, -inf, steady)
+    near = _near(cv2.min(led_gain, led_over_laser))
+    on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
+    elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
+    own = _shared(cv2.min(laser_loss, led_loss), lambda: _near(led_over_laser))
+    excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
+    laser_of_own = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
+    laser_of_excess = 8.0  # of lines within the hand that the ambient frame has and another has not
+    rest = max(SETTINGS.laser_of_elsewhere * elsewhere, laser_of_own * own, laser_of_excess * excess)
+    return Evidence(lit, _octaves(on_hand, laser_least), _octaves(on_hand, rest), steady)
+
+
+def unlit(frames: Sequence[Image]) -> bool:
+    """Return whether no broad light comes or goes within these coarse frames.
+
+    Frames are (60, 80). The LEDs light none of them, or all.
+    """
+    darkest = reduce(cv2.min, frames)
+    valid = _valid(darkest)
+    if valid < SETTINGS.valid_least * darkest.size:
+        return False
+    gain = cv2.subtract(reduce(cv2.max, frames), darkest)
+    return (
+        _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), SETTINGS.led_never * valid)
+        <= SETTINGS.led_never * valid
+    )
+
+
+def brighter(frame: Image, other: Image) -> bool:
+    """Return whether one coarse frame (60, 80) has broad light the other has not.
+
+    It must also lack none that the other has; such light is that of the LEDs.
+    """
+    darker = cv2.min(frame, other)
+    valid = max(_valid(darker), SETTINGS.valid_least * frame.size)
+    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
+    gain = cv2.subtract(cv2.subtract(frame, other), noise)
+    if _broad(gain, SETTINGS.led_least * valid) <= SETTINGS.led_least * valid:
+        return False
+    return _broad(cv2.subtract(cv2.subtract(other, frame), noise)) <= SETTINGS.led_never * valid
+
+
+def _valid(darker: _Cells) -> int:
+    """Count the cells in which one frame may be brighter than another.
+
+    `darker` is the darker of both frames.
+    """
+    saturated = 250  # level of a cell
+    return cv2.countNonZero(cv2.threshold(darker, saturated - 1, 255, cv2.THRESH_BINARY_INV)[1])
+
+
+def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
+    """Return how far each frame is brighter than the other [levels].
+
+    Beyond what noise and a swing of ambient light explain.
+    """
+    noise = cv2.LUT(cv2.min(first, second), _NOISE_OF_LEVEL)
+    one, other = cv2.subtract(first, second), cv2.subtract(second, first)
+    return cv2.subtract(one, noise), cv2.subtract(other, noise)
+
+
+def _lit(over: _Cells) -> _Cells:
+    return cv2.threshold(over, 0, 255, cv2.THRESH_BINARY)[1]
+
+
+def _near(over: _Cells) -> _Cells:
+    """What the LEDs light, and a line's height above and below."""
+    return cv2.dilate(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SMALL), _LINE_HIGH)
+
+
+def _inside(over: _Cells) -> _Cells:
+    """What lies within what the LEDs light, a line's height bridged."""
+    return cv2.erode(cv2.morphologyEx(_lit(over), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
+
+
+def _broad(over: _Cells, least: float = 0.0) -> int:
+    """Count the cells that are broadly brighter.
+
+    0 where no more than `least` are brighter at all.
+    """
+    if cv2.countNonZero(over) <= least:
+        return 0
+    return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
+
+
+def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
+    """Count the cells of thin lines that lie there.
+
+    `where` is called only if there can be any.
+    """
+    if cv2.minMaxLoc(over)[1] <= SETTINGS.line:
+        return 0
+    return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
+
+
+def _thin(over: _Cells) -> _Cells:
+    bright = cv2.threshold(over, SETTINGS.line, 255, cv2.THRESH_BINARY)[1]
+    high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
+    return cv2.subtract(bright, high)
+
+
+def _above_column(over: _Cells) -> _Cells:
+    """How far cells are brighter than what is about as bright above or below them."""
+    return cv2.morphologyEx(over, cv2.MORPH_TOPHAT, _COLUMN)
+
+
+def _octaves(value: float, threshold: float) -> float:
+    if value <= 0.0:
+        return -inf
+    return log2(value / threshold) if threshold > 0.0 else inf
+
 
 CYCLE = 3  # periods
 EVENTS = ("cycles", "doubled", "gaps", "out_of_step", "unsure", "unlit")
@@ -154,3 +400,39 @@ class Strobe:
 
 def _copied(last: _Seen, frame: Frame, cells: Image) -> bool:
     return last.cells.tobytes() == cells.tobytes() and np.array_equal(last.frame.image, frame.image)
+
+
+def lit_line(frame: Image, ambient: Image) -> Image:
+    """Return the image (H, W) of the laser's line, as `lit` does.
+
+    White where the light that was added made the frame white.
+
+    In the sun a line has less room up to white the brighter the skin is: what is left of it does not measure the line.
+    """
+    out = lit(frame, ambient)
+    # grey levels of a frame: as bright or brighter
+    white = cv2.threshold(frame, 250 - 1, 255, cv2.THRESH_BINARY)[1]
+    least = 16  # grey levels that were added: less is noise beside what is white anyway
+    added = cv2.threshold(out, least, 255, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.max(out, cv2.bitwise_and(white, added)), np.uint8)
+
+
+def lit(frame: Image, ambient: Image) -> Image:
+    """Subtract the ambient frame; the difference saturates at 0 (Kim et al. 2012).
+
+    The black level cancels. Where the ambient frame is saturated the light that was added cannot be measured, and
+    the difference is 0 there by itself.
+
+    Args:
+        frame: (H, W) laser or LED frame, uint8.
+        ambient: (H, W) ambient frame of the same strobe cycle, uint8.
+
+    Returns:
+        (H, W) uint8.
+
+    Raises:
+        ValueError: The two are not of one size.
+    """
+    if frame.shape != ambient.shape:
+        raise ValueError(f"frame of {frame.shape} and ambient frame of {ambient.shape} are not of one size")
+    return np.asarray(cv2.subtract(frame, ambient), np.uint8)

@@ -18,10 +18,10 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import intersect_plane
 from common.hand.model import CHAINS
 from slave.wrist.palm_pose import PalmPose
-from slave.wrist.view import WristView
-from slave.wrist.workspace_samples import (
+from slave.wrist.view import (
     NEAREST_M,
     PER_BONE,
+    WristView,
     along_bones,
     finger_postures,
     radius_along,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.cameras.depth import AWAY_M, SETTLING, static
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 
 def test_a_resting_marker_stands_within_a_millimetre_at_60_cm(root: Path) -> None:

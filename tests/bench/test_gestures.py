@@ -13,8 +13,7 @@ from common.calibration.gesture_settings import default_gestures
 from common.messages import Gesture
 from common.sim.gestures import Gestures
 from common.sim.scenes import scene_by_name
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 CALIBRATION = Path(__file__).parents[2] / "calib_json"
 SETTINGS = default_gestures()

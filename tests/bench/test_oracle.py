@@ -20,9 +20,9 @@ from bench.oracle.solve import run
 from bench.oracle.truth import Truth, sets_of, truths_of
 from common.arrays import Float
 from common.errors import RecordingError
-from common.recording.npz import read_npz, write_npz
+from common.recording.recorded_files import read_npz, write_npz
 from common.sim.scenes import scene_by_name
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 _STEP_NS = 10_000_000
 

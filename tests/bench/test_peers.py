@@ -14,7 +14,7 @@ from bench.report import Row
 from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from master.estimator.settings import DEFAULT
-from master.fabrik.rotations import Vector
+from master.fabrik.linear_algebra import Vector
 
 MODEL = bench_model()
 

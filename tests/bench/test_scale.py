@@ -10,7 +10,7 @@ import pytest
 from bench.rigs.rooms import ROOM, detections, dome, room
 from bench.rigs.scale import ScaleRun, cost_per_camera, summary
 from bench.rigs.scale_page import into_page
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
 

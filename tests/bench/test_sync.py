@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.cameras.unsynchronised import CALIBRATION, MOTIONS, Shooting, centroids, outcome
-from master.rig.files import load_setup
+from master.rig.setup import load_setup
 
 RATES_HZ = (30.0, 60.0, 90.0)
 SEEDS = range(1)

@@ -12,7 +12,7 @@ from bench import pose_cost
 from bench.__main__ import ALL, main
 from bench.hands import mocap
 from bench.report import Row
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 
 
 @pytest.mark.parametrize("name", ALL)

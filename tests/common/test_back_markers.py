@@ -8,7 +8,7 @@ import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
-from common.hand.back_markers import with_three_back_markers
+from common.hand.fitting import with_three_back_markers
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.sim.light import marker_colour

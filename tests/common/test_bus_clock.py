@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from common.bus.certificates import FIRST_DAY, MASTER, OPERATOR, KeyPair, issue
-from common.bus.refusal import why_refused
+from common.bus.endpoints import why_refused
+from common.bus.keys import FIRST_DAY, MASTER, OPERATOR, KeyPair, issue
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from tests.common.test_encrypted_bus import NOW, access, tls_endpoint
 from tests.network_helpers import until
 
@@ -30,7 +30,7 @@ def test_a_wrong_clock_is_named_and_not_another_rig(
     which: str,
 ) -> None:
     """Certificates of another time are the same as a clock of another time."""
-    monkeypatch.setattr("common.bus.certificates.FIRST_DAY", first_day)
+    monkeypatch.setattr("common.bus.keys.FIRST_DAY", first_day)
     folder, endpoint = tmp_path / "keys", tls_endpoint()
     make(folder, ["left"], EARLIER if which == "no longer" else LATER)
     with ExitStack() as stack:
@@ -94,7 +94,7 @@ def test_a_clock_that_is_wrong_where_the_master_is_is_named(
     folder, endpoint = tmp_path / "keys", tls_endpoint()
     make(folder, [], NOW)
     _with_certificate_of(folder, OPERATOR, EARLIER)
-    monkeypatch.setattr("common.bus.refusal.datetime", _InTime)
+    monkeypatch.setattr("common.bus.endpoints.datetime", _InTime)
     with ExitStack() as stack:
         stack.callback(ZenohBus(endpoint, None, access(MASTER, folder)).close)
         why = why_refused(endpoint, access(OPERATOR, folder).identity())

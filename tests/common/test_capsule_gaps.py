@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand.capsule_gaps import TaperedCapsules, gaps_between
+from common.hand.skin import TaperedCapsules, gaps_between
 
 
 def _capsules(rng: np.random.Generator, count: int) -> TaperedCapsules:

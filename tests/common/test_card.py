@@ -13,7 +13,7 @@ from common.errors import CalibrationError
 from common.geometry.srgb import to_linear
 from common.geometry.transforms import transform
 from common.sim.board import BOARD, BoardRenderer
-from common.sim.card import DISTANCES_M, HEIGHT_M, MARKER, WIDTH_M, CardScene
+from common.sim.scenes import DISTANCES_M, HEIGHT_M, MARKER, WIDTH_M, CardScene
 
 CALIB = Path(__file__).parents[2] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)

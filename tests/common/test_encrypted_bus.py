@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from common.bus.bus import Subscription
-from common.bus.certificates import MASTER, OPERATOR
-from common.bus.keys import Access
+from common.bus.keys import MASTER, OPERATOR, Access
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.messages import Command, Gesture, Health
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from tests.network_helpers import free_endpoint, health, until
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -10,10 +10,8 @@ from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.geometry.transforms import invert
 from common.hand.model import HandModel
-from common.sim.grasp import ROUND_S, ROUNDS, TIMING, Grasp
-from common.sim.grip import MCP_PER_PIP, bar_in_palm, closed_round, gaps_m
-from common.sim.held import Cylinder
-from common.sim.motion import PERIOD_S, HandState, angles_of
+from common.sim.grasp import MCP_PER_PIP, ROUND_S, ROUNDS, TIMING, Grasp, bar_in_palm, closed_round, gaps_m
+from common.sim.motion import PERIOD_S, Cylinder, HandState, angles_of
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name

@@ -12,17 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile, MarkerMount, parse
-from common.calibration.hand_presets import preset_couplings, preset_limits
 from common.errors import CalibrationError
 from common.geometry.transforms import quaternion_to_matrix, rigid
-from common.hand.model import (
-    CHAINS,
-    FINGER_JOINTS,
-    JOINTS,
-    WEBXR_JOINTS,
-    HandModel,
-)
-from common.hand.profiles import generated_profile
+from common.hand.model import CHAINS, FINGER_JOINTS, JOINTS, WEBXR_JOINTS, HandModel
+from common.hand.profiles import generated_profile, preset_couplings, preset_limits
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, any_rotation, palm, rendered
 
 MIRROR = np.diag([-1.0, 1.0, 1.0])

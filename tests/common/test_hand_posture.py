@@ -6,12 +6,10 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import Couplings
-from common.calibration.hand_presets import preset_limits
 from common.errors import CalibrationError
-from common.hand.fitting import profile_from_joints
+from common.hand.fitting import fit_posture, joint_angles, profile_from_joints, reached_limits
 from common.hand.model import HandModel
-from common.hand.posture import fit_posture, joint_angles, reached_limits
-from common.hand.profiles import generated_profile
+from common.hand.profiles import generated_profile, preset_limits
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import posture_prior_of
 

@@ -8,7 +8,7 @@ import pytest
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.hand.routine import MOVES, ROUTINE_S, STEPS, move_at, posture_at
-from common.sim.routine import PERIOD_S, REACTION_S, HandRoutine
+from common.sim.people import PERIOD_S, REACTION_S, HandRoutine
 
 MODEL = HandModel.of(generated_profile("any", "right"))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import PhalanxError
 from common.geometry.srgb import gain_tables, to_linear, to_srgb
-from common.sim.illuminant import CALIBRATED_KELVIN, ROOM, Light, LightSchedule, planckian_xy, white
+from common.sim.light import CALIBRATED_KELVIN, ROOM, Light, LightSchedule, planckian_xy, white
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.imu.csv_columns import UNITS, find_columns
-from common.imu.csv_table import Table, read_csv
+from common.imu.csv_table import UNITS, Table, find_columns, read_csv
 
 G = 9.80665
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry.transforms import axis_rotation, matrix_to_rotation_vector, quaternion_to_matrix
-from common.imu.fusion import OrientationFilter
-from common.imu.stillness import Stillness
+from common.imu.fusion import OrientationFilter, Stillness
 from common.messages import ImuSample
 from tests.hand_helpers import any_rotation
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion
-from common.imu_score import TiltErrors
+from common.imu.fusion import TiltErrors
 from tests.hand_helpers import any_rotation
 
 

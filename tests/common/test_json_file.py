@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.calibration.json_file import MAX_BYTES, MAX_DEPTH, decode_json, read_json
+from common.calibration.files import MAX_BYTES, MAX_DEPTH, decode_json, read_json
 from common.errors import CalibrationError
 
 

@@ -7,11 +7,22 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from common.bus.certificates import FIRST_DAY, LIFE, MASTER, OPERATOR, issue, new_authority, shown
-from common.bus.keys import access_of, link_key, new_key, rig_key
+from common.bus.keys import (
+    FIRST_DAY,
+    LIFE,
+    MASTER,
+    OPERATOR,
+    access_of,
+    issue,
+    link_key,
+    new_authority,
+    new_key,
+    rig_key,
+    shown,
+)
 from common.errors import BusError, PhalanxError
-from common.link.link_key import LinkKey
-from master.commands.keys_folder import make
+from common.link.datagram import LinkKey
+from master.commands.keys import make
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -12,8 +12,8 @@ from common.calibration import HandProfile, load
 from common.errors import RecordingError
 from common.geometry.transforms import quaternion_to_matrix, rigid
 from common.hand.model import CHAINS, HandModel
-from common.sim.leap import joint_angles, load_leap, palm_rotation
 from common.sim.motion import PERIOD_S, POSES, ScriptedMotion, smooth_step
+from common.sim.people import joint_angles, load_leap, palm_rotation
 
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = HandModel.of(load(ROOT / "calib_json/hands/default-right.json", HandProfile))

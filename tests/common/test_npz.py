@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.recording.npz import PACKED_BYTES, read_npz, write_npz
+from common.recording.recorded_files import PACKED_BYTES, read_npz, write_npz
 from tests.common.hostile_npz import MIB, member, write_bomb, write_members
 
 ARRAYS = {

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from common.calibration import HandProfile, load
-from common.hand.fingertips import Fingertips
-from common.hand.model import CHAINS, HandModel
-from common.hand.palmar_surface import PalmarSurface, first_hits
+from common.hand.model import CHAINS, Fingertips, HandModel
 from common.hand.profiles import generated_profile
+from common.hand.skin import PalmarSurface, first_hits
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still, 
 from common.recording.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
 from common.recording.pictures import decode as picture
 from common.recording.pictures import decode_file, read_picture
-from master.calibrate.cameras.image_sets import image_sets
-from master.calibrate.wrist.lit_views import load_grey
+from master.calibrate.cameras.views import image_sets
+from master.calibrate.wrist.device import load_grey
 from slave.cameras.replay import read_png
 from tests.picture_helpers import TINY, claiming, hostile, many_scans, tiled
 
@@ -209,8 +209,8 @@ from common.errors import MessageError, PhalanxError
 from common.messages import decode
 from common.recording.picture_size import size_of
 from common.recording.pictures import decode as picture, decode_file
-from master.calibrate.cameras.image_sets import _load
-from master.calibrate.wrist.lit_views import load_grey
+from master.calibrate.cameras.views import _load
+from master.calibrate.wrist.device import load_grey
 from slave.cameras.grey import Pixels
 from slave.cameras.replay import read_png
 from slave.cameras.v4l2_formats import Layout
@@ -284,4 +284,4 @@ def test_one_file_alone_calls_a_decoder_of_pictures_and_one_of_videos() -> None:
         path for package in ("common", "slave", "master", "deploy") for path in (ROOT / package).rglob("*.py")
     ]
     calling = {path.relative_to(ROOT).as_posix() for path in files if decoders(path.read_text())}
-    assert calling == {"common/recording/pictures.py", "common/recording/video.py"}
+    assert calling == {"common/recording/pictures.py"}

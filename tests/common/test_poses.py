@@ -10,8 +10,17 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, Matrix4, RigCalibration, load
 from common.hand.model import CHAINS, HandModel
 from common.recording.frame_recording import open_recording
-from common.sim.motion import PERIOD_S, POSES, HandState
-from common.sim.poses import MOVE_S, REACH_M, ROTATION_DEG, ROUNDS, STATION_S, StudyPoses
+from common.sim.motion import (
+    MOVE_S,
+    PERIOD_S,
+    POSES,
+    REACH_M,
+    ROTATION_DEG,
+    ROUNDS,
+    STATION_S,
+    HandState,
+    StudyPoses,
+)
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name

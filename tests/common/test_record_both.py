@@ -12,8 +12,8 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.imu.recording import read_imu
 from common.recording.frame_recording import Illumination, open_recording
 from common.sim.motion import HandMotion, HandState
-from common.sim.record_both import record_both
 from common.sim.scene import Scene
+from common.sim.wrist.record import record_both
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 
 
 def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path: Path) -> None:

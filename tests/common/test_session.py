@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from common.bus.keys import ENVIRONMENT, new_key, rig_key
 from common.errors import PhalanxError
-from common.link.datagram import Header, Kind, Refusal, parse
-from common.link.link_key import LinkKey, device_secret
+from common.link.datagram import Header, Kind, LinkKey, Refusal, device_secret, parse
 from common.link.session import (
     Beacon,
     EchoAnswer,

@@ -9,8 +9,8 @@ from common.calibration import ImuCalibration
 from common.errors import CalibrationError
 from common.geometry.transforms import axis_rotation, cross, quaternion_to_matrix, rigid
 from common.imu.fusion import OrientationFilter
-from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState
+from common.sim.sensors import SimulatedImu
 
 MOUNTED, WORLD = (0.5, 0.5, -0.5, 0.5), (0.8, 0.6, 0.0, 0.0)
 IMU = ImuCalibration(q_palm_imu=MOUNTED, q_rig_world=WORLD)

@@ -8,12 +8,12 @@ import pytest
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import HandModel
-from common.hand.wrist_joint import forearm_palm
+from common.hand.wrist import forearm_palm
 from common.imu.fusion import OrientationFilter
-from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
+from common.sim.sensors import SimulatedImu
 from common.sim.together import TOGETHER, together_motion
 from common.sim.wrist.scene import WristScene
 

@@ -17,14 +17,13 @@ from common.geometry.tag_family import dictionary, tag_image
 from common.geometry.transforms import axis_rotation, invert, rigid, transform
 from common.recording.frame_recording import open_recording
 from common.sim.motion import PERIOD_S, HandState
+from common.sim.objects_seen import INK, PAPER, TEXELS, printed
 from common.sim.painter import MarkerView, Painter
 from common.sim.record import record_scene
 from common.sim.render import Renderer
 from common.sim.scene import Card, Scene
-from common.sim.scenes import scene_by_name
-from common.sim.tag_painter import INK, PAPER, TEXELS, printed
+from common.sim.scenes import SHUTTLE_M_S, scene_by_name
 from common.sim.tracked import facing
-from common.sim.travel import SHUTTLE_M_S
 from common.sim.view import View
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,8 +3,7 @@
 import os
 from pathlib import Path
 
-from common.calibration.file_monitor import MonitoredFiles
-from common.calibration.replacing import replacing
+from common.calibration.files import MonitoredFiles, replacing
 
 
 def test_the_first_look_reports_and_the_next_does_not(tmp_path: Path) -> None:

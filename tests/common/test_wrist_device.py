@@ -8,10 +8,10 @@ import pytest
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse
-from common.calibration.wrist import Laser, LaserPlane
+from common.calibration.rig import Laser, LaserPlane
 from common.errors import CalibrationError
 from common.hand.model import HandModel
-from common.hand.wrist_device import WristDevice
+from common.hand.wrist import WristDevice
 from master.rig.wrist import WristSetup
 from slave.wrist.view import WristView
 

@@ -10,19 +10,16 @@ import pytest
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.geometry.transforms import axis_rotation, quaternion_to_matrix, rigid
-from common.hand.wrist_joint import STRAIGHT, forearm_palm
+from common.hand.wrist import STRAIGHT, forearm_palm
 from common.recording.frame_recording import Illumination
-from common.sim.held import Cylinder
-from common.sim.imu import SimulatedImu
-from common.sim.motion import HandMotion, HandState
+from common.sim.motion import Cylinder, HandMotion, HandState
 from common.sim.scenes import scene_by_name
+from common.sim.sensors import SimulatedImu
 from common.sim.together import TOGETHER
-from common.sim.wrist.capsules import THING_GROUP
-from common.sim.wrist.light import SURFACE_AT_M, Leds
-from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.capsules import THING_GROUP, bodies_of
+from common.sim.wrist.render import SURFACE_AT_M, Leds, WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.surface import HandSurface
-from common.sim.wrist.things import bodies_of
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}

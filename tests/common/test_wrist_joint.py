@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.geometry.transforms import axis_rotation, matrix_of
-from common.hand.wrist_joint import STRAIGHT, forearm_palm, wrist_angles_of, wrist_quaternion
+from common.hand.wrist import STRAIGHT, forearm_palm, wrist_angles_of, wrist_quaternion
 
 ANGLE = st.floats(-1.4, 1.4)
 

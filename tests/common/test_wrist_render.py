@@ -12,8 +12,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError
 from common.recording.frame_recording import Illumination
 from common.sim.scenes import renderer_of
-from common.sim.wrist.light import SURFACE_AT_M, Leds, Sensor
-from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.render import SURFACE_AT_M, Leds, Sensor, WristRenderer
 from common.sim.wrist.scene import WristScene
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"

@@ -15,12 +15,11 @@ from common.errors import CalibrationError, PhalanxError
 from common.geometry.camera_model import CameraModel
 from common.geometry.tapered_capsules import Capsules, distances, first_hits, terms
 from common.hand.model import HandModel
-from common.sim.imu import SimulatedImu
 from common.sim.scenes import renderer_of, view_by_name
+from common.sim.sensors import SimulatedImu
 from common.sim.wrist.capsules import PALM_GROUP, THENAR_GROUP, THUMB_GROUP, HandCapsules
-from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.render import WristRenderer
-from common.sim.wrist.scene import AMBIENTS, MOTIONS, WristScene
+from common.sim.wrist.scene import AMBIENTS, MOTIONS, LaserSheet, LineTruth, WristScene
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}

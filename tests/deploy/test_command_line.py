@@ -10,10 +10,10 @@ from common.sim.scene import APART_PPM, LATE_NS
 from common.sim.scenes import NAMES
 from common.sim.together import TOGETHER
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
-from deploy import commands, demo, sensors
+from deploy import commands, demo
 from master.cli.table import program
-from master.commands.summary_lines import summary_lines
-from master.replay import detect
+from master.commands.summary import summary_lines
+from master.replay import offline
 from slave.cli.table import PROGRAM
 from tests.common.test_frame_recording import camera, rig, write
 
@@ -72,9 +72,9 @@ def steps_of_replay(
     def step(*words: str) -> None:
         steps.append(words)
 
-    monkeypatch.setattr(detect, "_slave", step)
-    monkeypatch.setattr(detect, "setups_with_hands", setups)
-    monkeypatch.setattr(detect, "solve_hands", solve)
+    monkeypatch.setattr(offline, "_slave", step)
+    monkeypatch.setattr(offline, "setups_with_hands", setups)
+    monkeypatch.setattr(offline, "solve_hands", solve)
     write(folder, cameras={name: camera(name) for name in ("left", "right", "palm")}, kind="both", rig=None,
           rigs=[rig("wrist", ("palm",)), rig()])  # fmt: skip
     (folder / "hand.json").write_text("{}")
@@ -82,7 +82,7 @@ def steps_of_replay(
         ["replay", str(folder), "--out", str(folder / "out"), "--hand", str(folder / "hand.json"), *words]
     )
     assert command.work == "master.commands.replay:replay"
-    detect.replay_recording(options, lambda _line: None)
+    offline.replay_recording(options, lambda _line: None)
     return steps, solved
 
 
@@ -271,7 +271,7 @@ def test_the_summary_lists_the_results_of_objects_and_gestures() -> None:
 def test_a_rig_whose_imu_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "rigs").mkdir()
     (tmp_path / "rigs/odd.json").write_text(json.dumps({"cameras": ["left"], "imu": 5}))
-    with pytest.raises(sensors.DemoError, match=r"odd\.json: cannot read the rig"):
+    with pytest.raises(demo.DemoError, match=r"odd\.json: cannot read the rig"):
         rows("odd", tmp_path, tmp_path)
 
 
@@ -298,7 +298,7 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
 def test_rigs_that_cannot_be_played_together_are_refused(
     rigs: tuple[str, ...], scene: str, expected: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(sensors.DemoError, match=expected):
+    with pytest.raises(demo.DemoError, match=expected):
         rows(rigs, ROOT / "calib_json", tmp_path, scene)
 
 
@@ -336,6 +336,6 @@ def test_a_scene_of_both_kinds_is_played_before_both(
 
 def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:
     # The launcher imports nothing of what it starts, so these stand twice.
-    assert sensors.TOGETHER == TOGETHER
+    assert demo.TOGETHER == TOGETHER
     assert demo._LATE_MS * 1e6 == LATE_NS
     assert demo._APART_PPM == APART_PPM

@@ -14,18 +14,16 @@ from pathlib import Path
 import pytest
 
 from deploy import deployment, sender_check
-from deploy import wheelhouse as wheels_module
-from deploy.bundle import BUNDLE, bundle, command
-from deploy.deployment import make_keys
-from deploy.keys import prepared_keys
-from deploy.one_host import Host, Wish
+from deploy import payload as wheels_module
+from deploy.commands import prepared_keys
+from deploy.deployment import Host, Wish, make_keys
+from deploy.payload import BUNDLE, bundle, command, own_wheel, wheelhouse
 from deploy.remote import Deadline, Remote
 from deploy.sender_check import Ears, Received
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
-from deploy.wheelhouse import own_wheel, wheelhouse
 from master.cli.table import program
 from master.commands.fleet import Device, table
-from master.commands.keys_folder import make
+from master.commands.keys import make
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from master.commands.keys_folder import files_of_device, make
+from master.commands.keys import files_of_device, make
 
 ROOT = Path(__file__).resolve().parents[2]
 TEMPLATE = ROOT / "deploy/cloud_init/user-data"

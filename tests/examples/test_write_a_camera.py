@@ -10,8 +10,8 @@ import pytest
 from common.clock import Clock
 from common.errors import CameraError
 from common.messages import MarkerDetections, Message
-from slave.counters import DetectionCounters
-from slave.markers.calibrated import CalibratedDetector
+from slave.markers.reloadable import CalibratedDetector
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame, FrameSource
 from tests.slave.painted import NAMES, camera, hand, render

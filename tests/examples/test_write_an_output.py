@@ -8,7 +8,7 @@ import numpy as np
 from common.clock import SystemClock
 from common.hand.model import JOINTS
 from common.messages import HandPose, MarkerDetections, ResultMessage
-from master.outputs.sink import Sink
+from master.outputs.bus import Sink
 from master.rig.pipeline import pipeline_of
 from master.run.app import RunFigures, run
 from master.run.dispatcher import Dispatcher

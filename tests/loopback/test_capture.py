@@ -9,8 +9,7 @@ import cv2
 
 from common.bus.keys import new_key
 from master.calibrate.cameras.boards import Checkerboard
-from master.calibrate.cameras.image_sets import image_sets
-from master.calibrate.cameras.views import look
+from master.calibrate.cameras.views import image_sets, look
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,9 +18,8 @@ import pytest
 
 from common.arrays import Bool
 from common.sim.scenes import scene_by_name
-from master.outputs.files import load_poses
-from master.outputs.poses import Poses
-from master.rig.files import load_setup
+from master.outputs.poses import Poses, load_poses
+from master.rig.setup import load_setup
 from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[2]

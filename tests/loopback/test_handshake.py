@@ -13,8 +13,7 @@ import msgspec
 import pytest
 
 from common.clock import SkewedClock
-from common.link.datagram import Address, Header, Kind, Refusal, Sealer, parse
-from common.link.link_key import LinkKey
+from common.link.datagram import Address, Header, Kind, LinkKey, Refusal, Sealer, parse
 from common.link.session import Hello, RigKeys, seal
 from common.messages import (
     Command,

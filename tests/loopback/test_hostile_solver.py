@@ -19,13 +19,11 @@ from bench.rigs.rooms import ROOM, detections
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
 from common.link.session import EchoAnswer, Started
 from common.messages import HandPose, decode, encode
-from master.rig.files import load_setup, load_setups
-from master.rig.setup import RigSetup
-from master.run.admission import limits_of
+from master.rig.setup import RigSetup, load_setup, load_setups
 from master.run.app import result_at
 from master.run.dispatcher import new_dispatcher
 from master.run.link import MasterLink
-from master.run.link_senders import SensorMessage
+from master.run.link_senders import SensorMessage, limits_of
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import seeded

@@ -17,10 +17,10 @@ from common.bus.zenoh_bus import ZenohBus
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.messages import Command, Health, ImuSample
-from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
+from common.sim.sensors import SimulatedImu
 from master.run.ingest import Ingest
-from slave.simulated import scene_of
+from slave.commands.simulated import scene_of
 from slave.uplink import Uplink
 from tests.network_helpers import PATIENCE_S, clock_known, free_endpoint, free_udp_port, until
 from tests.slave.imu.fake_ximu3 import FakeXimu3

@@ -12,9 +12,8 @@ from common.clock import SkewedClock, SystemClock
 from common.link.datagram import Kind, Refusal, Sealer
 from common.link.session import RigKeys
 from common.messages import MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
-from master.run.ingest import Ingest
+from master.run.ingest import CAPACITY, Ingest
 from master.run.link import MasterLink
-from master.run.message_queue import CAPACITY
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires

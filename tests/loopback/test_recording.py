@@ -12,9 +12,8 @@ from typing import cast
 from common.bus.keys import new_key
 from common.messages import ResultMessage
 from common.recording.messages import open_messages
-from master.recording.digest import ResultDigest
 from master.recording.files import recorded_setups
-from master.recording.player import Player
+from master.recording.player import Player, ResultDigest
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]

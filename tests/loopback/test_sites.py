@@ -17,14 +17,13 @@ import numpy as np
 import pytest
 
 from common.bus.bus import Subscription
-from common.bus.certificates import MASTER as AS_MASTER
-from common.bus.certificates import OPERATOR
-from common.bus.keys import FOLDER, access_of
+from common.bus.keys import FOLDER, OPERATOR, access_of
+from common.bus.keys import MASTER as AS_MASTER
 from common.bus.zenoh_bus import ZenohBus
 from common.errors import BusError
 from common.messages import Command, Gesture, Health
 from common.messages.streams import MASTER
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from tests.network_helpers import free_endpoint, until
 
 SITES = {"room-a": "star", "room-b": "hash"}  # and the key that is tapped there, to tell them apart

@@ -3,8 +3,7 @@
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from common.link.datagram import Address, Header, Kind, Refusal, Sealer, parse, unseal
-from common.link.link_key import LinkKey, device_secret
+from common.link.datagram import Address, Header, Kind, LinkKey, Refusal, Sealer, device_secret, parse, unseal
 from common.link.session import (
     NONCE_BYTES,
     Beacon,

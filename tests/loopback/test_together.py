@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from master.outputs.files import load_poses
+from master.outputs.poses import load_poses
 from tests.sockets import Listener, listeners, rows, undocumented
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,7 +8,7 @@ from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_
 from common.messages import TrackerPose
 from master.calibrate.tracker.registration import documented, register
 from master.objects.tracker import TrackerLine
-from slave.objects.survive_lines import SurviveDevice
+from slave.objects.survive import SurviveDevice
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion
 from tests.slave.objects.recorded import HEAD
 

@@ -8,9 +8,8 @@ import pytest
 
 from common.link.datagram import Refusal
 from common.messages import MarkerDetections, TagDetections, WristDetections
-from master.rig.files import load_setups
-from master.run.admission import READY_NS, SenderLimits, bucket_of, limits_of, refused
-from master.run.link_senders import Sender
+from master.rig.setup import load_setups
+from master.run.link_senders import READY_NS, Sender, SenderLimits, bucket_of, limits_of, refused
 from tests.network_helpers import cycle, detections
 
 S = 1_000_000_000

@@ -14,10 +14,9 @@ from common.hand.model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup
-from master.run.app import AuxiliaryMessage, Observed, RunFigures, health, run
+from master.run.app import AuxiliaryMessage, Observed, RunFigures, StageTimes, health, run
 from master.run.dispatcher import Dispatcher
 from master.run.live import cameras_line
-from master.run.stages import StageTimes
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 

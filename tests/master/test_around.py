@@ -11,7 +11,7 @@ from common.hand.model import WRIST
 from common.messages import HandPose, MarkerDetections
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

@@ -5,7 +5,7 @@ import pytest
 
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
-from master.fabrik.blob_bias import LensShift, card_outline, centre_of_blob, round_outline
+from master.fabrik.caps import LensShift, card_outline, centre_of_blob, round_outline
 
 MATRIX = np.array([[503.0, 0.0, 319.5], [0.0, 503.0, 239.5], [0.0, 0.0, 1.0]])
 LENS = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])

@@ -12,7 +12,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, parse
 from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.depth import depth_law
 from master.fabrik.intersection import triangulate
 from tests.common.file_values import bounds_of, edited

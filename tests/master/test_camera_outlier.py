@@ -10,11 +10,11 @@ from common.arrays import Bool, Float
 from common.calibration import RigCalibration
 from common.geometry.transforms import rigid
 from common.messages import HandPose, MarkerDetections, Source
+from master.estimator.epoch import MarkerPositions
 from master.fabrik.caps import CapTables
-from master.fabrik.estimate import MarkerPositions
 from master.fabrik.rays import RayTriangulator
 from master.rig.pipeline import build_pipeline
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

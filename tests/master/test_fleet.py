@@ -12,8 +12,7 @@ from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, PhalanxError
 from common.messages import Health
-from master.commands.fleet import Roll, expected_devices
-from master.commands.wait_for_senders import at_master, here
+from master.commands.fleet import Roll, at_master, expected_devices, here
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port
 

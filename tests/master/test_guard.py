@@ -8,8 +8,7 @@ import pytest
 from common.messages import MarkerDetections
 from common.messages.streams import sender_of
 from master.run.app import Solved
-from master.run.link_senders import SensorMessage
-from master.run.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
+from master.run.link_senders import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine, SensorMessage
 from master.run.solver_supervisor import SolverSupervisor, culprit
 from tests.network_helpers import ManualClock, detections
 

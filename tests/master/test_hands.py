@@ -15,13 +15,12 @@ from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
 from master.estimator.pipeline import SolvedPose
 from master.monitor.clocks import ClockMonitor
-from master.outputs.files import RunFiles, load_poses
-from master.rig.files import RigFiles, load_setup
-from master.rig.needs_restart import refuse_restart
+from master.outputs.poses import RunFiles, load_poses
 from master.rig.pipeline import pipeline_of
+from master.rig.setup import RigFiles, load_setup
+from master.run.app import StageTimes
 from master.run.dispatcher import Dispatcher
-from master.run.stages import StageTimes
-from master.run.tuning import LivePipeline, RigTuning
+from master.run.tuning import LivePipeline, RigTuning, refuse_restart
 from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose
 from tests.master.test_rig_merge import setups, two_hands

@@ -20,10 +20,10 @@ from common.messages import Command, Health, Preview, Still
 from common.recording.picture_size import Size
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
-from master.calibrate.cameras.live_views import LiveViews
-from master.console.picture_sizes import PictureSizes
+from master.calibrate.cameras.coverage import LiveViews
+from master.console.link import PictureSizes
 from master.console.state import ConsoleSettings, ConsoleState
-from master.outputs.rerun_images import CameraImages
+from master.outputs.rerun_scene import CameraImages
 from master.run.ingest import Ingest
 from tests.network_helpers import free_endpoint, until
 from tests.picture_helpers import TINY, claiming, hostile

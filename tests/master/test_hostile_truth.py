@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.recording.npz import PACKED_BYTES
-from master.calibrate.depth.recording import Pairs, by_truth
-from master.evaluation.object_score import load_object_truth
-from master.evaluation.score import load_truth
+from common.recording.recorded_files import PACKED_BYTES
+from master.calibrate.depth.source import Pairs, by_truth
+from master.evaluation.score import load_object_truth, load_truth
 from master.evaluation.wrist_score import load_wrist_truth
 from tests.common.hostile_npz import MIB, member, write_bomb, write_members
 from tests.master.test_wrist_score import N, recording, truth, write_truth

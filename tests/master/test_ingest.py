@@ -10,9 +10,8 @@ from common.clock import SystemClock
 from common.errors import BusError
 from common.link.datagram import MAX_DATAGRAM
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose
-from master.run.ingest import Ingest
+from master.run.ingest import QUEUE, Ingest
 from master.run.link_senders import SensorMessage
-from master.run.message_queue import QUEUE
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))

@@ -13,13 +13,11 @@ from pathlib import Path
 import pytest
 
 from common.errors import PhalanxError
-from common.service_manager import ServiceManager
+from common.supervisor import ServiceManager
 from master.cli.table import program
-from master.commands.install import KEPT, ONE_RUN, command_of, environment_of
-from master.commands.keys_folder import make
-from master.commands.service_unit import UNIT, unit_text
-from master.commands.user_services import UserServices
-from master.monitor.loop import MonitoredLoop
+from master.commands.keys import make
+from master.commands.run import KEPT, ONE_RUN, UNIT, UserServices, command_of, environment_of, unit_text
+from master.monitor.report import MonitoredLoop
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(sys.executable).with_name("phalanx-master")

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from bench.rigs.local import free_port
-from master.commands.keys_folder import make
-from master.commands.service_unit import UNIT
+from master.commands.keys import make
+from master.commands.run import UNIT
 from tests.master.user_manager import user_manager, why_not
 from tests.network_helpers import until
 

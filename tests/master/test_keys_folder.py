@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from common.bus.certificates import shown
-from common.bus.keys import link_key, new_key
+from common.bus.keys import link_key, new_key, shown
 from common.errors import PhalanxError
-from common.link.link_key import device_secret
-from master.commands.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
+from common.link.datagram import device_secret
+from master.commands.keys import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
 from tests.cli import invoke
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

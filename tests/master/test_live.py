@@ -13,8 +13,8 @@ from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
 from common.errors import BusError
 from common.messages import Command, HandPose
-from master.outputs.files import load_poses
-from master.rig.files import load_setup, load_setups
+from master.outputs.poses import load_poses
+from master.rig.setup import load_setup, load_setups
 from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port, until

@@ -12,7 +12,7 @@ from common.bus.zenoh_bus import ZenohBus
 from common.clock import SystemClock
 from common.messages import Command, Detections, WristDetections
 from master.estimator.pipeline import SolvedPose
-from master.rig.files import RigFiles
+from master.rig.setup import RigFiles
 from master.run.live import LiveSettings, run_live
 from master.run.tuning import LivePipeline
 from slave.uplink import Uplink

@@ -24,7 +24,7 @@ from common.messages import (
     TrackerPose,
 )
 from master.outputs.result_files import contact_path, load_contact, load_object, object_path
-from master.rig.files import RigFiles, load_setups
+from master.rig.setup import RigFiles, load_setups
 from master.run.live import LiveSettings, cameras_line, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import free_endpoint, free_udp_port, until

@@ -12,9 +12,9 @@ import pytest
 from common.messages import HandPose, MarkerDetections
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
-from master.run.load_shedding import MOST, LoadShedding, Shedding
-from master.run.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, capacity
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
+from master.run.ingest import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, capacity
+from master.run.solver_supervisor import MOST, LoadShedding, Shedding
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
 from tests.network_helpers import cycle, detections
 from tests.synthetic_run import hand_at, synthetic_run

@@ -12,10 +12,10 @@ from common.calibration.hand import MarkerMount
 from common.errors import CalibrationError
 from common.hand.model import TIPS, HandModel
 from common.messages import HandPose, MarkerDetections, decode, encode
-from master.replay.solve import fingers_of
+from master.replay.offline import fingers_of
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

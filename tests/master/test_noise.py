@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.fabrik.noise import NoiseEstimator
+from master.fabrik.one_euro import NoiseEstimator
 
 DT_NS = 16_666_667
 UNKNOWN = np.full(4, np.nan)

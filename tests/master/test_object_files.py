@@ -9,7 +9,7 @@ import pytest
 
 from common.errors import RecordingError
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource, ResultMessage
-from master.outputs.files import RunFiles
+from master.outputs.poses import RunFiles
 from master.outputs.result_files import (
     GESTURES,
     ObjectPoses,
@@ -20,7 +20,7 @@ from master.outputs.result_files import (
     load_object,
     object_path,
 )
-from master.replay.recorded_tags import recorded_tags
+from master.replay.recorded import recorded_tags
 from tests.master.test_outputs_files import random_pose
 
 HAND = "default-right"

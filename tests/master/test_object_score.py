@@ -8,7 +8,7 @@ import pytest
 from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigid
-from master.evaluation.object_score import (
+from master.evaluation.score import (
     ObjectTruth,
     errors,
     load_object_truth,

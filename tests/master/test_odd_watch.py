@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from master.monitor.extrinsics import ExtrinsicsMonitor
+from master.monitor.report import ExtrinsicsMonitor
 from tests.master.test_camera_outlier import THREE, messages, rig, solve
 
 

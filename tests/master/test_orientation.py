@@ -18,10 +18,8 @@ from common.geometry.transforms import (
     matrix_to_quaternion,
     quaternion_to_matrix,
 )
-from master.estimator.epoch import OrientationMeasurement
-from master.estimator.imu_samples import REACH_NS, slerp
-from master.estimator.palm_imu import OrientationTrack
-from master.fabrik.estimate import SolvedHand
+from master.estimator.epoch import OrientationMeasurement, SolvedHand
+from master.estimator.pipeline import REACH_NS, OrientationTrack, slerp
 from tests.hand_helpers import any_rotation
 
 MS = 1_000_000

@@ -8,9 +8,7 @@ import pytest
 
 from common.errors import RecordingError
 from common.messages import HandPose
-from master.outputs.files import PosesFile, load_poses, save_poses
-from master.outputs.poses import Poses
-from master.outputs.truth import PosesTruth
+from master.outputs.poses import Poses, PosesFile, PosesTruth, load_poses, save_poses
 
 FIXED = "t_ns position_m orientation_wxyz radius_m valid tracked cov_m2 angles_rad markers_m markers_raw_m"
 

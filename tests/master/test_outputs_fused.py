@@ -14,14 +14,13 @@ from common.hand.model import WRIST
 from common.messages import HandPose, Source
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene, WristTruth
-from master.outputs.device_place import DevicePlace
+from master.outputs.drawing import DevicePlace
 from master.outputs.picture import draw_summary
-from master.outputs.picture_wrist import WristPicture
+from master.outputs.picture_overlays import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.rerun_scene import RerunScene
-from master.rig.files import load_setups
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setups
 from tests.master.test_outputs_rerun import column, rows_of
 
 TIMES_S = np.linspace(0.5, 9.0, 5)

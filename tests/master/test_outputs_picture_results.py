@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 
 from master.evaluation.run_results import RunResults
-from master.outputs.files import RunFiles
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_results import STRIP_BOX, ResultPicture, spans
-from master.outputs.poses import Poses
+from master.outputs.picture_overlays import STRIP_BOX, ResultPicture, spans
+from master.outputs.poses import Poses, RunFiles
 from tests.master.test_outputs_rerun import MODEL, RIG, moving_hand
 from tests.master.test_outputs_results import START_NS, STEP_NS, WATCHED, bar, contact, gesture
 

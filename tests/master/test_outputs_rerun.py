@@ -18,11 +18,9 @@ from common.hand.model import JOINTS, TIPS, HandModel
 from common.hand.profiles import generated_profile
 from common.messages import Command, HandPose, Health, Preview, Source
 from master.outputs.bus import BusSink
-from master.outputs.poses import Poses
-from master.outputs.rerun import run_viewer, write_rrd
-from master.outputs.rerun_process import ViewerProcess, viewer_arguments
+from master.outputs.poses import Poses, PosesTruth
+from master.outputs.rerun import ViewerProcess, run_viewer, viewer_arguments, write_rrd
 from master.outputs.rerun_scene import RerunScene
-from master.outputs.truth import PosesTruth
 from master.rig.setup import RigSetup
 from tests.hand_helpers import detections
 

@@ -19,10 +19,10 @@ from common.calibration.object_profile import (
     Tags,
 )
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource
-from master.outputs.object_appearance import ObjectAppearance
+from master.outputs.drawing import ObjectAppearance
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.outputs.rerun_gestures import arc, label_of
+from master.outputs.rerun_results import arc, label_of
 from tests.master.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
 
 START_NS = 10**15

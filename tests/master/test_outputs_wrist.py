@@ -14,12 +14,11 @@ from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quat
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristTruth
 from master.evaluation.wrist_report import lit_view
-from master.outputs.laser_fan import fan, fan_rays
+from master.outputs.drawing import fan, fan_rays
 from master.outputs.picture import draw_summary
-from master.outputs.picture_wrist import WristPicture
-from master.outputs.poses import Poses
+from master.outputs.picture_overlays import WristPicture
+from master.outputs.poses import Poses, PosesTruth
 from master.outputs.rerun import write_rrd
-from master.outputs.truth import PosesTruth
 from master.rig.setup import RigSetup
 from tests.master.test_outputs_rerun import column, rows_of
 from tests.wrist_run import exact_cycle, true_poses, wrist_scene, wrist_setup

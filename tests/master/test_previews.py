@@ -8,7 +8,7 @@ import pytest
 from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health
-from master.outputs.previews import PictureAsker
+from master.outputs.bus import PictureAsker
 from tests.network_helpers import until
 
 

@@ -13,10 +13,9 @@ from common.errors import CalibrationError
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from master.calibrate.tree_files import load_marker_rig
-from master.rig.files import load_hand, load_setup
 from master.rig.pipeline import build_pipeline, pipeline_of
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_hand, load_setup
+from master.run.app import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, rig_file
 
 

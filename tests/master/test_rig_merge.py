@@ -23,10 +23,9 @@ from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigi
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.messages import MarkerDetections
-from master.rig.files import load_setup, load_setups, setups_of
 from master.rig.pipeline import build_pipeline
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_setup, load_setups, setups_of
+from master.run.app import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file
 
 ASIDE = rigid(axis_rotation(1, 1.2), np.array([0.4, 0.0, 0.3]))

@@ -12,13 +12,11 @@ from common.calibration import RigCalibration, load, save
 from common.calibration.gesture_settings import default_gestures
 from common.calibration.object_profile import Bead, ObjectProfile
 from common.errors import CalibrationError
-from master.rig.files import RigFiles, load_setup, load_setups, setups_with_hands
-from master.rig.merge import in_world, merged_rig
-from master.rig.needs_restart import refuse_restart
-from master.rig.objects import load_gestures, objects_of, refuse_shared_objects
+from master.rig.merge import in_world, load_gestures, merged_rig, objects_of, refuse_shared_objects
+from master.rig.setup import RigFiles, load_setup, load_setups, setups_with_hands
+from master.run.app import StageTimes
 from master.run.dispatcher import Dispatcher
-from master.run.stages import StageTimes
-from master.run.tuning import LivePipeline, RigTuning
+from master.run.tuning import LivePipeline, RigTuning, refuse_restart
 from tests.loopback.test_imu_link import sample
 from tests.master.test_rig_merge import ASIDE, rows
 

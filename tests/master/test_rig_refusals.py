@@ -11,9 +11,9 @@ import pytest
 
 from common.bus.keys import new_key
 from common.geometry.transforms import axis_rotation
-from master.rig.files import load_setup
 from master.rig.pipeline import build_pipeline
-from master.run.stages import StageTimes
+from master.rig.setup import load_setup
+from master.run.app import StageTimes
 from tests.commands import Ended, command
 from tests.network_helpers import free_endpoint
 

@@ -8,7 +8,7 @@ import pytest
 
 from common.messages import Contact, Gesture, ObjectPose
 from master.evaluation.run_results import Annotated, RunResults, judge_gestures
-from master.outputs.files import RunFiles
+from master.outputs.poses import RunFiles
 from tests.master.test_outputs_rerun import STEP_NS
 from tests.master.test_outputs_results import START_NS, WATCHED, bar, contact, gesture
 

@@ -10,9 +10,8 @@ import pytest
 from common.errors import RecordingError
 from common.recording.frame_recording import FrameRecording, Manifest
 from master.commands.summary import read_summary, write_summary
-from master.outputs.files import load_poses
-from master.outputs.poses import Poses
-from master.replay.solve import fingers_of, solve
+from master.outputs.poses import Poses, load_poses
+from master.replay.offline import fingers_of, solve
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, hand_at, synthetic_run
 

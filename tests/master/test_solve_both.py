@@ -19,11 +19,10 @@ from common.recording.frame_recording import FrameRecording, Manifest
 from common.sim.record import named_angles
 from common.sim.render import Renderer
 from common.sim.wrist.record import WristTake
-from master.outputs.files import load_poses
-from master.replay.recorded_imu import recorded_samples
-from master.replay.solve import rigs_to_solve, solve_hands
-from master.rig.files import setups_of
-from master.rig.setup import RigSetup
+from master.outputs.poses import load_poses
+from master.replay.offline import rigs_to_solve, solve_hands
+from master.replay.recorded import recorded_samples
+from master.rig.setup import RigSetup, setups_of
 from tests.hand_helpers import LEFT
 
 SECONDS = 0.4

@@ -11,9 +11,8 @@ from common.errors import RecordingError
 from common.messages import ObjectSource, TagDetections
 from common.recording.frame_recording import FrameRecording, Manifest
 from master.outputs.result_files import contact_path, load_contact, load_object, object_path
-from master.replay.solve import rigs_to_solve, solve_hands
-from master.rig.files import load_setups, setups_with_hands
-from master.rig.setup import RigSetup
+from master.replay.offline import rigs_to_solve, solve_hands
+from master.rig.setup import RigSetup, load_setups, setups_with_hands
 from tests.object_run import PERIOD_NS, START_NS, ObjectRun, Sent, object_run
 
 FRAMES = 18

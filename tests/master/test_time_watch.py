@@ -7,7 +7,7 @@ import pytest
 from common.link.clock_offset import ClockEstimate
 from common.messages import Health, MarkerDetections, decode, encode
 from master.monitor.clocks import ClockMonitor
-from master.monitor.phases import CameraPhases
+from master.monitor.rates import CameraPhases
 from master.rig.setup import RigSetup
 from tests import timing_scenes as scenes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file

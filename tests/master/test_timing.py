@@ -11,10 +11,9 @@ from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from common.sim.scenes import scene_by_name
-from master.monitor.timing import KEPT_BLOCKS, ResidualTiming
-from master.monitor.timing_evidence import CameraPair, Track, carried
-from master.monitor.timing_fit import TimeOffset
-from master.rig.files import load_setup
+from master.monitor.clocks import KEPT_BLOCKS, ResidualTiming
+from master.monitor.timing_fit import CameraPair, TimeOffset, Track, carried
+from master.rig.setup import load_setup
 from tests import timing_scenes as scenes
 from tests.timing_scenes import Motion, cameras, misplaced, recorded
 

@@ -19,10 +19,9 @@ from common.errors import BusError, CalibrationError
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import HandJoints
 from common.messages import Command, HandPose, MarkerDetections
-from master.rig.files import RigFiles, load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigFiles, RigSetup, load_setup
+from master.run.app import StageTimes
 from master.run.live import LiveSettings, run_live
-from master.run.stages import StageTimes
 from master.run.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, rig_file

@@ -6,9 +6,9 @@ import pytest
 from common.calibration import Volume
 from common.hand.model import TIPS
 from common.messages import HandPose
-from master.monitor.volume import corners, edges, inside
+from master.rig.merge import corners, edges, inside
 from master.rig.pipeline import build_pipeline
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.synthetic_run import synthetic_run
 
 CUBE = Volume(low_m=(-0.2, -0.1, 0.4), high_m=(0.2, 0.3, 0.8))

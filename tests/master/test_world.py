@@ -26,15 +26,12 @@ from common.messages import (
     TrackerPose,
 )
 from master.estimator.pipeline import SolvedPose
-from master.evaluation.object_score import ObjectTruth, errors
+from master.evaluation.score import ObjectTruth, errors
 from master.outputs.result_files import ObjectPoses
-from master.rig.files import load_setups, setups_of
 from master.rig.pipeline import pipeline_of
-from master.rig.setup import RigSetup
-from master.run.app import Observed, RunFigures, health, run
-from master.run.dispatcher import Dispatcher
-from master.run.stages import StageTimes
-from master.run.tracked_object import TrackedObject
+from master.rig.setup import RigSetup, load_setups, setups_of
+from master.run.app import Observed, RunFigures, StageTimes, health, run
+from master.run.dispatcher import Dispatcher, TrackedObject
 from tests.master.test_app import Collector, ScriptedClock, ScriptedSource
 from tests.master.test_outputs_files import random_pose
 from tests.object_run import (

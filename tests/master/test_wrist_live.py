@@ -17,11 +17,10 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.messages import Command, Health
-from master.outputs.files import load_poses
-from master.rig.files import RigFiles, load_setup
-from master.rig.setup import RigSetup
+from master.outputs.poses import load_poses
+from master.rig.setup import RigFiles, RigSetup, load_setup
+from master.run.app import StageTimes
 from master.run.live import LiveSettings, run_live
-from master.run.stages import StageTimes
 from master.run.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_endpoint, free_udp_port, until

@@ -13,9 +13,8 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.evaluation.report import Played, report_scene
 from master.evaluation.wrist_report import forearm_tilt, laser_scores, lit_view
-from master.outputs.files import save_poses
-from master.rig.files import load_setups
-from master.rig.setup import RigSetup
+from master.outputs.poses import save_poses
+from master.rig.setup import RigSetup, load_setups
 from tests.master.test_outputs_rerun import rows_of
 from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 

@@ -12,9 +12,9 @@ from common.geometry.transforms import quaternion_to_matrix
 from common.messages import WristDetections
 from common.recording.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.sim.wrist.scene import WristTruth
-from master.outputs.files import load_poses
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
 from master.replay.recorded import recorded_cycles
-from master.replay.solve import solve
 from master.rig.setup import RigSetup
 from tests.hand_helpers import camera_file, rig_file
 from tests.wrist_run import CYCLE_NS, START_NS, exact_cycle, wrist_scene, wrist_setup

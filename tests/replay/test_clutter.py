@@ -17,11 +17,10 @@ from common.calibration import HandProfile, load
 from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
-from master.outputs.files import load_poses
-from master.replay.solve import solve
-from master.rig.files import load_hand, load_setup
-from master.rig.setup import RigSetup
-from slave.offline import detect_recording, save_detections
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
+from master.rig.setup import RigSetup, load_hand, load_setup
+from slave.commands.offline import detect_recording, save_detections
 
 SECONDS, RADIUS_PX, MARKER = 0.5, 8.0, 1
 RIGHT_MM, WRONG_MM = 10.0, 20.0

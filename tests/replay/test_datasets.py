@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Bool, Float
-from master.outputs.files import load_poses
+from master.outputs.poses import load_poses
 
 HANDS = ("calib_colors", "static", "flex90", "poses_left", "translate_8ms", "lights_0_warm")
 SWEEPS = ("sweep_paper", "sweep_rough")

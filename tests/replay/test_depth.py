@@ -18,10 +18,9 @@ import pytest
 
 from common.calibration import RigCalibration, load
 from common.recording.frame_recording import open_recording
-from master.outputs.files import load_poses
-from master.replay.solve import solve
-from master.rig.files import load_hand
-from master.rig.setup import RigSetup
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
+from master.rig.setup import RigSetup, load_hand
 
 CAMERAS = ("left", "right")
 

@@ -24,11 +24,10 @@ from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.commands.summary import read_summary
-from master.outputs.files import load_poses
-from master.replay.solve import solve
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
-from slave.offline import detect_recording, save_detections
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
+from master.rig.setup import RigSetup, load_setup
+from slave.commands.offline import detect_recording, save_detections
 from tests.replay.test_datasets import command
 
 SECONDS, RATE_HZ = 1.0, 30.0

@@ -10,15 +10,14 @@ import pytest
 from common.calibration import HandProfile, load
 from common.hand.model import HandModel
 from common.recording.frame_recording import open_recording
-from common.sim.poses import MOVE_S, STATION_S, StudyPoses
+from common.sim.motion import MOVE_S, STATION_S, StudyPoses
 from common.sim.record import record_scene
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
 from master.commands.summary import read_summary
-from master.outputs.files import load_poses
-from master.replay.solve import solve
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
+from master.rig.setup import RigSetup, load_setup
 from tests.replay.test_datasets import command
 
 SECONDS, RATE_HZ, SEED = 1.0, 30.0, 7

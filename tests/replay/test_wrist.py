@@ -16,10 +16,9 @@ import pytest
 from common.arrays import Float
 from common.hand.model import FINGERS
 from common.recording.frame_recording import FrameRecording, Illumination, open_recording
-from master.outputs.files import load_poses
-from master.replay.solve import solve
-from master.rig.files import load_hand
-from master.rig.setup import RigSetup
+from master.outputs.poses import load_poses
+from master.replay.offline import solve
+from master.rig.setup import RigSetup, load_hand
 from tests.replay.test_datasets import command
 
 _TIPS = pytest.mark.xfail(

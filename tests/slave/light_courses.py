@@ -17,13 +17,12 @@ import numpy as np
 from bench.report import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.sim.illuminant import CALIBRATED_KELVIN, LightSchedule
+from common.sim.light import CALIBRATED_KELVIN, LightSchedule
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import Detections, MarkerDetector
-from slave.markers.light_adaptive import LightAdaptiveDetector
-from slave.markers.white_balance import apart
-from slave.markers.workers import Inline
+from slave.markers.reloadable import LightAdaptiveDetector
+from slave.markers.white_balance import Inline, apart
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 RATE_HZ = 20.0

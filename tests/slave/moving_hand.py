@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.geometry.srgb import gain_tables
-from common.sim.desk import desk_image
+from common.sim.light import desk_image
 from common.sim.render import Renderer
 from common.sim.scene import DESK_DEPTH_M, Scene
 from slave.markers.classify import in_range

@@ -10,12 +10,11 @@ import pytest
 from common.calibration import CameraCalibration, HsvRange, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras.faulty import FaultyCamera
-from slave.cameras.synthetic import SyntheticCamera
-from slave.colours_in_use import in_use, overlap
-from slave.markers.ambiguity import ColourAmbiguityMonitor, ambiguity_counts, ambiguity_metrics
-from slave.markers.blobs import Blob
-from slave.simulated import FrameClock, scene_of
+from slave.cameras.synthetic import FaultyCamera, SyntheticCamera
+from slave.commands.simulated import FrameClock, scene_of
+from slave.markers.classify import Blob
+from slave.markers.group import ColourAmbiguityMonitor, ambiguity_counts, ambiguity_metrics
+from slave.tuning import in_use, overlap
 
 ROOT = Path(__file__).resolve().parents[2]
 TREE = ROOT / "calib_json"

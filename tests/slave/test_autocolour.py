@@ -16,11 +16,20 @@ from common.calibration import CameraCalibration, HsvRange, load
 from common.errors import CalibrationError, FitError, RecordingError
 from common.sim.record import record_scene
 from slave.__main__ import main
-from slave.markers.autocolour import MarkerColour, Namer, calibrate_moving
-from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked, pattern_of, votes_of
+from slave.commands.offline import calibrate_colours, detect_recording
+from slave.markers.autocolour import (
+    MarkerColour,
+    Namer,
+    by_clicks,
+    by_hand,
+    by_hues,
+    calibrate_moving,
+    checked,
+    pattern_of,
+    votes_of,
+)
 from slave.markers.colours import calibrate, report
 from slave.markers.detector import MarkerDetector
-from slave.offline import calibrate_colours, detect_recording
 from tests.slave.moving_hand import (
     CAMERAS,
     HANDS,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from common.messages import MarkerDetections
-from slave.markers.null_detector import NullDetector
+from slave.markers.reloadable import NullDetector
 from tests.slave.painted import hand, render
 
 

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.markers.blobs import FULL, MAX_CANDIDATES, find_blobs
+from slave.markers.classify import FULL, MAX_CANDIDATES, find_blobs
 
 
 def test_a_rectangle_gives_its_area_centroid_and_box_in_full_pixels() -> None:

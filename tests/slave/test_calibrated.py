@@ -9,11 +9,9 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration
 from slave import live
-from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import NUMPY
-from slave.markers.light_adaptive import LightAdaptiveDetector
-from slave.markers.reloadable import ReloadableDetector
+from slave.markers.reloadable import CalibratedDetector, LightAdaptiveDetector, ReloadableDetector
 from tests.slave import painted
 from tests.slave.test_tuning import FILE, RIG, tree
 

@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Image
-from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
 from slave.markers.centroid import PAD, Measured, measure
-from slave.markers.classify import ColourTable
+from slave.markers.classify import SCALE, Blob, ColourTable, find_blobs, with_fragments
 from tests.slave.painted import DESK, RANGES, SKIN, Disc, finger, marker_hsv, render
 
 TABLE = ColourTable(list(RANGES.values()))

@@ -16,15 +16,17 @@ from common.errors import CameraError, FitError
 from common.geometry.srgb import gain_tables
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from slave.colour_sampler import ColourSampler
-from slave.markers.calibrated import CalibratedDetector
+from slave.live import ColourSampler
 from slave.markers.classify import in_range
-from slave.markers.colour_sampling import SampledColours, undone
-from slave.markers.colours import calibrate, hue_separation
+from slave.markers.colours import SampledColours, calibrate, hue_separation, undone
 from slave.markers.detector import MarkerDetector
-from slave.markers.light_adaptive import LightAdaptiveDetector
-from slave.markers.reloadable import ReloadableDetector, marker_changes
-from slave.markers.workers import Inline
+from slave.markers.reloadable import (
+    CalibratedDetector,
+    LightAdaptiveDetector,
+    ReloadableDetector,
+    marker_changes,
+)
+from slave.markers.white_balance import Inline
 from slave.sources import Frame
 from slave.tuning import CameraTuning
 from tests.slave import painted

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from common.calibration import CameraCalibration, load
 from common.errors import FitError
+from slave.commands.offline import calibrate_colours
 from slave.markers.classify import HUES
 from slave.markers.colours import calibrate, circular_median, grow, report
-from slave.offline import calibrate_colours
 from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, marker_hsv, render
 
 IMAGE = render(hand(), noise=2.0)

@@ -12,11 +12,9 @@ from hypothesis.extra.numpy import arrays
 from common.arrays import Float
 from common.calibration import HsvRange
 from common.geometry.srgb import gain_tables
-from common.sim.illuminant import Light
-from common.sim.light import MARKER_LINEAR_RGB
+from common.sim.light import MARKER_LINEAR_RGB, Light
 from slave.markers.classify import ColourTable
-from slave.markers.colour_monitor import ColourMonitor, hsv
-from slave.markers.drift import (
+from slave.markers.illuminant import (
     LIMIT_BLUE,
     LIMIT_EXPOSURE,
     LIMIT_RED,
@@ -26,6 +24,7 @@ from slave.markers.drift import (
     bounded,
     fit_gains,
 )
+from slave.markers.white_balance import ColourMonitor, hsv
 from tests.slave import painted
 
 COLOURS = np.array(list(MARKER_LINEAR_RGB.values()))[:, ::-1] + 0.02  # blue first; no paint is quite black

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.markers.edge import Ellipse, centre_of, fits_occlusion
+from slave.markers.track import Ellipse, centre_of, fits_occlusion
 
 OVER = 8
 

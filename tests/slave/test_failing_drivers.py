@@ -14,20 +14,18 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from common.messages import MarkerDetections, Message
-from slave import failures
+from slave import sources
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reconnecting import CONTRAST, ReconnectingCamera, RepeatedPictures
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import DetectionCounters
-from slave.failures import LOG_EVERY_NS, Failures
 from slave.markers.detector import Detections
-from slave.markers.null_detector import NullDetector
-from slave.reconnect import Backoff
+from slave.markers.reloadable import NullDetector
+from slave.reconnect import CONTRAST, Backoff, ReconnectingCamera, RepeatedPictures
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, WristPipeline, run
-from slave.sources import Frame, FrameSource
-from slave.wrist.null_detector import NullWristDetector
+from slave.sources import LOG_EVERY_NS, Failures, Frame, FrameSource
+from slave.wrist.detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -287,7 +285,7 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
 def test_failures_are_logged_once_in_ten_seconds_with_how_many_were_left_out(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.WARNING, logger=failures.__name__)
+    caplog.set_level(logging.WARNING, logger=sources.__name__)
     now = [0]
     log = Failures("camera", lambda: now[0])
     for _ in range(100):

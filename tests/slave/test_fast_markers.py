@@ -19,9 +19,8 @@ from common.geometry.srgb import gain_tables
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers import centroid
-from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured
-from slave.markers.classify import ColourTable
+from slave.markers.classify import Blob, ColourTable, find_blobs
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
 from tests.slave.painted import RANGES, hand, render
@@ -193,7 +192,7 @@ def test_under_another_light_both_engines_look_up_the_same_colours(
 
 @needs_numba
 def test_an_image_that_must_not_be_written_is_no_new_kind_to_compile(numba: Engine) -> None:
-    from slave.markers.fast_scan import _scan_blobs
+    from slave.markers.fast import _scan_blobs
     from slave.markers.fast_window import measure_windows
 
     numba.prepare(TABLE)

@@ -12,15 +12,15 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from common.recording.frame_recording import Illumination, open_recording
-from slave import devices
 from slave.__main__ import main
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import DetectionCounters
+from slave.commands import devices
 from slave.preview import small_jpeg, whole_jpeg
+from slave.report import DetectionCounters
 from slave.sender import WristPipeline, run
 from slave.wrist.detector import WristDetector
 from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install

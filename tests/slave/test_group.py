@@ -1,6 +1,6 @@
 """Tests of what belongs together: blobs as the scan's finer grids report them."""
 
-from slave.markers.blobs import Blob
+from slave.markers.classify import Blob
 from slave.markers.group import candidate, choose
 
 

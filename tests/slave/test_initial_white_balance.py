@@ -10,11 +10,11 @@ import pytest
 from common.arrays import Float, Image
 from common.geometry.srgb import gain_tables
 from common.sim.grasp import Grasp
-from common.sim.illuminant import Light
+from common.sim.light import Light
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from slave.markers.classify import ColourTable
-from slave.markers.initial_white_balance import OTHER, initial_white_balance, lights
+from slave.markers.illuminant import OTHER, initial_white_balance, lights
 from tests.slave import painted
 from tests.slave.light_courses import standard_scene
 from tests.slave.painted import NAMES, SKIN, Disc, linear, marker_hsv

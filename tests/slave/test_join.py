@@ -17,8 +17,8 @@ from common.recording.frame_recording import Illumination, Manifest, RecordedClo
 from common.recording.frame_writing import RecordingWriter, encode_png
 from common.recording.pictures import MAX_FILE_BYTES
 from slave.__main__ import main
-from slave.join import join_recordings
-from slave.offline import detect_recording
+from slave.commands.join import join_recordings
+from slave.commands.offline import detect_recording
 from tests.common.test_frame_writing import check_whole, small_disk
 from tests.slave.painted import CENTRES, camera, hand, render
 

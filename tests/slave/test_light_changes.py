@@ -13,12 +13,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.sim.illuminant import LightSchedule
+from common.sim.light import LightSchedule
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
-from slave.markers.light_adaptive import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
-from slave.markers.white_balance import apart
-from slave.markers.workers import Inline
+from slave.markers.reloadable import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
+from slave.markers.white_balance import Inline, apart
 from tests.slave import painted
 from tests.slave.light_courses import (
     CANDLE,

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float, Image
 from common.geometry.srgb import gain_tables
-from common.sim.illuminant import Light
-from slave.markers.light_meter import AGREE, EVERY_NS, Change, LightMeter
+from common.sim.light import Light
+from slave.markers.white_balance import AGREE, EVERY_NS, Change, LightMeter
 
 SIZE = (320, 240)
 FRAME_NS = 16_666_667

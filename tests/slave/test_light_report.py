@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from slave.light_report import LightReport
-from slave.markers.colour_monitor import ColourWarning
+from slave.live import LightReport
 from slave.markers.reloadable import ReloadableDetector
+from slave.markers.white_balance import ColourWarning
 from slave.sources import Frame
 
 SECOND = 1_000_000_000

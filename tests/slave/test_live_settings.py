@@ -12,13 +12,12 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import picamera2, v4l2_settings
+from slave.cameras import picamera2, v4l2_controls
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.settings import FrameObserver
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.reconnect import Backoff
+from slave.reconnect import Backoff, ReconnectingCamera
 from slave.sources import FrameSource
 from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install
@@ -231,7 +230,7 @@ def test_what_a_usb_camera_cannot_change_is_said() -> None:
 
 
 def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(v4l2_settings, "TIMEOUT_S", 0.01)
+    monkeypatch.setattr(v4l2_controls, "TIMEOUT_S", 0.01)
     monkeypatch.setattr(picamera2, "TIMEOUT_S", 0.01)
     for source in (usb(Camera()), pi(monkeypatch, Sensor())):
         with pytest.raises(CameraError, match=r"no frame was read for 0.01 s"):

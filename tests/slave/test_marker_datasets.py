@@ -12,7 +12,7 @@ import pytest
 
 from common.arrays import Float
 from common.recording.frame_recording import open_recording
-from slave.offline import calibrate_colours, detect_recording
+from slave.commands.offline import calibrate_colours, detect_recording
 
 CLEAR_PX2 = 60.0  # a cap of this area is well visible
 

@@ -10,7 +10,7 @@ from common.calibration import save
 from common.errors import CalibrationError, RecordingError
 from common.recording.frame_recording import open_recording
 from slave.__main__ import main
-from slave.offline import camera_of, detect_recording, save_detections
+from slave.commands.offline import camera_of, detect_recording, save_detections
 from tests.slave.painted import CENTRES, NAMES, RANGES, camera, hand, render
 
 IDENTITY = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]

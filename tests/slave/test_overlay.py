@@ -10,12 +10,10 @@ from common.bus.bus import LoopbackBus
 from common.calibration import HsvRange
 from common.errors import CalibrationError
 from common.messages import Command, Preview
-from common.messages.preview_wish import PreviewWish
-from slave.markers.calibrated import CalibratedDetector
+from common.messages.command_bodies import PreviewWish
 from slave.markers.detector import MarkerDetector
-from slave.markers.reloadable import ReloadableDetector
-from slave.overlay import ARM_PX, SEVERAL, MarkerOverlay, WristOverlay, contrast_of
-from slave.preview import Previews
+from slave.markers.reloadable import CalibratedDetector, ReloadableDetector
+from slave.preview import ARM_PX, SEVERAL, MarkerOverlay, Previews, WristOverlay, contrast_of
 from slave.sources import Frame
 from tests.network_helpers import ManualClock
 from tests.slave import painted

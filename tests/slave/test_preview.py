@@ -15,10 +15,9 @@ from common.bus.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview
-from slave.counters import DetectionCounters
 from slave.markers.detector import MarkerDetector
 from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
-from slave.report import Reporter
+from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.uplink import Uplink

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, load
-from slave.markers.colour_monitor import hsv
 from slave.markers.detector import MarkerDetector
 from slave.markers.quality import WEIGHTS, Evidence, _hue, clarity_of, evidence_of, probability_of
+from slave.markers.white_balance import hsv
 from tests.slave.painted import NAMES, RANGES, Disc, camera, marker_hsv, render
 
 SIX = ("thumb", "index", "middle", "ring", "little", "back")

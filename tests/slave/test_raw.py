@@ -17,16 +17,15 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Health
-from common.messages.raw_wish import RawWish, raw_name
+from common.messages.command_bodies import RawWish, raw_name
 from common.recording.frame_recording import open_recording
 from slave import raw
 from slave.__main__ import main
-from slave.counters import DetectionCounters
-from slave.join import join_recordings
-from slave.markers.null_detector import NullDetector
-from slave.offline import detect_recording
+from slave.commands.join import join_recordings
+from slave.commands.offline import detect_recording
+from slave.markers.reloadable import NullDetector
 from slave.raw import RawFrames, RawSettings
-from slave.report import Reporter
+from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.tuning import CameraFiles

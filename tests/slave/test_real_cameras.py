@@ -10,12 +10,11 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave import devices
 from slave.cameras.grey import Pixels
-from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.cli.options import add_camera
-from slave.reconnect import Backoff
+from slave.commands import devices
+from slave.reconnect import Backoff, ReconnectingCamera
 from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice

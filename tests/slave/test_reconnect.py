@@ -12,11 +12,9 @@ import pytest
 from common.calibration import CameraCalibration
 from common.errors import CameraError, ImuError, PhalanxError, TrackerChoiceError, TrackerError
 from common.messages import ImuSample, TrackerPose
-from slave import failures
-from slave.cameras.reconnecting import ReconnectingCamera
-from slave.failures import LOG_EVERY_NS
-from slave.reconnect import Backoff, ReconnectingDriver, ReconnectingTracker
-from slave.sources import Frame
+from slave import sources
+from slave.reconnect import Backoff, ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
+from slave.sources import LOG_EVERY_NS, Frame
 
 CALIBRATION = CameraCalibration(
     version=1,
@@ -280,7 +278,7 @@ def test_a_stop_and_a_close_end_the_wait(device: str, end: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_long_absence_is_logged_now_and_then(device: str, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING, logger=failures.__name__)
+    caplog.set_level(logging.WARNING, logger=sources.__name__)
     bench = Bench(lives=[1])
     items = measured(driver(device, bench))
     next(items)

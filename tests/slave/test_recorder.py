@@ -26,10 +26,9 @@ from common.imu.recording import read_imu
 from common.recording.frame_recording import Illumination, Manifest, open_recording
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera
+from slave.commands.offline import detect_recording
 from slave.markers.detector import MarkerDetector
-from slave.offline import detect_recording
-from slave.progress import Length, Progress, ProgressDisplay, progress_text
-from slave.recorder import Recorder, clock_of, feed
+from slave.recorder import Length, Progress, ProgressDisplay, Recorder, clock_of, feed, progress_text
 from slave.sources import Frame
 from tests.common.test_frame_writing import check_whole, small_disk
 from tests.network_helpers import until

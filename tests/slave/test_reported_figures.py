@@ -10,8 +10,7 @@ from common.bus.keys import Access
 from common.calibration.camera_settings import WANTED, figures
 from common.clock import SystemClock
 from common.messages import Command, Health, decode, encode
-from master.checklist.slave_rules import AMBIGUOUS, OFF, OVERLAP, UNCOLOURED
-from master.checklist.unseen import COLOUR, SEEN
+from master.checklist.slave_rules import AMBIGUOUS, COLOUR, OFF, OVERLAP, SEEN, UNCOLOURED
 from slave import live
 from slave.markers.engine import NUMPY
 from slave.report import Reporter

@@ -14,19 +14,17 @@ from bench.markers.frames import sequences
 from bench.markers.kinds import KINDS
 from common.arrays import Image
 from common.recording.frame_recording import open_recording
-from common.sim.illuminant import LightSchedule
+from common.sim.light import LightSchedule
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png
-from slave.markers.blobs import MAX_CANDIDATES, SCALE, Blob
-from slave.markers.classify import ColourTable
+from slave.commands.offline import calibrate_colours, camera_of
+from slave.markers.classify import MAX_CANDIDATES, SCALE, Blob, ColourTable
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
-from slave.markers.light_adaptive import LightAdaptiveDetector, detector_for
-from slave.markers.reloadable import plain_of
-from slave.markers.roi import Window
+from slave.markers.reloadable import LightAdaptiveDetector, detector_for, plain_of
 from slave.markers.scan import STRIPS, Scanner, merged
-from slave.markers.workers import Inline
-from slave.offline import calibrate_colours, camera_of
+from slave.markers.track import Window
+from slave.markers.white_balance import Inline
 from tests.slave.light_courses import standard_scene
 from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 

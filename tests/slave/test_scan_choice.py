@@ -11,12 +11,11 @@ import pytest
 from common.errors import CameraError
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
-from slave.counters import DetectionCounters
-from slave.markers.calibrated import CalibratedDetector
+from slave.commands.offline import calibrate_colours
 from slave.markers.detector import MarkerDetector
-from slave.markers.reloadable import ReloadableDetector
-from slave.markers.scan_choice import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
-from slave.offline import calibrate_colours
+from slave.markers.reloadable import CalibratedDetector, ReloadableDetector
+from slave.markers.scan import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from tests.slave.painted import NAMES, RANGES, camera, hand, render

@@ -9,9 +9,8 @@ from common.bus.bus import LoopbackBus
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message
-from slave.counters import DetectionCounters
 from slave.markers.detector import MarkerDetector
-from slave.report import ALONE_AT, Reporter
+from slave.report import ALONE_AT, DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run, wait_for_start
 from slave.sources import Frame
 from slave.uplink import Uplink

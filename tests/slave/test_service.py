@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from common.messages import Message
-from slave.counters import DetectionCounters
 from slave.markers.detector import Detections
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run, wait_for_start
 from slave.service import LOST_PATIENCE_S, WAITING, Service
 from slave.sources import Frame

@@ -7,8 +7,8 @@ import pytest
 
 from common.clock import SkewedClock
 from common.messages import ImuSample
-from common.sim.imu import SimulatedImu
-from slave.simulated import SyntheticSensor
+from common.sim.sensors import SimulatedImu
+from slave.commands.simulated import SyntheticSensor
 from tests.slave.wrist.wrist_frames import scene
 
 PERIOD_NS = 1e9 / 120.0

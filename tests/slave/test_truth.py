@@ -12,7 +12,7 @@ from common.recording.frame_recording import Manifest, open_recording
 from common.sim.board import BoardScene
 from slave.__main__ import main
 from slave.cameras.synthetic import SyntheticCamera
-from slave.simulated import FrameClock, scene_of, world_of
+from slave.commands.simulated import FrameClock, scene_of, world_of
 
 TRUTH = Path(__file__).resolve().parents[2] / "calib_json"
 RIG = load(TRUTH / "rigs/desk.json", RigCalibration)

@@ -20,12 +20,10 @@ from common.sim.motion import HandState
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.cameras.synthetic import SyntheticCamera
-from slave.counters import DetectionCounters
-from slave.markers.light_adaptive import detector_for
-from slave.markers.reloadable import ReloadableDetector, marker_changes
-from slave.markers.scan_choice import Scan, ScanChoice
-from slave.markers.workers import Inline
-from slave.report import Reporter
+from slave.markers.reloadable import ReloadableDetector, detector_for, marker_changes
+from slave.markers.scan import Scan, ScanChoice
+from slave.markers.white_balance import Inline
+from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.tuning import CameraFiles, CameraTuning

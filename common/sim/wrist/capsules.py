@@ -1,4 +1,6 @@
-"""Flesh of one simulated hand: round cones on its bones.
+"""Round cones model a simulated hand and the things that it holds.
+
+Flesh of one simulated hand: round cones on its bones.
 
 They differ from every plain model of the hand.
 
@@ -6,8 +8,15 @@ A solver models a finger as cones with the radii of the profile. Real fingers ar
 radii, adds the pads on the palmar side of every phalanx and the pulp at its tip, and gives the thumb its thenar. What
 a finger carries moves with its joints; what the palm carries turns with the wrist alone, and while that is straight it
 stands still in the camera's frame, as the end of the forearm always does.
+
+Things that the hand holds in front of the wrist camera.
+
+Bodies that follow those of the flesh, matt and dark.
+
+They hide what is behind them from the camera, and keep the laser and the LEDs from it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +25,7 @@ import numpy as np
 from common.arrays import Float, Int
 from common.geometry.tapered_capsules import Capsules
 from common.hand.model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, HandModel
+from common.sim.motion import Cylinder
 
 GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6
@@ -223,3 +233,39 @@ def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> li
     for side in (-0.008, 0.010):  # _FOREARM_PARTS of them, the last ones
         add(np.array([side * s, -0.004, -0.06]), np.array([0.7 * side * s, -0.004, 0.008]), 0.021, 0.0185)
     return out
+
+
+ALBEDO = 0.05  # of matt black coating or rubber in the near infrared, against usual skin
+
+
+def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:
+    """Return round cones of equal radii that stand for closed cylinders.
+
+    In the camera's frame.
+
+    Their round ends hold as much as the flat ones: a hand that holds one in its middle touches none of them.
+
+    Raises:
+        ValueError: One is wider than long; it would be a ball.
+    """
+    start, stop, radius = [np.empty((0, 3))], [np.empty((0, 3))], np.array([one.radius_m for one in things])
+    for one in things:
+        if one.length_m < 2.0 * one.radius_m:
+            raise ValueError(
+                f"cylinder of {one.length_m} m: shorter than its width of {2.0 * one.radius_m} m"
+            )
+        T = T_camera_rig @ one.T_rig_object
+        half = (0.5 * one.length_m - 2.0 / 3.0 * one.radius_m) * T[:3, 2]  # 4/3 pi r^3 are in the ends
+        start.append(T[:3, 3] - half[None])
+        stop.append(T[:3, 3] + half[None])
+    return Capsules(np.concatenate(start), np.concatenate(stop), radius, radius)
+
+
+def with_things(capsules: Capsules, things: Capsules) -> Capsules:
+    """The bodies of the flesh, and after them those of things."""
+    return Capsules(
+        np.concatenate([capsules.start_m, things.start_m]),
+        np.concatenate([capsules.stop_m, things.stop_m]),
+        np.concatenate([capsules.start_radius_m, things.start_radius_m]),
+        np.concatenate([capsules.stop_radius_m, things.stop_radius_m]),
+    )

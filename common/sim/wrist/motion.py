@@ -13,7 +13,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import HandModel
-from common.hand.wrist_joint import STRAIGHT, forearm_palm
+from common.hand.wrist import STRAIGHT, forearm_palm
 from common.sim.motion import (
     FIST,
     PERIOD_S,

@@ -1,4 +1,21 @@
-"""Renderer from scene to wrist camera frames: ambient, laser and LED.
+"""A renderer turns a wrist scene into camera frames: light, line, sensor.
+
+Light on the scene and the sensor that records it.
+
+The room and its window behind the hand, LEDs and laser.
+
+Brightness is in levels of the sensor above black, at the exposure of the camera's file: 253 saturates. The rooms differ
+by what falls on the hand, by how bright they are behind it, by how far the window saturates, and by sunlight on skin.
+
+Renderer of the laser line.
+
+Its exact curve widened by the thickness of the sheet, with the glow of the skin beside it.
+
+A lit point moves along its ray by s where the sheet is looked at h off its middle: the point stays on the skin when
+n . (h m + s r) = 0, with n the normal of the skin, m that of the sheet, r the ray. So each piece between two rays is a
+ribbon of parallelograms, each as bright as the Gaussian profile gives and as large as its picture.
+
+Renderer from scene to wrist camera frames: ambient, laser and LED.
 
 Ambient is the light of the room alone.
 
@@ -7,18 +24,248 @@ exact curve, each piece as wide and as bright as the sheet of light is there, to
 """
 
 from copy import copy
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image
 from common.errors import CalibrationError
-from common.geometry.tapered_capsules import Capsules, Plane
+from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
 from common.recording.frame_recording import Illumination
-from common.sim.wrist import light
+from common.sim.wrist.capsules import ALBEDO, THING_GROUP
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.stripe import draw_stripe
 from common.sim.wrist.surface import HandSurface, SurfaceView
+
+BLACK_LEVEL = 2.0
+LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SURFACE_AT_M
+SURFACE_AT_M = 0.13
+SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
+GLOW = (
+    (5.0, 0.13),
+    (14.0, 0.10),
+)  # what comes out of the skin beside the line: sigma [px], share of the line's light
+_TILE_MARGIN = 128
+_LEVELS = {  # on the hand, behind it, of the window, of sun on skin
+    "dark": (0.6, 0.4, 0.0, 0.0),
+    "indoor": (24.0, 16.0, 330.0, 0.0),
+    "bright": (68.0, 46.0, 900.0, 0.0),
+    "sun": (95.0, 80.0, 2500.0, 190.0),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Room:
+    """One ambient light.
+
+    Attributes:
+        hand, wall, window, sun: Levels on skin, behind it, of the window, and of sunlight that falls straight on skin.
+        to_sky, to_sun: Unit vectors (3,), camera frame.
+        seed: Of what stands in the room.
+    """
+
+    hand: float
+    wall: float
+    window: float
+    sun: float
+    to_sky: Float
+    to_sun: Float
+    seed: int
+
+    @classmethod
+    def of(cls, name: str, seed: int) -> "Room":
+        """The room called dark, indoor, bright or sun."""
+        rng = np.random.default_rng([seed, 31])
+        sky = np.array([rng.uniform(-0.6, 0.6), -1.0, rng.uniform(-0.6, 0.2)])
+        sun = np.array([rng.uniform(-1.0, 1.0), -0.8, rng.uniform(-0.5, 0.1)])
+        return cls(*_LEVELS[name], sky / np.linalg.norm(sky), sun / np.linalg.norm(sun), seed)
+
+    def on_surface(self, normals: Plane) -> Plane:
+        """Return the levels of plain skin with the given normals.
+
+        Levels (N,), normals (N, 3): light from all sides, more from above, and the sun.
+        """
+        shade: Plane = self.hand * (0.75 + 0.25 * (normals @ self.to_sky.astype(np.float32)))
+        if self.sun > 0.0:
+            shade += self.sun * np.maximum(normals @ self.to_sun.astype(np.float32), 0.0)
+        return shade
+
+    def backdrop(self, size: tuple[int, int], step: float) -> Plane:
+        """Return the background, seen where there is no hand.
+
+        Shape (H, W), `size` = (W, H): a wall, things out of focus, a bright window.
+
+        `step` is how many pixels of the camera one of the backdrop is.
+        """
+        rng = np.random.default_rng([self.seed, 33])
+        width, height = size
+        wall = np.full((height, width), self.wall, dtype=np.float32)
+        wall *= (1.0 + np.linspace(-0.25, 0.25, width) * rng.uniform(-1.0, 1.0)).astype(np.float32)
+        for _ in range(7):
+            middle, half = rng.uniform(0.0, 1.0, 2), rng.uniform(0.05, 0.25, 2)
+            _box(wall, middle - half, middle + half, self.wall * rng.uniform(0.4, 1.8))
+        if self.window > 0.0:
+            low = np.array([rng.uniform(0.0, 0.6), rng.uniform(-0.2, 0.05)])
+            high = low + np.array([rng.uniform(0.25, 0.4), rng.uniform(0.4, 0.65)])
+            bar = low[0] + rng.uniform(0.4, 0.6) * (high[0] - low[0])
+            _box(wall, low, high, self.window)
+            _box(wall, np.array([bar, low[1]]), np.array([bar + 0.02, high[1]]), 0.2 * self.window)
+        out = np.asarray(cv2.GaussianBlur(wall, (0, 0), 7.0 / step), dtype=np.float32)
+        # The lens scatters a little of the window everywhere.
+        veil = np.asarray(cv2.GaussianBlur(wall, (0, 0), 120.0 / step), dtype=np.float32)
+        return np.asarray(cv2.addWeighted(out, 1.0, veil, 0.006, 0.0), dtype=np.float32)
+
+
+def _box(image: Plane, low: Float, high: Float, level: float) -> None:
+    """Fill a box given in shares of the picture."""
+    size = np.array(image.shape[::-1])
+    (x0, y0), (x1, y1) = (np.rint(corner * size).astype(int).tolist() for corner in (low, high))
+    cv2.rectangle(image, (x0, y0), (x1, y1), level, -1)
+
+
+class Leds:
+    """The LEDs beside the lens. Holds where they are."""
+
+    def __init__(self, led_m: Float) -> None:
+        """Of places (L, 3) [m], camera frame."""
+        self._led = led_m.astype(np.float32)
+
+    def on_surface(self, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
+        """Return the levels of plain skin at points lit by the LEDs.
+
+        Levels (N,) at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
+
+        Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
+        """
+        faced = normals @ self._led.T - np.einsum("ij,ij->i", normals, points)[:, None]
+        square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ self._led.T)
+        square += (self._led * self._led).sum(axis=1)
+        np.maximum(faced, 0.0, out=faced)
+        if before is not None:
+            for led, place in enumerate(self._led):
+                faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
+        faced /= square * np.sqrt(square)
+        led_level = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
+        return faced.sum(axis=1) * np.float32(led_level * SURFACE_AT_M**2 / len(self._led))
+
+
+def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
+    """Check whether a body blocks the light from an origin to points.
+
+    Origin (3,) [m], points (N, 3) [m], `square` (N,) [m^2]: their squared distances.
+    """
+    far = np.sqrt(square)
+    ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)
+    known = terms(before, origin.astype(np.float64), np.float32)
+    reach = np.min([first_hits(body, ways) for body in known.T], axis=0)
+    shadow_gap_m = 0.001  # nearer to a body nothing is in its shadow: it may be on the body itself
+    return reach < far - np.float32(shadow_gap_m)
+
+
+class Sensor:
+    """Adds noise, and cuts at what a byte holds. Holds a tile of noise, drawn once."""
+
+    def __init__(self, height: int, width: int, seed: int) -> None:
+        """Of so many pixels."""
+        rng = np.random.default_rng([seed, 32])
+        self._tile = rng.standard_normal((height + _TILE_MARGIN, width + _TILE_MARGIN), dtype=np.float32)
+        level = np.arange(256, dtype=np.float32)
+        read_variance, shot_variance = 0.35, 0.032  # of the noise [levels^2], and per level
+        self._sigma = np.sqrt(read_variance + shot_variance * np.maximum(level - BLACK_LEVEL, 0.0))
+
+    def bytes_of(self, level: Plane, key: int) -> Image:
+        """Convert levels to an image, black at BLACK_LEVEL.
+
+        Levels and image (H, W); the same key gives the same noise.
+        """
+        height, width = level.shape
+        mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
+        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+        y, x = (mixed >> 4) % _TILE_MARGIN, (mixed >> 14) % _TILE_MARGIN
+        noise = cv2.LUT(cv2.convertScaleAbs(level), self._sigma)
+        cv2.multiply(noise, self._tile[y : y + height, x : x + width], dst=noise)
+        return np.asarray(cv2.add(noise, level, dtype=cv2.CV_8U), dtype=np.uint8)  # rounded, and cut
+
+
+LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
+
+
+def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) -> None:
+    """Add the laser line to the levels in place.
+
+    Levels (H, W); the line glows where skin is, by `hand` (h, w), a coarser grid: what skin gives back, about 1, and
+    0 where none is. Things glow as little as they give back, so not at all here.
+    """
+    sheet, optics = scene.sheet, scene.optics
+    curve = sheet.cross(bodies)
+    chords = np.flatnonzero(curve.joined)
+    chords = chords[curve.seen[chords] & curve.seen[chords + 1]]
+    points = curve.points[chords]
+    ray = curve.rays[chords]
+    normals = bodies.normals(curve.body[chords], points)
+    least_cosine = 0.12  # skin that the laser grazes flatter is lit as if it were this steep
+    facing = np.maximum(-np.einsum("ij,ij->i", normals, ray), least_cosine)
+    rise = sheet.normal + ((normals @ sheet.normal) / facing)[:, None] * ray
+    uv = optics.project(points)
+    nudge_m = 1e-4
+    way = (optics.project(points + nudge_m * rise) - uv) / nudge_m  # px per metre across the sheet
+    piece = optics.project(curve.points[chords + 1]) - uv
+    heights = LAYERS * SHEET_SIGMA_M
+    area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
+    reach = np.linalg.norm(points - sheet.origin, axis=1)
+    given_back = np.where(curve.group[chords] == THING_GROUP, ALBEDO, scene.reflectance)
+    amount = (LASER_LEVEL * given_back * facing * (SURFACE_AT_M / reach) * area)[:, None] * np.exp(
+        -0.5 * LAYERS**2
+    )
+    place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]
+    _spread(level, place.reshape(-1, 2), amount.ravel(), hand)
+
+
+def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
+    """Add light at image places, blurred as the lens and skin do.
+
+    Places (N, 2) [px], each shared by four pixels.
+    """
+    height, width = level.shape
+    inside = ((place > 1.0) & (place < np.array([width - 2.0, height - 2.0]))).all(axis=1)
+    place, amount = place[inside], amount[inside]
+    if not len(place):
+        return
+    edge_px = 40
+    (x0, y0), (x1, y1) = (
+        np.maximum(place.min(axis=0).astype(int) - edge_px, 0).tolist(),
+        np.minimum(place.max(axis=0).astype(int) + edge_px, [width, height]).tolist(),
+    )
+    w, h = x1 - x0, y1 - y0
+    at = place - np.array([x0, y0])
+    corner = at.astype(np.int64)
+    fx, fy = (at - corner).T
+    index = corner[:, 1] * w + corner[:, 0]
+    four = np.concatenate([index, index + 1, index + w, index + w + 1])
+    share = np.concatenate([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]) * np.tile(amount, 4)
+    line = np.bincount(four, share, w * h).reshape(h, w).astype(np.float32)
+    glow = _glow(line, hand, (x0, y0, x1, y1), width)
+    lens_sigma_px = 0.9
+    light = cv2.GaussianBlur(line, (0, 0), lens_sigma_px)
+    light += cv2.resize(glow, (w, h), interpolation=cv2.INTER_LINEAR)
+    level[y0:y1, x0:x1] += light
+
+
+def _glow(line: Plane, hand: Plane, box: tuple[int, int, int, int], width: int) -> Plane:
+    """Return the glow of the skin around a line, at a quarter of its size.
+
+    None where there is no skin.
+    """
+    h, w = line.shape
+    size = -(-w // 4), -(-h // 4)
+    coarse = cv2.resize(line, size, interpolation=cv2.INTER_AREA)
+    glow = np.zeros(size[::-1], dtype=np.float32)
+    for sigma, part in GLOW:
+        glow += part * np.asarray(cv2.GaussianBlur(coarse, (0, 0), 0.25 * sigma))
+    x0, y0, x1, y1 = (round(side * hand.shape[1] / width) for side in box)
+    glow *= cv2.resize(hand[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+    return glow
+
 
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
@@ -59,10 +306,10 @@ class WristRenderer:
             raise CalibrationError(f"rig {scene.rig.name!r}: cameras: no camera {camera!r}")
         self._scene = scene
         self._surface = HandSurface(scene, step, wrist_step_rad)
-        self._room = light.Room.of(scene.ambient, scene.seed)
-        self._leds = light.Leds(np.array(scene.rig.led, dtype=np.float64))
+        self._room = Room.of(scene.ambient, scene.seed)
+        self._leds = Leds(np.array(scene.rig.led, dtype=np.float64))
         optics = scene.optics
-        self._sensor = light.Sensor(optics.height_px, optics.width_px, scene.seed)
+        self._sensor = Sensor(optics.height_px, optics.width_px, scene.seed)
         self._gain = 1.0
         self._behind = self._room.backdrop(self._surface.size, optics.width_px / self._surface.size[0])
         self._still = {
@@ -109,7 +356,7 @@ class WristRenderer:
             draw_stripe(level, self._scene, bodies, hand)
         if self._gain != 1.0:
             level *= np.float32(self._gain)
-        level += np.float32(light.BLACK_LEVEL)
+        level += np.float32(BLACK_LEVEL)
         return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _ILLUMINATIONS.index(lit))
 
     def _shaded(

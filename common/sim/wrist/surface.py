@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
-from common.calibration.flat_field import flat_of
+from common.calibration.rig import flat_of
 from common.geometry.tapered_capsules import Capsules, Plane, first_hits, terms
+from common.sim.wrist.capsules import ALBEDO
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.things import ALBEDO
 
 _AROUND = (0, 0, 0, 1, 1, 2, 2, 2), (0, 1, 2, 0, 2, 0, 1, 2)  # corners and middles of a box
 _ORIGIN = np.zeros(3)

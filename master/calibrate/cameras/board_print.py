@@ -1,8 +1,13 @@
-"""Drawing of a board at true scale.
+"""The command `phalanx calibrate board` draws a board at true scale.
+
+Drawing of a board at true scale.
 
 A vector page, a ruler to check the printer by, and the options to calibrate with it.
+
+`phalanx calibrate board`: a board to print.
 """
 
+from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
+from common.command_line import UsageError, echo
 from common.errors import CalibrationError
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
-from master.calibrate.cameras.options import options_of
+from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_of, options_of
 
 PAPERS_MM = {
     "A4": (297.0, 210.0),
@@ -151,3 +156,21 @@ def _foot(axes: Axes, page: Page, board: Board) -> None:
         fontsize=6,
         va="center",
     )
+
+
+def board(options: Namespace) -> None:
+    """Draw a board at true scale.
+
+    With a ruler of 100 mm and the options to calibrate with it.
+    """
+
+    marker = None
+    side = options.square_mm
+    if options.kind == "charuco":
+        side = 29.0 if side is None else side
+        marker = 0.75 * side if options.marker_mm is None else options.marker_mm
+    elif options.marker_mm is not None:
+        raise UsageError("--marker-mm: a checkerboard has no markers; use --kind charuco")
+    drawn = board_of(options.size or "9x6", 25.0 if side is None else side, marker, options.dictionary)
+    print_board(options.out, drawn, options.paper)
+    echo(f"wrote {options.out}: {drawn}, on {options.paper}. Print it at 100 % and measure the ruler: 100 mm")

@@ -1,15 +1,29 @@
-"""The boards whose corners are known: checkerboard and ChArUco.
+"""A board has known corners, and they are found in an image.
+
+The boards whose corners are known: checkerboard and ChArUco.
 
 Frame of a board: origin at its first inner corner, x along the columns, y down the rows, z into the board, so that a
 board seen upright from the front is nearly unrotated in the camera's frame. Corners are numbered row by row.
+
+How a board is named on the command line.
+
+Finds a board's corners in one image, to a fraction of a pixel.
+
+Checkerboards: OpenCV's classic finder, where it fails the sector-based one; both only locate the corners roughly.
+The place is refined by `cornerSubPix` in a window of half the distance to the next grid line, which on rendered
+boards is twice as good as the sector-based finder's own (0.05 against 0.10 px). Corners of the outermost row look
+out on squares that print shops and scissors often cut to half; their window is smaller. On a ChArUco board the window
+ends where the markers begin.
 """
 
+import re
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Float, Image, Int
 from common.errors import CalibrationError
 
 DICTIONARIES = {
@@ -143,3 +157,199 @@ def _check_length(board: object, what: str, length_m: float) -> None:
     # From a stamp under a microscope to a wall: outside, the unit was mistaken.
     if not 5e-4 <= length_m <= 1.0:
         raise CalibrationError(f"{board}: the {what} must be between 0.5 mm and 1 m (give it in mm)")
+
+
+def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+    """The board that the options name.
+
+    Raises:
+        CalibrationError: The size is not two numbers, or there can be no such board.
+    """
+    found = re.fullmatch(r"(\d+)x(\d+)", size)
+    if found is None:
+        raise CalibrationError(f"--board {size!r}: expected COLUMNSxROWS, for example 9x6")
+    columns, rows = int(found[1]), int(found[2])
+    if marker_mm is None:
+        return Checkerboard(columns, rows, square_mm * 1e-3)
+    return Charuco(columns, rows, square_mm * 1e-3, marker_mm * 1e-3, dictionary)
+
+
+def options_of(board: Board) -> str:
+    """Return the options that specify `board`.
+
+    `board_of` of them is that board again.
+    """
+    text = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
+    if isinstance(board, Charuco):
+        text += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"
+    return text
+
+
+_WINDOW_PX = (3, 15)  # smaller ones hold too little of the edges: five times the error
+_REFINE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageObservation:
+    """The board in one image.
+
+    Attributes:
+        corners_px: Corners (N, 2) [px], board's order, distorted image, (0, 0) = centre of the top-left pixel.
+            NaN: not seen.
+        blur_px: Standard deviation [px] of the blur of the board's edges, in the direction where it is worse.
+    """
+
+    corners_px: Float
+    blur_px: float
+
+    @property
+    def seen(self) -> int:
+        """Number of corners seen."""
+        return int(np.isfinite(self.corners_px[:, 0]).sum())
+
+
+def find_board(board: Board, image: Image) -> ImageObservation | None:
+    """Detect the board in an image.
+
+    Image (H, W) or (H, W, 3) BGR; None where it is not found whole (ChArUco: 8 corners of it).
+    """
+    grey = image if image.ndim == 2 else cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
+    if corners is None:
+        return None
+    corners = _refine(board, grey, corners)
+    min_corners = 8  # a pose and a few corners to check it
+    if np.isfinite(corners[:, 0]).sum() < min_corners:
+        return None
+    return ImageObservation(corners, _blur(board, grey, corners))
+
+
+def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:
+    size = (board.columns, board.rows)
+    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(grey, size, flags=classic | cv2.CALIB_CB_FAST_CHECK)
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        found, corners = cv2.findChessboardCorners(grey, size, flags=classic)
+    if not found:
+        return None
+    return _upright(board, grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+
+
+def _upright(board: Checkerboard, grey: Image, corners: Float) -> Float:
+    """Return the same corners in the board's own order.
+
+    Never mirrored, and square (0, 0) dark where that is a choice.
+    """
+    rows, columns = grid_shape(board)
+    grid = corners.reshape(rows, columns, 2)
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if along[0] * down[1] - along[1] * down[0] < 0.0:
+        grid = grid[:, ::-1]
+    middles = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4.0
+    light = _sample(grey, middles)
+    even = np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0
+    if light[even].mean() > light[~even].mean():
+        if (rows + columns) % 2 == 1:
+            grid = grid[::-1, ::-1]
+        elif rows == columns:
+            grid = np.rot90(grid, 1, (0, 1))
+    return grid.reshape(-1, 2).copy()
+
+
+def _charuco(board: Charuco, grey: Image) -> Float | None:
+    detected = cv2.aruco.CharucoDetector(board.pattern()).detectBoard(grey)
+    # The stubs promise arrays; where nothing is seen there is None.
+    found, ids = cast(tuple[Float | None, Int | None], detected[:2])
+    if found is None or ids is None:
+        return None
+    rows, columns = grid_shape(board)
+    corners = np.full((rows * columns, 2), np.nan)
+    corners[ids.reshape(-1)] = found.reshape(-1, 2)
+    return corners
+
+
+def _refine(board: Board, grey: Image, corners: Float) -> Float:
+    """Refine rough corners to sub-pixel positions.
+
+    One that moves by more than its window was none and becomes NaN.
+    """
+    half = _windows(board, corners)
+    refined = np.full_like(corners, np.nan)
+    for i in np.flatnonzero(np.isfinite(half)):
+        window = int(half[i])
+        start = corners[i].astype(np.float32).reshape(1, 1, 2)
+        place = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), _REFINE).reshape(2)
+        if np.abs(place - corners[i]).max() <= window:
+            refined[i] = place
+    if isinstance(board, Checkerboard) and np.isnan(refined).any():
+        return np.full_like(
+            corners, np.nan
+        )  # found whole or not at all: one strayed corner condemns the grid
+    return refined
+
+
+def _windows(board: Board, corners: Float) -> Float:
+    """Return half the side of each corner's window.
+
+    Shape (N,) [px]; NaN where no square beside the corner is complete.
+    """
+    rows, columns = grid_shape(board)
+    grid = corners.reshape(rows, columns, 2)
+    along, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
+    area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0])
+    longer = np.maximum(np.linalg.norm(along, axis=-1), np.linalg.norm(down, axis=-1))
+    height = area / np.maximum(longer, 1e-9)
+    reach = np.full((rows, columns), np.inf)
+    for i in (0, 1):
+        for j in (0, 1):
+            part = reach[i : rows - 1 + i, j : columns - 1 + j]
+            np.fmin(part, height, out=part)
+    outer_window = 0.3
+    share = np.full((rows, columns), outer_window)
+    inner_window = 0.5  # of the distance to the next grid line
+    share[1:-1, 1:-1] = inner_window
+    if isinstance(board, Charuco):
+        share = np.minimum(share, 0.5 * (1.0 - board.marker_m / board.square_m))
+    half = np.minimum(np.maximum(np.round(share * reach), _WINDOW_PX[0]), _WINDOW_PX[1])
+    half[np.isinf(reach) | np.isnan(grid[..., 0])] = np.nan
+    return half.ravel()
+
+
+def _blur(board: Board, grey: Image, corners: Float) -> float:
+    """Return the blur across the board's edges.
+
+    Standard deviation [px], the worse of its two directions.
+
+    A step blurred by a Gaussian has the steepest slope step / (sigma sqrt(2 pi)).
+    """
+    rows, columns = grid_shape(board)
+    edges = grid_edges(board)
+    split = rows * (columns - 1)
+    # Up to the middle of a square; beside a marker only its white margin is free.
+    reach = 0.35 if isinstance(board, Checkerboard) else 0.4 * (1.0 - board.marker_m / board.square_m)
+    steps = np.linspace(-reach, reach, 29)
+    worst = 0.0
+    for family in (edges[:split], edges[split:]):
+        a, b = corners[family[:, 0]], corners[family[:, 1]]
+        length = np.linalg.norm(b - a, axis=1)
+        known = np.isfinite(length) & (length > 0)
+        if not known.any():
+            continue
+        a, b, length = a[known], b[known], length[known, None]
+        across = (b - a)[:, ::-1] * [1.0, -1.0] / length
+        points = ((a + b) / 2)[:, None] + across[:, None] * (length * steps)[..., None]
+        profile = _sample(grey, points)
+        rise = np.abs(profile[:, -4:].mean(axis=1) - profile[:, :4].mean(axis=1))
+        slope = np.abs(np.diff(profile, axis=1)).max(axis=1) / (length[:, 0] * (steps[1] - steps[0]))
+        clear = rise > 10.0
+        if clear.any():
+            worst = max(worst, float(np.median(rise[clear] / slope[clear]) / np.sqrt(2 * np.pi)))
+    return worst
+
+
+def _sample(grey: Image, points: Float) -> Float:
+    """Brightness (A, B) at pixels (A, B, 2), between pixels interpolated."""
+    u, v = np.moveaxis(points.astype(np.float32), -1, 0)
+    return cast(Image, cv2.remap(grey, u, v, cv2.INTER_LINEAR)).astype(np.float64)

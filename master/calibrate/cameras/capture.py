@@ -1,13 +1,22 @@
-"""Image capture for a calibration from running slaves.
+"""The command `calibrate cameras capture` keeps board images of slaves.
+
+Image capture for a calibration from running slaves.
 
 Whole frames over the bus, on a person's pace.
 
 While it runs it *is* the rig's master: it gives the start and keeps the clocks, so that slaves need not know that
 nobody tracks. Nothing is calibrated here; its folder is what `calibrate cameras intrinsics` and `stereo` read.
+
+Command `phalanx calibrate cameras capture`: board images from running slaves.
+
+They are for `intrinsics` and `stereo`.
 """
 
+import os
 import threading
+from argparse import Namespace
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,14 +25,22 @@ import numpy as np
 
 from common.arrays import Image
 from common.bus.bus import Bus, Subscription
-from common.clock import now_ns
+from common.bus.keys import link_key
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.clock import SystemClock, now_ns
+from common.command_line import echo
 from common.errors import BusError, CalibrationError, PictureError
 from common.messages import Command, Still
 from common.recording.picture_size import Size
 from common.recording.pictures import decode
-from master.calibrate.cameras.live_views import LiveViews, Verdict
+from master.calibrate.cameras.boards import board_of, options_of
+from master.calibrate.cameras.coverage import LiveViews, Verdict
 from master.calibrate.tree_files import date_now
+from master.commands.options import (
+    address,
+)
 from master.run.ingest import Ingest
+from master.run.process import host_bus, stop_on_signals
 
 _ASK_S = 0.5
 NOTES = "capture.json"
@@ -212,3 +229,82 @@ def _note(folder: Path, live: LiveViews, spread_ms: list[float]) -> None:
         (folder / NOTES).write_bytes(msgspec.json.format(msgspec.json.encode(notes)) + b"\n")
     except OSError as error:
         raise CalibrationError(f"{folder / NOTES}: cannot write: {error.strerror}") from error
+
+
+def capture_views(options: Namespace) -> None:
+    """Keep an image whenever the board is held still somewhere new.
+
+    All running slaves of the rig at once.
+    """
+    ends = address(options.beacon, "--beacon"), address(options.bind, "--bind")
+    cameras = cameras_of(options.calibration, options.rig)
+    sizes = _sizes(options.calibration, cameras)
+    live = LiveViews(
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary), cameras
+    )
+    key = link_key(os.environ, options.key_file)
+    clock = SystemClock()
+    new_folder(options.out)
+    stop = stop_on_signals()
+    with ExitStack() as stack:
+        link = host_bus(options.bus, live.cameras)
+        stack.callback(link.close)
+        start_s = 5.0
+        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, start_s)
+        stack.callback(ingest.close)
+        _wait(ingest, live.cameras, stop)
+        taker = StillTaker(link, ingest, sizes)
+        stack.callback(taker.close)
+        kept = capture(taker.take, live, options.out, options.views, stop, echo, live.missing)
+    fewest = 5  # from which a lens can be fitted at all
+    if kept < fewest:
+        raise CalibrationError(
+            f"{options.out}: {kept} views kept; a calibration needs {fewest}, better {options.views}"
+        )
+    echo(f"{kept} views in {options.out}; next: phalanx calibrate {_next(live, options.out, options.rig)}")
+
+
+def _next(live: LiveViews, out: Path, rig: str) -> str:
+    """The command that makes a calibration of what was kept."""
+    several = len(live.cameras) > 1
+    what, of_rig = ("stereo", f" --rig {rig}") if several else ("intrinsics", "")
+    return f"cameras {what} {out} {options_of(live.board)}{of_rig} --out DIR"
+
+
+def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
+    """The cameras of a rig, which need not have lenses or places yet."""
+    return load(calibration / "rigs" / f"{rig}.json", RigCalibration).cameras
+
+
+def _sizes(calibration: Path, cameras: tuple[str, ...]) -> dict[str, tuple[int, int]]:
+    """Return the image sizes that the camera files state.
+
+    Width and height [px].
+    """
+    files = (load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in cameras)
+    return {file.name: (file.width_px, file.height_px) for file in files}
+
+
+def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> None:
+    """Wait until the start is given, and print whom it waits for.
+
+    Raises:
+        CalibrationError: Called with to stop before.
+    """
+    previous: frozenset[str] | None = None
+    rounds = 0
+    while not ingest.started:
+        here = ingest.connected
+        if here != previous:
+            absent = ", ".join(name for name in cameras if name not in here)
+            echo(f"waiting for {absent or 'the start'}")
+            previous = here
+        rounds += 1
+        hint_rounds = 50  # ten seconds
+        if rounds % hint_rounds == 0 and not here:
+            echo(
+                "no slave answers: is it running, with the same rig key, and does --beacon reach it? See its log"
+            )
+        poll_s = 0.2
+        if stop.wait(poll_s):
+            raise CalibrationError("stopped before any slave was there")

@@ -1,37 +1,213 @@
-"""Calibration of lenses and camera poses from images of a board.
+"""The commands `intrinsics` and `stereo` fit cameras and write their files.
+
+Writing calibrations into the calibration tree, each with its provenance.
+
+Lenses into cameras/NAME.json, poses into rigs/RIG.json.
+
+Calibration of lenses and camera poses from images of a board.
 
 `phalanx calibrate cameras intrinsics | stereo`.
 """
 
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
+import numpy as np
+
 from common.arrays import Float
-from common.calibration import CameraCalibration
-from common.errors import FitError
-from common.terminal import echo
-from master.calibrate.cameras.boards import Board
-from master.calibrate.cameras.files import (
-    camera_with_lens,
-    check_size,
-    known_camera,
-    known_rig,
-    lens_provenance,
-    places_provenance,
-    rig_with_places,
-    without_wrong_law,
-    write_files,
-)
+from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, check, load
+from common.command_line import echo
+from common.errors import CalibrationError, FitError
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import invert
+from master.calibrate.cameras.boards import Board, board_of
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
-from master.calibrate.cameras.image_sets import image_sets
-from master.calibrate.cameras.lens_files import lens_of
-from master.calibrate.cameras.options import board_of
-from master.calibrate.cameras.report import report_json, report_lines
-from master.calibrate.cameras.result import CamerasResult, result
-from master.calibrate.cameras.views import BoardViews, View, look
+from master.calibrate.cameras.result import CamerasResult, report_json, report_lines, result
+from master.calibrate.cameras.views import BoardViews, View, image_sets, look
+from master.calibrate.tree_files import lens_of, matrix_of, provenance, write_camera, write_rig
 from master.commands.summary import write_summary
+from master.fabrik.depth import law_contradicts
+
+NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not measured"
+
+
+def known_camera(name: str, calibration: Path, out: Path | None) -> CameraCalibration | None:
+    """Return the camera's file, or None if there is none.
+
+    The file of `out`, else that of `calibration`.
+    """
+    for tree in (out, calibration):
+        if tree is not None and (path := tree / "cameras" / f"{name}.json").exists():
+            return load(path, CameraCalibration)
+    return None
+
+
+def known_rig(name: str, calibration: Path, out: Path | None) -> RigCalibration | None:
+    """The rig's file: that of `out`, else that of `calibration`; None: there is none."""
+    for tree in (out, calibration):
+        if tree is not None and (path := tree / "rigs" / f"{name}.json").exists():
+            return load(path, RigCalibration)
+    return None
+
+
+def check_size(camera: CameraCalibration, size_px: tuple[int, int]) -> None:
+    """Refuse images of another mode than the file's: a lens in pixels holds for one.
+
+    Raises:
+        CalibrationError: Naming both sizes.
+    """
+    if (camera.width_px, camera.height_px) != size_px:
+        raise CalibrationError(
+            f"camera {camera.name!r}: the images are {size_px[0]} x {size_px[1]} px, its file says"
+            f" {camera.width_px} x {camera.height_px}: take them in the mode that will be used"
+        )
+
+
+def camera_with_lens(
+    known: CameraCalibration | None, name: str, size_px: tuple[int, int], lens: Intrinsics, how: Provenance
+) -> CameraCalibration:
+    """Return the camera's file with a new lens.
+
+    A new file with neutral settings where there is none.
+    """
+    if known is None:
+        how = msgspec.structs.replace(how, note=f"{how.note}; new file: {NEUTRAL}")
+        return CameraCalibration(
+            version=1,
+            name=name,
+            width_px=size_px[0],
+            height_px=size_px[1],
+            frame_rate_hz=30.0,
+            exposure_us=10000.0,
+            analogue_gain=1.0,
+            colour_gains=(1.0, 1.0),
+            row_time_us=0.0,
+            intrinsics=lens,
+            provenance={"intrinsics": how},
+        )
+    return msgspec.structs.replace(known, intrinsics=lens, provenance=known.provenance | {"intrinsics": how})
+
+
+def rig_with_places(
+    known: RigCalibration | None, name: str, places: dict[str, Matrix4], how: Provenance
+) -> RigCalibration:
+    """Return the rig's file with new camera poses.
+
+    Everything else in it stays, and so does its frame.
+
+    Args:
+        known: The rig so far; None: a new marker rig.
+        name: Of the rig.
+        places: Camera -> T_first_camera (4, 4), of all cameras measured.
+        how: Provenance.
+    """
+    if known is None:
+        return RigCalibration(
+            version=1,
+            name=name,
+            kind="markers",
+            cameras=tuple(places),
+            hand="default-right",
+            T_rig_camera=places,
+            provenance={"T_rig_camera": how},
+        )
+    # The rig's frame is wherever the file has it: there the first camera of both stays.
+    anchor = next((camera for camera in known.cameras if camera in places), None)
+    if anchor is None:
+        raise CalibrationError(
+            f"rig {name!r} has the cameras {', '.join(known.cameras)}, the images are of {', '.join(places)}"
+        )
+    T_rig_first = invert(_array(places[anchor]))
+    if anchor in known.T_rig_camera:
+        T_rig_first = known.camera_pose(anchor) @ T_rig_first
+    new = {camera: matrix_of(T_rig_first @ _array(place)) for camera, place in places.items()}
+    if anchor in known.T_rig_camera:
+        new[anchor] = known.T_rig_camera[anchor]
+    return msgspec.structs.replace(
+        known,
+        cameras=known.cameras + tuple(camera for camera in places if camera not in known.cameras),
+        T_rig_camera=known.T_rig_camera | new,
+        provenance=known.provenance | {"T_rig_camera": how},
+    )
+
+
+def without_wrong_law(
+    rig: RigCalibration, cameras: Mapping[str, CameraCalibration | None]
+) -> tuple[RigCalibration, str]:
+    """Return the rig without a law that contradicts its places, and why.
+
+    Its `depth_model` is "stereo" then; the numbers of the law stay.
+
+    Args:
+        rig: With new places.
+        cameras: Camera files by name; None: not known.
+    """
+    files = [cameras.get(name) for name in rig.cameras]
+    if rig.depth_model == "stereo" or any(file is None or file.intrinsics is None for file in files):
+        return rig, ""
+    models = [CameraModel.of(file, rig.camera_pose(file.name)) for file in files if file is not None]
+    try:
+        wrong = law_contradicts(rig, models)
+        then = f"; `phalanx calibrate depth --use {rig.depth_model}` fits it anew"
+    except CalibrationError as error:  # these cameras can have no such law
+        wrong, then = str(error), ""
+    if not wrong:
+        return rig, ""
+    return msgspec.structs.replace(rig, depth_model="stereo"), f"{wrong}: depth_model is 'stereo' now{then}"
+
+
+def lens_provenance(result: CamerasResult, camera: str, tool: str, data: tuple[str, ...]) -> Provenance:
+    """Of one camera's lens."""
+    lens = result.lenses[camera]
+    residual = {
+        "rms_px": round(lens.rms_px, 4),
+        "fx_sd_px": round(float(lens.sd[0]), 4),
+        "cx_sd_px": round(float(lens.sd[2]), 4),
+        "cy_sd_px": round(float(lens.sd[3]), 4),
+    }
+    note = f"{lens.views} images, {sum(no.camera in (camera, '') for no in result.rejected)} with a part left out"
+    return provenance(tool, data, residual, note)
+
+
+def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -> Provenance:
+    """Of the places of the cameras."""
+    residual = {"rms_px": round(result.rms_px, 4)}
+    for pair in result.pairs:
+        names = f"{pair.first}_{pair.second}"
+        residual[f"{names}_baseline_m"] = round(pair.baseline_m, 6)
+        residual[f"{names}_epipolar_rms_px"] = round(pair.epipolar_rms_px, 4)
+        residual[f"{names}_edge_mean_mm"] = round(pair.edge_mean_mm, 4)
+        residual[f"{names}_edge_sd_mm"] = round(pair.edge_sd_mm, 4)
+    for camera, sd in result.baseline_sd_m.items():
+        if sd > 0.0:
+            residual[f"{camera}_baseline_sd_m"] = round(sd, 7)
+    rejected = "; ".join(str(no) for no in result.rejected)
+    note = f"{result.views} views shared{'; left out: ' * bool(rejected)}{rejected}"
+    return provenance(tool, data, residual, note)
+
+
+def write_files(
+    out: Path, cameras: Mapping[str, CameraCalibration], rigs: Mapping[str, RigCalibration]
+) -> list[Path]:
+    """Save files, by their names in the tree.
+
+    Each is replaced whole or not at all, and none is written where one is impossible.
+
+    Raises:
+        CalibrationError: A folder or file cannot be written, or what is measured cannot be.
+    """
+    for folder, files in (("cameras", cameras), ("rigs", rigs)):
+        for name, value in files.items():
+            check(value, str(out / folder / f"{name}.json"))
+    written = [write_camera(out, name, camera) for name, camera in cameras.items()]
+    return written + [write_rig(out, name, rig) for name, rig in rigs.items()]
+
+
+def _array(matrix: Matrix4) -> Float:
+    return np.array(matrix, dtype=np.float64)
 
 
 def intrinsics(options: Namespace) -> None:

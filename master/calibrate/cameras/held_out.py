@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 from common.arrays import Bool, Float
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, solve
-from master.calibrate.cameras.judge import Seen, Shot, place_boards
+from master.calibrate.cameras.outliers import Seen, Shot, place_boards
 
 MIN_VIEWS = (
     8  # dealt into five folds they leave six to fit: fewer cannot distinguish a bent board from a bent lens

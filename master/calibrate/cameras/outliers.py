@@ -1,9 +1,39 @@
-"""Which views are wrong, judged by the others."""
+"""A robust fit calibrates one camera, and rejects wrong images and views.
+
+Which views are wrong, judged by the others.
+
+Calibration of one camera by itself, the start of every fit.
+
+Its lens, where the board was, and which of its images are wrong.
+
+Which images and views are wrong, given lenses and places of the cameras.
+
+An image is judged by its own camera, whatever the others saw: one that fails is not used at all. A view is judged by
+whether its cameras agree on where the board is: where they do not, the board moved between the exposures or images of
+two epochs were put together. Such images are good in themselves, so each still helps the lens of its own camera.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit
 
-from common.arrays import Float
+from common.arrays import Bool, Float, Int
+from common.errors import FitError
+from common.geometry.transforms import invert
+from master.calibrate.cameras.boards import ImageObservation, board_corners
+from master.calibrate.cameras.bundle import (
+    Bundle,
+    Free,
+    Observation,
+    guess_lens,
+    place_board,
+    predict,
+    rms,
+    solve,
+)
+from master.calibrate.cameras.views import BoardViews
 
 FALSE_ALARM = 0.05  # chance that a set of good views loses one; one view less costs little, a wrong one much
 GOOD_PX = 0.12  # as well as corners can be found: such a view is right, however good the others are
@@ -33,3 +63,311 @@ def limit(errors: Float, dof: Float) -> float:
     spread = max(spread, least_spread, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
     quantile = float(stdtrit(len(errors) - 1, 1.0 - FALSE_ALARM / len(errors)))
     return max(float(np.exp(middle + quantile * spread)), GOOD_PX)
+
+
+MIN_VIEWS = 4  # three determine a lens in principle; a fourth can contradict it
+_ROUNDS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """An image, or a whole view (no camera), that is not used, and why."""
+
+    view: str
+    camera: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"view {self.view}{' ' * bool(self.camera)}{self.camera}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alone:
+    """A camera's own fit.
+
+    Attributes:
+        lens: (9,) in the order of `bundle.LENS`.
+        T_camera_board: View -> place of the board (4, 4) [m], accepted images only.
+        rejected: The other images.
+        sigma_px: Robust standard deviation of a coordinate.
+    """
+
+    lens: Float
+    T_camera_board: Mapping[str, Float]
+    rejected: tuple[Rejection, ...]
+    sigma_px: float
+
+
+def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
+    """Numbers (n,) and places (n, 2) [px] of the corners seen."""
+    seen = np.flatnonzero(np.isfinite(observation.corners_px[:, 0])).astype(np.int64)
+    return seen, observation.corners_px[seen]
+
+
+def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alone:
+    """Lens and places of the board from one camera's images, without the wrong ones.
+
+    Images are judged by a robust fit to all of them: blurred ones and those whose corners lie off further than the
+    other images' do (`outliers.limit`). Then it is fitted to the good ones, and all are judged anew, until nothing
+    changes; so an image may come back.
+
+    Args:
+        views: What was seen.
+        camera: One of its cameras.
+        held: A known lens (9,), then only the images are judged.
+
+    Raises:
+        FitError: Too few images, or too few that agree with each other.
+    """
+    drawn = board_corners(views.board)
+    observations = views.of(camera)
+    if held is None and len(observations) < MIN_VIEWS:
+        raise FitError(
+            f"camera {camera!r}: the board is seen in {len(observations)} images, at least {MIN_VIEWS} are needed"
+            " (better 15), each with the board in another place and tilt"
+        )
+    names = [name for name, _ in observations]
+    seen = [corners_seen(observation) for _, observation in observations]
+    blurred = _blurred(np.array([observation.blur_px for _, observation in observations]))
+    sharp = [seen[i] for i in range(len(seen)) if i not in blurred]
+    lens = guess_lens(sharp, drawn, views.sizes_px[camera]) if held is None else held
+    good = [i for i in range(len(seen)) if i not in blurred]
+    errors, bound, sigma = np.zeros(len(seen)), np.inf, 1.0
+    dof = np.array([2.0 * len(uv) - 6.0 for _, uv in seen])
+    for round_ in range(_ROUNDS):
+        if held is None:
+            lens, sigma = _robust(good, seen, drawn, lens, first=round_ == 0)
+        placed = [place_board(drawn[corners], uv, lens) for corners, uv in seen]
+        errors = np.array([error for _, error in placed])
+        bound = limit(errors, dof)
+        kept = [i for i in range(len(seen)) if i not in blurred and errors[i] <= bound]
+        if kept == good and round_ > 0:
+            break
+        good = kept
+        if held is None and len(good) < MIN_VIEWS:
+            break
+    typical = float(np.median(errors))
+    rejected = tuple(
+        Rejection(names[i], camera, _reason(blurred.get(i), errors[i], typical, bound))
+        for i in range(len(seen))
+        if i not in good
+    )
+    if held is None and len(good) < max(MIN_VIEWS, len(seen) / 2):
+        raise FitError(
+            f"camera {camera!r}: only {len(good)} of {len(seen)} images agree with each other, at least"
+            f" {max(MIN_VIEWS, (len(seen) + 1) // 2)} must: " + "; ".join(str(no) for no in rejected)
+        )
+    placed = [place_board(drawn[corners], uv, lens)[0] for corners, uv in seen]
+    return Alone(lens, {names[i]: placed[i] for i in good}, rejected, sigma)
+
+
+def _robust(
+    good: list[int], seen: list[tuple[Int, Float]], drawn: Float, lens: Float, *, first: bool
+) -> tuple[Float, float]:
+    """Fit a lens with Cauchy's loss.
+
+    The scale of the loss is three times the robust standard deviation of the residuals.
+    """
+    observations = [Observation(0, view, *seen[i]) for view, i in enumerate(good)]
+    places = np.stack([place_board(drawn[seen[i][0]], seen[i][1], lens)[0] for i in good])
+    bundle = Bundle(lens[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn))
+    free = np.ones((1, 9), dtype=np.bool_)
+    free[0, 8] = False
+    # From a lens without distortion everything is wrong a little: k1 must be found before outliers can be detected.
+    for _ in range(3 if first else 1):
+        residuals = [seen_.uv - predict(bundle, seen_) for seen_ in observations]
+        # The median of a two-dimensional normal distance is 1.1774 standard deviations.
+        sigma = max(float(np.median(np.linalg.norm(np.concatenate(residuals), axis=1))) / 1.1774, 1e-3)
+        bundle = solve(observations, bundle, Free(free, np.zeros(1, np.bool_), shape=False), 3 * sigma).bundle
+    residuals = [seen_.uv - predict(bundle, seen_) for seen_ in observations]
+    sigma = max(float(np.median(np.linalg.norm(np.concatenate(residuals), axis=1))) / 1.1774, 1e-3)
+    return bundle.lenses[0], sigma
+
+
+def _blurred(blur_px: Float) -> dict[int, str]:
+    """Images that are blurred where the others are not: index -> reason."""
+    typical = float(np.median(blur_px))
+    blurred = 2.5  # times the blur of the camera's other images: more of the edge than a window holds
+    blurred_px = 1.5  # less is no harm, however sharp the others are
+    return {
+        int(
+            i
+        ): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
+        for i in np.flatnonzero(blur_px > max(blurred * typical, blurred_px))
+    }
+
+
+def _reason(blurred: str | None, error: float, typical: float, bound: float) -> str:
+    if blurred is not None:
+        return blurred
+    return f"corners are off by {error:.2f} px rms, usually {typical:.2f} px (limit {bound:.2f} px)"
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One image, and the place of the board that it shows.
+
+    Cameras that agree on a view share a `place`, named as the view; one parted from the others has its own.
+    """
+
+    view: str
+    camera: str
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was seen, with the turned boards put right.
+
+    Attributes:
+        views: As found in the images.
+        corner_order: View -> camera -> order of the corner numbers, as of `links.Links`.
+    """
+
+    views: BoardViews
+    corner_order: Mapping[str, Mapping[str, Int]]
+
+    def observations(self, shots: Sequence[Shot]) -> tuple[Observation, ...]:
+        """Return the corners of the shots.
+
+        Views are numbered by the shots' places, in order of appearance.
+        """
+        cameras = self.views.cameras
+        number = {place: i for i, place in enumerate(dict.fromkeys(shot.place for shot in shots))}
+        by_name = {view.name: view for view in self.views.views}
+        found: list[Observation] = []
+        for shot in shots:
+            corners, uv = corners_seen(by_name[shot.view].observations[shot.camera])
+            true = self.corner_order[shot.view][shot.camera][corners]
+            found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv))
+        return tuple(found)
+
+
+def place_boards(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
+    """The bundle with each board where the middle camera of its view likes it best."""
+    views: dict[int, list[Observation]] = {}
+    for seen in observations:
+        views.setdefault(seen.view, []).append(seen)
+    places: list[Float] = []
+    for _, own in sorted(views.items()):
+        tried: list[tuple[float, Float]] = []
+        for seen in own:
+            T_camera_board, _ = place_board(bundle.drawn_m[seen.corners], seen.uv, bundle.lenses[seen.camera])
+            T = invert(bundle.T_camera_rig[seen.camera]) @ T_camera_board
+            alone = replace(bundle, T_rig_board=T[None])
+            off = [rms([other.uv - predict(alone, replace(other, view=0))]) for other in own]
+            tried.append((float(np.nan_to_num(np.median(off), nan=np.inf)), T))
+        places.append(min(tried, key=lambda pair: pair[0])[1])
+    return replace(bundle, T_rig_board=np.stack(places))
+
+
+def judge(
+    seen: Seen, shots: Sequence[Shot], bundle: Bundle
+) -> tuple[tuple[Shot, ...], tuple[Rejection, ...]]:
+    """The shots that are good, each at its place, and what is wrong with the others.
+
+    Args:
+        seen: What was seen.
+        shots: All that may be good, every view at one place.
+        bundle: Lenses, places of the cameras and shape of the board; its places of the board are not used.
+    """
+    good, rejected, sigma = _judge_images(seen, shots, bundle)
+    views: dict[str, list[Shot]] = {}
+    for shot in good:
+        views.setdefault(shot.view, []).append(shot)
+    linked = {view: own for view, own in views.items() if len(own) > 1}
+    if not linked:
+        return good, rejected
+    errors = _view_errors(seen, list(linked.values()), bundle, sigma)
+    corners = [2.0 * sum(len(o.uv) for o in seen.observations(own)) - 6.0 for own in linked.values()]
+    bound, typical = limit(errors, np.array(corners)), float(np.median(errors))
+    parted: dict[str, set[str]] = {}
+    notes = list(rejected)
+    for (view, own), error in zip(linked.items(), errors, strict=True):
+        if error > bound:
+            parted[view] = _to_part(seen, own, bundle, sigma, bound)
+            cameras = "" if len(parted[view]) == len(own) else "".join(parted[view])
+            notes.append(Rejection(view, cameras, _disagreement(own, parted[view], error / typical)))
+    placed = tuple(
+        replace(shot, place=f"{shot.view} {shot.camera}")
+        if shot.camera in parted.get(shot.view, ())
+        else shot
+        for shot in good
+    )
+    return placed, tuple(notes)
+
+
+def _judge_images(
+    seen: Seen, shots: Sequence[Shot], bundle: Bundle
+) -> tuple[tuple[Shot, ...], tuple[Rejection, ...], Float]:
+    """Return good shots, rejections, and each camera's robust standard deviation.
+
+    Reasons are given for the rejections; the standard deviation is (C,) [px].
+    """
+    residuals = _settled(seen, [replace(shot, place=f"{shot.view} {shot.camera}") for shot in shots], bundle)
+    errors = np.array([rms([r]) for r in residuals])
+    dof = np.array([2.0 * len(r) - 6.0 for r in residuals])
+    good = np.ones(len(shots), dtype=np.bool_)
+    sigma = np.ones(len(bundle.lenses))
+    reasons: dict[int, Rejection] = {}
+    for c, camera in enumerate(seen.views.cameras):
+        own = [i for i, shot in enumerate(shots) if shot.camera == camera]
+        if not own:
+            continue
+        bound, typical = limit(errors[own], dof[own]), float(np.median(errors[own]))
+        distances = np.concatenate([np.linalg.norm(residuals[i], axis=1) for i in own])
+        sigma[c] = max(float(np.median(distances)) / 1.1774, 1e-3)
+        for i in (i for i in own if errors[i] > bound):
+            text = (
+                f"corners are off by {errors[i]:.2f} px rms, usually {typical:.2f} px (limit {bound:.2f} px)"
+            )
+            reasons[i] = Rejection(shots[i].view, camera, text)
+            good[i] = False
+    kept = tuple(shot for shot, yes in zip(shots, good, strict=True) if yes)
+    return kept, tuple(reasons.values()), sigma
+
+
+def _settled(seen: Seen, shots: Sequence[Shot], bundle: Bundle) -> tuple[Float, ...]:
+    """Residuals (n, 2) [px] of each shot when only the boards may move."""
+    observations = seen.observations(shots)
+    nothing = Free(np.zeros_like(bundle.lenses, dtype=np.bool_), _none(bundle), shape=False)
+    return solve(observations, place_boards(observations, bundle), nothing).residuals
+
+
+def _none(bundle: Bundle) -> Bool:
+    return np.zeros(len(bundle.lenses), dtype=np.bool_)
+
+
+def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, sigma: Float) -> Float:
+    """Return the rms residual of each view.
+
+    Shape (V,) [px], as if all cameras were as good as the middle one.
+    """
+    shots = [shot for own in views for shot in own]
+    residuals = iter(_settled(seen, shots, bundle))
+    cameras = seen.views.cameras
+    return float(np.median(sigma)) * np.array(
+        [rms([next(residuals) / sigma[cameras.index(shot.camera)] for shot in own]) for own in views]
+    )
+
+
+def _to_part(seen: Seen, own: Sequence[Shot], bundle: Bundle, sigma: Float, bound: float) -> set[str]:
+    """Return the cameras to separate from a view.
+
+    The one without which the others agree, or else all.
+    """
+    if len(own) < 3:
+        return {shot.camera for shot in own}
+    without = [[shot for shot in own if shot != rejected] for rejected in own]
+    errors = [float(_view_errors(seen, [rest], bundle, sigma)[0]) for rest in without]
+    best = int(np.argmin(errors))
+    return {own[best].camera} if errors[best] <= bound else {shot.camera for shot in own}
+
+
+def _disagreement(own: Sequence[Shot], parted: set[str], times: float) -> str:
+    names = [shot.camera for shot in own]
+    who = " and ".join(names) if len(parted) == len(own) else "this camera and the others"
+    return (
+        f"{who} disagree on where the board is, {times:.1f} times the usual error: it moved between the exposures,"
+        " or these are images of two different times; used for the lens only"
+    )

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.errors import RecordingError
 from master.calibrate.cameras.bundle import rms
 from master.calibrate.cameras.coverage import CELLS

@@ -1,25 +1,139 @@
-"""Results of the camera fits.
+"""A result holds lenses and poses, their audited accuracy, and the report.
+
+Accuracy of a calibration, measured from the values as written to the files.
+
+Results of the camera fits.
 
 Lenses and poses with their uncertainty, or why the views are not enough.
+
+Report table of a camera calibration.
+
+A person reads it after the calibration; the same numbers are given for a machine.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from common.arrays import Float
 from common.calibration import Intrinsics, Matrix4
 from common.calibration.camera import check_lens
 from common.errors import CalibrationError, FitError
+from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert, skew
-from master.calibrate.cameras.alone import Rejection
-from master.calibrate.cameras.audit import PairAudit, audit_pair, pairs_with_views
-from master.calibrate.cameras.bundle import rms
+from master.calibrate.cameras.boards import Board, grid_edges
+from master.calibrate.cameras.bundle import LENS, rms
 from master.calibrate.cameras.coverage import Coverage, advice, coverage
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.held_out import BoardChoice
-from master.calibrate.cameras.lens_files import camera_model, intrinsics_of, matrix_of
+from master.calibrate.cameras.outliers import Rejection
+from master.calibrate.tree_files import camera_model, intrinsics_of, lens_of, matrix_of
+
+
+@dataclass(frozen=True, slots=True)
+class PairAudit:
+    """Two cameras, over all views that both see.
+
+    Attributes:
+        first, second: Their names.
+        views: Number of views.
+        baseline_m: Distance of the optical centres.
+        epipolar_rms_px: Distance of undistorted corners from the epipolar lines of the other camera's.
+        edge_mean_mm, edge_sd_mm, edge_worst_mm: Sides of squares, triangulated: mean, standard deviation, and the
+            largest difference from the drawn side.
+        edges: Number of sides.
+    """
+
+    first: str
+    second: str
+    views: int
+    baseline_m: float
+    epipolar_rms_px: float
+    edge_mean_mm: float
+    edge_sd_mm: float
+    edge_worst_mm: float
+    edges: int
+
+
+def audit_pair(
+    board: Board,
+    names: tuple[str, str],
+    models: tuple[CameraModel, CameraModel],
+    views: Sequence[tuple[Float, Float]],
+) -> PairAudit:
+    """Epipolar error and triangulated squares of two cameras.
+
+    Args:
+        board: The board.
+        names: Of the cameras.
+        models: Of the cameras, as read from their files.
+        views: Corners (N, 2) [px] in both, NaN = not seen, at least one view.
+    """
+    T = invert(models[1].T_rig_camera) @ models[0].T_rig_camera
+    essential = skew(T[:3, 3]) @ T[:3, :3]
+    focal = float(np.mean([m.matrix[i, i] for m in models for i in (0, 1)]))
+    distances: list[Float] = []
+    sides: list[Float] = []
+    edges = grid_edges(board)
+    for uv_a, uv_b in views:
+        a, b = models[0].undistort(uv_a), models[1].undistort(uv_b)
+        both = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
+        distances.append(focal * _epipolar(essential, a[both], b[both]))
+        points = np.full((len(a), 3), np.nan)
+        points[both] = _triangulate(T, a[both], b[both])
+        side = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+        sides.append(side[np.isfinite(side)])
+    off, side_mm = np.concatenate(distances), 1e3 * np.concatenate(sides)
+    return PairAudit(
+        first=names[0],
+        second=names[1],
+        views=len(views),
+        baseline_m=float(np.linalg.norm(T[:3, 3])),
+        epipolar_rms_px=float(np.sqrt(np.mean(off**2))),
+        edge_mean_mm=float(side_mm.mean()) if len(side_mm) else float("nan"),
+        edge_sd_mm=float(side_mm.std()) if len(side_mm) else float("nan"),
+        edge_worst_mm=float(np.abs(side_mm - 1e3 * board.square_m).max(initial=0.0)),
+        edges=len(side_mm),
+    )
+
+
+def _epipolar(essential: Float, a: Float, b: Float) -> Float:
+    """Return the distances of normalized points from their epipolar lines.
+
+    Distances (2n,) of points (n, 2) from the lines of their partners, in both images.
+    """
+    a1, b1 = np.column_stack([a, np.ones(len(a))]), np.column_stack([b, np.ones(len(b))])
+    in_b, in_a = a1 @ essential.T, b1 @ essential
+    product = (b1 * in_b).sum(axis=1)
+    return np.concatenate(
+        [product / np.linalg.norm(in_b[:, :2], axis=1), product / np.linalg.norm(in_a[:, :2], axis=1)]
+    )
+
+
+def _triangulate(T_b_a: Float, a: Float, b: Float) -> Float:
+    """Points (n, 3) [m] in the first camera's frame of normalized points (n, 2)."""
+    homogeneous = cv2.triangulatePoints(np.eye(4)[:3], T_b_a[:3], a.T, b.T)
+    points = np.asarray(homogeneous, dtype=np.float64)
+    return (points[:3] / points[3]).T
+
+
+def pairs_with_views(
+    shared: Mapping[str, Mapping[str, Float]],
+) -> dict[tuple[str, str], list[tuple[Float, Float]]]:
+    """Pairs of cameras, with the corners of each place of the board that both see.
+
+    Args:
+        shared: Place -> camera -> corners (N, 2) [px].
+    """
+    pairs: dict[tuple[str, str], list[tuple[Float, Float]]] = {}
+    for cameras in shared.values():
+        names = list(cameras)
+        for i, first in enumerate(names):
+            for second in names[i + 1 :]:
+                pairs.setdefault((first, second), []).append((cameras[first], cameras[second]))
+    return pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,3 +299,130 @@ def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
         return sd, 0.0
     way = -rotation.T @ t / length
     return sd, float(np.sqrt(way @ centre @ way))
+
+
+def report_lines(result: CamerasResult) -> Iterator[str]:
+    """The table, line by line."""
+    for name, lens in result.lenses.items():
+        yield from _lens_lines(name, lens)
+    for name, pair_sd in result.baseline_sd_m.items():
+        if pair_sd > 0.0:
+            centre, rotation = result.place_sd[name][:3] * 1e3, result.place_sd[name][3:] * 57.2958
+            yield (
+                f"{name}: place known to {centre[0]:.3f} {centre[1]:.3f} {centre[2]:.3f} mm,"
+                f" {rotation[0]:.4f} {rotation[1]:.4f} {rotation[2]:.4f}° (standard deviations)"
+            )
+    for pair in result.pairs:
+        sd = result.baseline_sd_m[pair.second] if pair.first == next(iter(result.lenses)) else 0.0
+        known = f" ± {1e3 * sd:.3f}" if sd > 0.0 else ""
+        yield (
+            f"{pair.first} - {pair.second}: {pair.views} views, baseline {1e3 * pair.baseline_m:.3f}{known} mm,"
+            f" epipolar rms {pair.epipolar_rms_px:.3f} px"
+        )
+        yield (
+            f"  squares triangulated from the written values: {pair.edge_mean_mm:.3f} ± {pair.edge_sd_mm:.3f} mm"
+            f" (mean, standard deviation of {pair.edges} sides; worst off by {pair.edge_worst_mm:.2f} mm)"
+        )
+    what = "stereo rms" if len(result.lenses) > 1 else "rms"
+    yield f"{what} {result.rms_px:.3f} px over {result.views} views"
+    yield _board_line(result)
+    yield "nothing was left out" if not result.rejected else f"left out ({len(result.rejected)}):"
+    for no in result.rejected:
+        yield f"  {no}"
+
+
+def _board_line(result: CamerasResult) -> str:
+    """Which board was taken, and by what it was chosen."""
+    board, (along, out) = result.board, result.shape_mm
+    taken = (
+        f"corners {along:.2f} mm in its plane and {out:.2f} mm out of it from where they are drawn (rms)"
+        if board.bent
+        else "taken as drawn, flat"
+    )
+    if board.reason:
+        return f"board: {taken}: {board.reason}"
+    return (
+        f"board: {taken}: in {board.views} views held out of the fit, corners are {board.flat_px:.3f} px off where a"
+        f" flat board predicts them and {board.bent_px:.3f} px with a shape of its own"
+        f"{'' if board.bent or board.bent_px >= board.flat_px else ', which is not certainly less'}"
+    )
+
+
+def _lens_lines(name: str, lens: LensResult) -> Iterator[str]:
+    values = lens_of(lens.intrinsics)
+    kind = "" if lens.estimated else " (held)"
+    yield f"{name}: {lens.views} images, rms {lens.rms_px:.3f} px{kind}"
+    yield "  " + "  ".join(
+        f"{term.removesuffix('_px')} {value:.2f}" + (f" ± {sd:.2f}" if sd > 0 else "")
+        for term, value, sd in zip(LENS[:4], values[:4], lens.sd[:4], strict=True)
+    )
+    yield "  " + "  ".join(
+        f"{term} {value:.4f} ± {sd:.4f}" if sd > 0 else f"{term} {value:g}"
+        for term, value, sd in zip(LENS[4:], values[4:], lens.sd[4:], strict=True)
+    )
+    covered = lens.covered
+    yield (
+        f"  seen: {100 * covered.share:.0f} % of the image, tilts to {covered.tilt_deg.max():.0f}°"
+        f" ({covered.tilt_spread_deg:.0f}° apart), {covered.distance_m.min():.2f} to"
+        f" {covered.distance_m.max():.2f} m"
+    )
+    for row in covered.cells:
+        yield "    " + "".join("#" if cell else "." for cell in row)
+    if wish := advice(covered):
+        yield f"  it would gain most if you {wish}"
+
+
+def report_json(result: CamerasResult) -> dict[str, object]:
+    """The numbers; lengths in the unit of their key."""
+    return {
+        "rms_px": result.rms_px,
+        "views": result.views,
+        "cameras": {name: _lens_json(lens) for name, lens in result.lenses.items()},
+        "T_first_camera": {name: [list(row) for row in place] for name, place in result.T_rig_camera.items()},
+        "place_sd": {
+            name: {"centre_m": sd[:3].tolist(), "rotation_rad": sd[3:].tolist()}
+            for name, sd in result.place_sd.items()
+        },
+        "pairs": [
+            {
+                "cameras": [pair.first, pair.second],
+                "views": pair.views,
+                "baseline_m": pair.baseline_m,
+                "epipolar_rms_px": pair.epipolar_rms_px,
+                "edge_mean_mm": pair.edge_mean_mm,
+                "edge_sd_mm": pair.edge_sd_mm,
+                "edge_worst_mm": pair.edge_worst_mm,
+                "edges": pair.edges,
+            }
+            for pair in result.pairs
+        ],
+        "board": _board_json(result),
+        "rejected": [{"view": no.view, "camera": no.camera, "reason": no.reason} for no in result.rejected],
+    }
+
+
+def _board_json(result: CamerasResult) -> dict[str, object]:
+    board, (along, out) = result.board, result.shape_mm
+    compared: dict[str, object] = {"reason": board.reason}
+    if not board.reason:
+        compared = {"flat_px": board.flat_px, "bent_px": board.bent_px, "views_held_out": board.views}
+    return {"bent": board.bent, "shape_rms_mm": {"in_plane": along, "out_of_plane": out}} | compared
+
+
+def _lens_json(lens: LensResult) -> dict[str, object]:
+    covered = lens.covered
+    return {
+        "views": lens.views,
+        "rms_px": lens.rms_px,
+        "estimated": lens.estimated,
+        "values": dict(zip(LENS, lens_of(lens.intrinsics).tolist(), strict=True)),
+        "sd": dict(zip(LENS, lens.sd.tolist(), strict=True)),
+        "coverage": {
+            "share": covered.share,
+            "cells": covered.cells.astype(int).tolist(),
+            "tilt_deg": covered.tilt_deg.tolist(),
+            "tilt_spread_deg": covered.tilt_spread_deg,
+            "distance_m": covered.distance_m.tolist(),
+            "advice": advice(covered),
+        },
+    }

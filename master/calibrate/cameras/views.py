@@ -1,12 +1,25 @@
-"""What the cameras saw of a board: the observations of all fits of cameras."""
+"""A view is one board seen by several cameras at once, loaded from images.
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+What the cameras saw of a board: the observations of all fits of cameras.
+
+Sources of board images.
+
+A folder of files, a folder per camera, or a recording of ours.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
 
 from common.arrays import Image
-from common.errors import CalibrationError, FitError
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
-from master.calibrate.cameras.detect import ImageObservation, find_board
+from common.errors import CalibrationError, FitError, PictureError, RecordingError
+from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+from common.recording.pictures import FramePictures, decode_file, read_picture
+from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, ImageObservation, find_board
 
 ImageSet = Mapping[str, Callable[[], Image]]
 """Images taken at one time: camera -> how to load its image."""
@@ -131,3 +144,143 @@ def _likely_mistakes(board: Board) -> Iterator[Board]:
             yield Charuco(columns, rows, board.square_m, board.marker_m, dictionary)
         except CalibrationError:  # such a board cannot exist: too small, or more markers than the family has
             continue
+
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_NUMBER = re.compile(r"[-_ .]?\d+$")
+MOST_VIEWS = 60  # of a recording: more of the same motion adds time, not knowledge
+
+
+def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, ImageSet]]:
+    """Return the views of a folder, by name.
+
+    Each is the images of all cameras taken at one epoch.
+
+    Args:
+        folder: Holds `recording.json`; or one sub-folder of images per camera, views matched by file name; or images
+            named CAMERA*.png|jpg|…, matched by the rest of the name (left01.jpg, right01.jpg).
+        cameras: Names of the cameras wanted; none: those the folder has, a name being what stands before the number.
+
+    Raises:
+        RecordingError: No folder, no image in it, or none of a camera asked for.
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: is not a folder")
+    if (folder / MANIFEST).is_file():
+        return _of_recording(folder, cameras)
+    files = _images(folder)
+    if files:
+        return _matched(folder, _by_prefix(folder, files, cameras))
+    nested = {sub.name: _images(sub) for sub in sorted(folder.iterdir()) if sub.is_dir()}
+    nested = {name: found for name, found in nested.items() if found}
+    if not nested:
+        raise RecordingError(f"{folder}: no images here, nor in a folder per camera ({', '.join(_ENDINGS)})")
+    if missing := [camera for camera in cameras if camera not in nested]:
+        raise RecordingError(
+            f"{folder}: no folder of images for {missing[0]!r}; there are {', '.join(nested)}"
+        )
+    return _matched(
+        folder, {camera: {file.stem: file for file in nested[camera]} for camera in cameras or tuple(nested)}
+    )
+
+
+def _images(folder: Path) -> list[Path]:
+    return sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in _ENDINGS and file.is_file() and not file.name.startswith(".")
+    )
+
+
+def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """Camera -> rest of the name -> file; files of other cameras are ignored."""
+    prefixes = sorted({_NUMBER.sub("", file.stem) for file in files} - {""})
+    names = list(cameras) or prefixes
+    if len(names) == 1 and not any(file.stem.startswith(names[0]) for file in files) and len(prefixes) <= 1:
+        return {
+            names[0]: {file.stem: file for file in files}
+        }  # a folder of one camera need not repeat its name
+    found: dict[str, dict[str, Path]] = {name: {} for name in names}
+    longest_first = sorted(names, key=len, reverse=True)
+    for file in files:
+        owner = next((name for name in longest_first if file.stem.startswith(name)), None)
+        if owner is not None:
+            found[owner][file.stem[len(owner) :].strip("-_ .") or "0"] = file
+    for name, own in found.items():
+        if not own:
+            raise RecordingError(
+                f"{folder}: no image is named {name}*; the names begin with {', '.join(prefixes) or 'numbers'}"
+            )
+    if not found:
+        raise RecordingError(f"{folder}: the images are numbered only: name their camera with --camera NAME")
+    return found
+
+
+def _matched(folder: Path, files: dict[str, dict[str, Path]]) -> list[tuple[str, ImageSet]]:
+    names = sorted(set[str]().union(*files.values()), key=_natural)
+    return [
+        (name, {camera: partial(_load, own[name]) for camera, own in files.items() if name in own})
+        for name in names
+    ]
+
+
+def _natural(name: str) -> tuple[tuple[int, str], ...]:
+    """Order in which 2 comes before 10."""
+    return tuple(
+        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name) if part
+    )
+
+
+def _load(file: Path) -> Image:
+    try:
+        return decode_file(read_picture(file))
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
+    except PictureError as error:
+        raise RecordingError(f"{file}: is no image: it {error}") from error
+
+
+def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
+    """Return the frames that show a board.
+
+    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same moment;
+    never those with a laser's line across the corners.
+    """
+    lit = {row.illumination for row in rows}
+    for best in (Illumination.LED, Illumination.AMBIENT):
+        if best in lit:
+            return [row for row in rows if row.illumination is best]
+    return [row for row in rows if row.illumination is Illumination.NONE]
+
+
+def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, ImageSet]]:
+    """Return views spread evenly over a recording.
+
+    Frames of the first camera, with those of the others nearest in time.
+    """
+    recording = open_recording(folder)
+    names = list(cameras) or list(recording.manifest.cameras)
+    rows = {name: _showing(recording.frames_of(name)) for name in names}
+    pictures: dict[str, FramePictures] = {}
+    for name, own in rows.items():
+        if not own:
+            raise RecordingError(f"{folder}: camera {name!r} has no frame")
+        camera = recording.manifest.cameras[name]
+        pictures[name] = FramePictures(folder, (camera.width_px, camera.height_px))
+    reference = rows[names[0]]
+    times = {name: np.array([row.t_ns for row in own], dtype=np.int64) for name, own in rows.items()}
+    # Nearer to this frame than to its neighbours; frames alone in the recording have no neighbour to be nearer to.
+    gap = np.median(np.diff(times[names[0]])) / 2 if len(reference) > 1 else np.inf
+    chosen = np.unique(
+        np.linspace(0, len(reference) - 1, min(MOST_VIEWS, len(reference))).round().astype(int)
+    )
+    sets: list[tuple[str, ImageSet]] = []
+    for i in chosen:
+        row = reference[int(i)]
+        images: dict[str, Callable[[], Image]] = {}
+        for name, own in rows.items():
+            nearest = int(np.abs(times[name] - row.t_ns).argmin())
+            if abs(own[nearest].t_ns - row.t_ns) <= gap:
+                images[name] = partial(pictures[name].read, own[nearest].file)
+        sets.append((str(row.seq), images))
+    return sets

@@ -1,22 +1,38 @@
-"""Command `phalanx calibrate depth`: two laws of raw disparity.
+"""The commands `calibrate depth` and `calibrate verify` fit and check depth.
+
+Writing of the fitted depth laws into the rig file.
+
+With date, data and residual, and the notes to print about it.
+
+Command `phalanx calibrate depth`: two laws of raw disparity.
 
 The published session, from known distances to the two laws.
+
+`phalanx calibrate verify`: measured and predicted depth error of this rig.
+
+Prints the published table.
 """
 
 import os
 from argparse import Namespace
 from pathlib import Path
 
+import msgspec
+import numpy as np
+
 from common.arrays import Float
 from common.bus.keys import link_key
-from common.calibration import RigCalibration
+from common.calibration import (
+    AffineDisparityCalibration,
+    PowerLawCalibration,
+    Provenance,
+    RigCalibration,
+)
+from common.command_line import echo
 from common.errors import CalibrationError
 from common.recording.frame_recording import FrameRecording
-from common.terminal import echo
-from master.calibrate.depth.fit import ideal_of
-from master.calibrate.depth.live import sweep_live
-from master.calibrate.depth.report import fit_depth, report_json, report_lines
-from master.calibrate.depth.save import conclusion, rig_to_write, write_laws
+from master.calibrate.depth.fit import DepthReport, fit_depth, ideal_of, report_json, report_lines
+from master.calibrate.depth.session import sweep_live
 from master.calibrate.depth.source import (
     Measured,
     Pair,
@@ -26,13 +42,105 @@ from master.calibrate.depth.source import (
     pair_of,
     parse_target,
 )
-from master.calibrate.depth.sweep import checked
-from master.calibrate.depth.verify import laws_of
+from master.calibrate.depth.sweep import check_places, checked, parse_distances, parse_numbers
+from master.calibrate.depth.verify import (
+    Noise,
+    Verified,
+    budget,
+    budget_lines,
+    expected_json,
+    laws_of,
+    measured_lines,
+    off_axis,
+    off_axis_lines,
+    verified_json,
+    verify,
+)
+from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
 from master.commands.options import (
     address,
 )
 from master.commands.summary import write_summary
-from master.fabrik.depth import DepthLaw
+from master.fabrik.depth import DepthLaw, tolerable_skew_s
+
+
+def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
+    """Return the rig file that receives the new laws.
+
+    The one in `out` where there is one, else the one in use.
+
+    Raises:
+        CalibrationError: No rig is known, it has not two cameras, or other ones than the file in `out`.
+    """
+    rig = pair.rig
+    if out is None:
+        return rig
+    if rig is None:
+        raise CalibrationError("--out: which rig is this? give --rig NAME (a file of --calibration DIR/rigs)")
+    if len(rig.cameras) != 2:
+        raise CalibrationError(
+            f"rig {rig.name!r} has {len(rig.cameras)} cameras: laws of disparity are for two; it needs"
+            " depth_model 'stereo'"
+        )
+    return rig_in_tree(out, pair.file_name, rig)
+
+
+def write_laws(
+    out: Path, rig: RigCalibration | None, report: DepthReport, measured: Measured, use: str | None
+) -> Path:
+    """Write the rig file with both laws and their provenance.
+
+    Includes the depth model if asked for.
+
+    Raises:
+        CalibrationError: The file cannot be written; the old one is untouched.
+    """
+    assert rig is not None  # `rig_to_write` has refused it
+    power, affine = report.power_law, report.affine_disparity
+    low, high = float(report.sweep.distance_m.min()), float(report.sweep.distance_m.max())
+    dropped = "" if report.used.all() else f"; left out: {report.sweep.names(~report.used)}"
+
+    def how(name: str) -> Provenance:
+        mean, largest = report.mean_max(name)
+        residual = {
+            "mean_percent": round(100 * mean, 4),
+            "max_percent": round(100 * largest, 4),
+            "leave_one_out_mean_percent": round(100 * float(np.abs(report.rejected[name]).mean()), 4),
+        }
+        note = f"{int(report.used.sum())} distances, {low:.3g} to {high:.3g} m{dropped}"
+        return provenance("calibrate depth", measured.data, residual, note)
+
+    new = msgspec.structs.replace(
+        rig,
+        power_law=PowerLawCalibration(k_m=power.k_m, z=power.z),
+        affine_disparity=AffineDisparityCalibration(a_m_px=affine.a_m_px, x0_px=affine.x0_px),
+        depth_model=rig.depth_model if use is None else use,
+        provenance=rig.provenance | {name: how(name) for name in report.rejected},
+    )
+    return write_rig(out, measured.pair.file_name, new)
+
+
+def conclusion(report: DepthReport, rig: RigCalibration | None, use: str | None, written: Path | None) -> str:
+    """Before and after, what was written, and which depth model would be better."""
+    before = [name for name in report.errors if name not in report.rejected]
+    was = f"before {100 * report.mean_max(before[-1])[0]:.2f} % ({before[-1]}), " if before else ""
+    after = ", ".join(f"{100 * report.mean_max(name)[0]:.2f} % ({name})" for name in report.rejected)
+    text = f"mean error: {was}after {after}"
+    if written is None:
+        return f"{text}\nnothing written: give --out DIR"
+    model = use if use is not None else "" if rig is None else rig.depth_model
+    hint = (
+        ""
+        if use is not None or model == report.best
+        else f"; --use {report.best} would switch it"
+        + (
+            " (stereo, if calibrated, is better off the axis: see `calibrate verify`)"
+            if model == "stereo"
+            else ""
+        )
+    )
+    return f"{text}\nwrote {written}; its depth_model is {model}{hint}"
+
 
 _SWEEP = "1.00:0.20:-0.05"  # the published one
 
@@ -150,3 +258,124 @@ def _refuse_idle(where: str, **given: object) -> None:
         if value:
             option = "a recording or a table" if name == "source" else f"--{name}"
             raise CalibrationError(f"{option} has no meaning with {where}: leave it out")
+
+
+_TABLE = "0.20:1.00:0.10"  # where the budget is printed
+
+
+def verify_command(options: Namespace) -> None:
+    """Report the error of each depth model at known distances.
+
+    Also prints the error budget, that is, what to expect of the rig.
+    """
+    noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
+    numbers: dict[str, object] = {}
+    found: Verified | None = None
+    if options.source is None:
+        pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
+        distance = parse_distances(options.distances or _TABLE)
+    else:
+        outline = parse_target(options.target)
+        measured = measured_from(
+            options.source,
+            options.detections,
+            options.marker,
+            options.distances,
+            options.rig,
+            options.calibration,
+            options.fov_deg,
+            outline,
+        )
+        pair = measured.pair
+        found = _measured(measured, noise)
+        numbers |= verified_json(found)
+        distance = parse_distances(_TABLE)
+    numbers |= _expected(pair, distance, _angles(options.angles), noise)
+    if options.json_file is not None:
+        write_summary(options.json_file, numbers)
+    if options.picture is not None:
+        if found is None:
+            raise CalibrationError(
+                "--picture: there are no measured errors to draw; give a recording or a .csv"
+            )
+        from master.calibrate.depth.picture import draw_errors
+
+        errors = {name: found.relative(name) for name in found.error_m}
+        title = f"Depth of rig {pair.rig.name if pair.rig is not None else ''!r}"
+        d = found.sweep.distance_m
+        draw_errors(options.picture, title, d, errors, band=found.expected_m / d)
+
+
+def _measured(measured: Measured, noise: Noise) -> Verified:
+    """Hold a sweep against its rig and print the table.
+
+    Raises:
+        CalibrationError: The rig has no depth model at all.
+        FitError: The sweep is unfit.
+    """
+    pair = measured.pair
+    laws = {} if pair.rig is None else laws_of(pair.rig)
+    if not laws and pair.models is None:
+        raise CalibrationError(
+            "there is nothing to verify: give --rig NAME, a rig with power_law, affine_disparity or calibrated cameras"
+        )
+    with measured.named():
+        sweep = check_places(measured.sweep, pair.cameras, pair.size_px)
+    found = verify(sweep, laws, pair.models, noise)
+    if not found.error_m:
+        raise CalibrationError(
+            "the stereo model needs the columns v_left_px and v_right_px, and the rig has no law of disparity"
+        )
+    echo(measured.about)
+    rates = ", ".join(f"{file.name} {file.frame_rate_hz:g} Hz" for file in pair.files) or "unknown"
+    echo(f"camera rate: {rates}; processed: {int(found.sweep.frames.sum())} frame pairs")
+    for name in laws:
+        known = pair.rig.provenance.get(name) if pair.rig is not None else None
+        if known is not None and set(known.data) & set(measured.data):
+            echo(f"{name} was fitted to this very sweep ({known.date}): its error for other places is larger")
+    for line in measured_lines(found):
+        echo(line)
+    return found
+
+
+def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[str, object]:
+    """Print the error budget and the off-axis table, and return them as numbers.
+
+    Only where the cameras are known.
+    """
+    if pair.models is None or pair.rig is None:
+        echo("no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)")
+        return {}
+    expected = budget(pair.models, distance, noise)
+    errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
+    baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
+    wanted = 0.02  # of the depth, as the published rig
+    apart_ms = 1e3 * tolerable_skew_s(wanted, baseline_m, 1.0)
+    echo(
+        f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
+        f" {100 * wanted:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
+    )
+    for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
+        echo(line)
+    return expected_json(distance, expected, noise, angle, errors)
+
+
+def _angles(text: str) -> Float:
+    """Angles [deg] of --angles.
+
+    Raises:
+        CalibrationError: Not numbers, or not in front of the cameras.
+    """
+    angles = parse_numbers(
+        text, "--angles", "FIRST:LAST:STEP in degrees, such as -20:20:10, or a list -20,0,20"
+    )
+    if not (np.abs(angles) < 90.0).all():
+        raise CalibrationError(f"--angles {text!r}: expected angles between -90 and 90 degrees")
+    return angles
+
+
+def _noise(sigma_px: float, speed_m_s: float, skew_ms: float) -> Noise:
+    for option, value in (("--sigma-px", sigma_px), ("--speed-m-s", speed_m_s), ("--skew-ms", skew_ms)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise CalibrationError(f"{option} {value:g}: expected a number that is not negative")
+    return Noise(sigma_px, speed_m_s, skew_ms * 1e-3)

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from common.arrays import Bool, Float
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.errors import RecordingError
 
 _LOOK = {

@@ -1,9 +1,19 @@
-"""Inputs of the depth commands: the sweep, the camera pair and the rig.
+"""The inputs of a depth fit are read from a rig, a recording or a table.
+
+Depth sweep from a recording.
+
+Its detections, and the distances that belong to them.
+
+The frames of the two cameras are paired by time. The target stands still while a distance is measured, so neither
+interpolation nor the rolling shutter matters; what does matter is that no frame of its way from one place to the next
+is taken, which `still_runs` sees to.
+
+Inputs of the depth commands: the sweep, the camera pair and the rig.
 
 Read from the files that the user names.
 """
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,16 +21,256 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, load
-from common.errors import CalibrationError, FitError
+from common.errors import CalibrationError, FitError, RecordingError
 from common.geometry.camera_model import CameraModel
+from common.messages import MarkerDetections
 from common.recording.frame_recording import FrameRecording, open_recording
-from master.calibrate.depth.recording import Pairs, by_file, by_list, by_truth, read_pairs
-from master.calibrate.depth.sweep import Sweep
-from master.calibrate.depth.tables import parse_distances, read_table
+from common.recording.recorded_files import TRUTH, has_truth, read_truth
+from master.calibrate.depth.sweep import Sweep, column, parse_distances, read_table, rows_of
 from master.calibrate.tree_files import load_marker_rig
-from master.fabrik.blob_bias import card_outline, centre_of_blob, round_outline
+from master.fabrik.caps import card_outline, centre_of_blob, round_outline
+from master.replay.recorded import recorded_detections
+
+STILL_S = 0.5  # shortest stretch that counts as standing
+STILL_FRAMES = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Frame pairs of two cameras in which one marker is looked for; T pairs.
+
+    Attributes:
+        t_ns: (T,) of the first camera's frame.
+        seq: (T,) its frame counter.
+        uv: (2, T, 2) [px]; NaN: not seen.
+        area_px2: (2, T) [px^2].
+        sigma_px: (2, T) stated standard deviations of the centroids [px].
+    """
+
+    t_ns: Int
+    seq: Int
+    uv: Float
+    area_px2: Float
+    sigma_px: Float
+
+
+def read_pairs(
+    recording: FrameRecording, detections: Path, cameras: tuple[str, str], marker: str | None
+) -> tuple[Pairs, str]:
+    """Return the frame pairs of two cameras of a recording and the target's name.
+
+    The name is that of the marker that is the target.
+
+    Args:
+        recording: The recording.
+        detections: Folder with detections_<camera>.npz.
+        cameras: First (left) and second camera.
+        marker: The target; None: the only marker that both cameras see.
+
+    Raises:
+        RecordingError: Detections are missing or broken, or no frames belong together.
+        CalibrationError: No such marker; or none is named and there are several, or none.
+    """
+    names = recording.manifest.marker_rig().markers
+    if marker is not None and marker not in names:
+        raise CalibrationError(f"--marker {marker!r}: the recording's rig has {', '.join(names)}")
+    first, second = (list(recorded_detections(detections, camera, len(names))) for camera in cameras)
+    index = _target([*first, *second], names) if marker is None else names.index(marker)
+    limit_ns = round(0.5e9 / min(recording.manifest.cameras[camera].frame_rate_hz for camera in cameras))
+    together = list(_together(first, second, limit_ns))
+    if not together:
+        raise RecordingError(
+            f"{detections}: no frame of {cameras[1]!r} lies within {limit_ns * 1e-6:.1f} ms, half a frame, of one of"
+            f" {cameras[0]!r}: were both recorded at the same time, on one clock?"
+        )
+    return Pairs(
+        np.array([a.t_ns for a, _ in together], np.int64),
+        np.array([a.seq for a, _ in together], np.int64),
+        np.array([[m.uv[index] for m in side] for side in zip(*together, strict=True)]),
+        np.array([[m.area[index] for m in side] for side in zip(*together, strict=True)]),
+        np.array([[m.sigma_px[index] for m in side] for side in zip(*together, strict=True)]),
+    ), names[index]
+
+
+def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
+    """Return each pair at its true distance from truth.npz of a rendered recording.
+
+    None where truth.npz has no `depth`.
+
+    Raises:
+        RecordingError: truth.npz is broken, leads out of the folder, or has another number of frames.
+    """
+    truth = read_truth(recording.folder, also=["depth"]) if has_truth(recording.folder) else {}
+    if "depth" not in truth:
+        return None
+    path = recording.folder / TRUTH
+    try:
+        depth = truth["depth"].astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path}: depth: {error}") from error
+    frames = recording.frames_of(recording.manifest.marker_rig().cameras[0])
+    if depth.shape != (len(frames),):
+        raise RecordingError(f"{path}: depth has shape {depth.shape}, frames.csv {len(frames)} frames")
+    number = {row.seq: i for i, row in enumerate(frames)}
+    if strange := [int(seq) for seq in pairs.seq if int(seq) not in number]:
+        raise RecordingError(
+            f"{recording.folder}: the detections have a frame {strange[0]}, frames.csv has not: they are of another"
+            " recording; run `phalanx-slave run -o` again"
+        )
+    index = np.array([number[int(seq)] for seq in pairs.seq], np.int64)
+    return _single(pairs, depth[index])
+
+
+def by_list(pairs: Pairs, distances: Float) -> Sweep:
+    """Assign the given distances to the pairs of the recording.
+
+    Distances (N,) in the order of the recording: one for each pair, or else one for each still stretch.
+
+    Raises:
+        CalibrationError: The numbers fit neither.
+    """
+    if distances.size == pairs.t_ns.size:
+        return _single(pairs, distances)
+    runs = still_runs(pairs)
+    if len(runs) != distances.size:
+        raise CalibrationError(
+            f"--distances names {distances.size} places, but the recording has {pairs.t_ns.size} frame pairs and the"
+            f" target stands still (for {STILL_S} s) {len(runs)} times: {_times(pairs, runs)}; give as many, or a file"
+            " with the columns t_s,distance_m"
+        )
+    return _averaged(pairs, runs, distances)
+
+
+def by_file(pairs: Pairs, path: Path) -> Sweep:
+    """Read the distances of the pairs from a CSV.
+
+    Columns: `distance_m`, and one of `t_s` (since the first pair), `frame` (pair, from 0), `seq`.
+
+    A time takes the pairs within a quarter of a second of it.
+
+    Raises:
+        CalibrationError: The file cannot be read, or names what the recording has not; with file and line.
+    """
+    columns, rows = rows_of(path)
+    keys = [key for key in ("t_s", "frame", "seq") if key in columns]
+    if "distance_m" not in columns or len(keys) != 1:
+        raise CalibrationError(
+            f"{path}: the columns must be distance_m and one of t_s, frame, seq; it has {', '.join(columns)}"
+        )
+    key = keys[0]
+    since_s = (pairs.t_ns - pairs.t_ns[0]) * 1e-9
+    number_of = np.arange(since_s.size, dtype=np.float64)
+    of_pair = {"t_s": since_s, "frame": number_of, "seq": pairs.seq.astype(np.float64)}[key]
+    around_s = 0.25  # frames before and after a time that `--distances FILE` names
+    around = around_s if key == "t_s" else 0.0
+    runs: list[Int] = []
+    for (number, _), v in zip(rows, column(path, rows, key).tolist(), strict=True):
+        run = np.flatnonzero(np.abs(of_pair - v) <= around)
+        if run.size == 0:
+            raise CalibrationError(
+                f"{path}: line {number}: no frame pair with {key} {v:g}; the recording has {since_s.size} pairs,"
+                f" seq {pairs.seq[0]}...{pairs.seq[-1]}, 0...{since_s[-1]:.2f} s"
+            )
+        if run.size > 1 and not _is_still(pairs, run):
+            raise CalibrationError(
+                f"{path}: line {number}: the target moves within {around_s} s of t_s {v:g}; still are"
+                f" {_times(pairs, still_runs(pairs))}"
+            )
+        runs.append(run)
+    return _averaged(pairs, runs, column(path, rows, "distance_m"))
+
+
+def still_runs(pairs: Pairs) -> list[Int]:
+    """The stretches, as indices of pairs, in which the target stands in both images.
+
+    A pair joins the stretch before it while its centroids lie within six standard deviations, 1.2 px at most, of the
+    stretch's mean. A tenth is cut off each end, where the target may still be settling, or be touched again.
+    """
+    runs: list[Int] = []
+    start = 0
+    for i in range(1, pairs.t_ns.size + 1):
+        run = np.arange(start, i)
+        if i < pairs.t_ns.size and _near(pairs, run, i):
+            continue
+        if run.size >= STILL_FRAMES and pairs.t_ns[run[-1]] - pairs.t_ns[run[0]] >= STILL_S * 1e9:
+            runs.append(run[run.size // 10 : run.size - run.size // 10])
+        start = i
+    return runs
+
+
+def _near(pairs: Pairs, run: Int, new: int | Int) -> bool:
+    """Return true if all pairs `new` lie at the mean position of the pairs `run`.
+
+    False where one is not seen.
+    """
+    off = np.abs(pairs.uv[:, new] - pairs.uv[:, run].mean(axis=1).reshape(2, *([1] * np.ndim(new)), 2))
+    noise_px = 0.1  # of a centroid whose sigma is not stated
+    # of a target at rest; more is stated of what moves suddenly, and must not excuse that it moves
+    unsure_px = 0.2
+    sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], noise_px), unsure_px)[..., None]
+    still_sigmas = 6.0  # distance of a frame's centroid from the mean of its stretch
+    return bool((off <= still_sigmas * sigma).all())
+
+
+def _is_still(pairs: Pairs, run: Int) -> bool:
+    return _near(pairs, run, run)
+
+
+def _times(pairs: Pairs, runs: Sequence[Int]) -> str:
+    since_s = (pairs.t_ns - pairs.t_ns[0]) * 1e-9
+    return ", ".join(f"{since_s[run[0]]:.1f}-{since_s[run[-1]]:.1f} s" for run in runs) or "never"
+
+
+def _single(pairs: Pairs, distance: Float) -> Sweep:
+    return _averaged(pairs, [np.array([i]) for i in range(distance.size)], distance)
+
+
+def _averaged(pairs: Pairs, runs: Sequence[Int], distance: Float) -> Sweep:
+    """One place for each run of pairs."""
+    disparity = pairs.uv[0, :, 0] - pairs.uv[1, :, 0]
+    stated = np.hypot(pairs.sigma_px[0], pairs.sigma_px[1])
+    return Sweep(
+        distance_m=np.asarray(distance, np.float64),
+        disparity_px=np.array([disparity[run].mean() for run in runs]),
+        uv=np.stack([pairs.uv[:, run].mean(axis=1) for run in runs], axis=1),
+        area_px2=np.stack([pairs.area_px2[:, run].mean(axis=1) for run in runs], axis=1),
+        sigma_px=np.array(
+            [disparity[run].std(ddof=1) if run.size >= STILL_FRAMES else stated[run].mean() for run in runs]
+        ),
+        frames=np.array([run.size for run in runs], np.int64),
+        place=tuple(f"frame {run[0]}" if run.size == 1 else f"frames {run[0]}-{run[-1]}" for run in runs),
+    )
+
+
+def _target(messages: Sequence[MarkerDetections], names: tuple[str, ...]) -> int:
+    """The one marker that is seen in at least half of the messages."""
+    share = np.isfinite([message.uv[:, 0] for message in messages]).mean(axis=0)
+    seen = np.flatnonzero(share >= 0.5).tolist()
+    if len(seen) != 1:
+        visible = ", ".join(names[i] for i in seen) or "none"
+        raise CalibrationError(f"--marker is missing: markers seen in half of the frames: {visible}")
+    return seen[0]
+
+
+def _together(
+    first: Sequence[MarkerDetections], second: Sequence[MarkerDetections], limit_ns: int
+) -> list[tuple[MarkerDetections, MarkerDetections]]:
+    """Match each message of the first camera with the nearest one of the second.
+
+    Matches are not farther apart than `limit_ns`.
+    """
+    if not second:
+        return []
+    times = np.array([message.t_ns for message in second], np.int64)
+    out: list[tuple[MarkerDetections, MarkerDetections]] = []
+    for message in first:
+        nearest = int(np.argmin(np.abs(times - message.t_ns)))
+        if abs(int(times[nearest]) - message.t_ns) <= limit_ns:
+            out.append((message, second[nearest]))
+    return out
+
 
 _LEFT_RIGHT = ("left", "right")
 

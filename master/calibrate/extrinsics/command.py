@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.arrays import Float
+from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.imu.fusion import OrientationFilter
 from common.imu.recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
 from common.recording.frame_recording import FrameRecording, open_recording
-from common.terminal import echo
 from master.calibrate.wrist.device import device_of, print_line, write_device
 from master.commands.summary import write_summary
 from master.replay.recorded import recorded_cycles, recorded_detections
-from master.rig.files import load_hand
 from master.rig.pipeline import build_pipeline
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_hand
+from master.run.app import StageTimes
 
 if TYPE_CHECKING:
     from master.calibrate.extrinsics.extrinsics import Extrinsics
@@ -62,7 +61,7 @@ def extrinsics(options: Namespace) -> None:
         raise FitError(f"{options.recording}: {error}") from error
     print_line(found.report)
     if options.picture is not None:
-        from master.calibrate.extrinsics.picture import draw_extrinsics  # matplotlib takes a second to import
+        from master.calibrate.picture import draw_extrinsics
 
         draw_extrinsics(options.picture, found, device.optics)
         echo(f"drew {options.picture}")
@@ -109,7 +108,7 @@ def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequenc
 
 def summary(found: "Extrinsics") -> dict[str, object]:
     """What was measured, as numbers."""
-    from master.calibrate.extrinsics.report import left_of
+    from master.calibrate.extrinsics.extrinsics import left_of
 
     imu = found.rig.imu
     return {

@@ -1,4 +1,10 @@
-"""Most probable mounting as one least-squares problem.
+"""The most probable mounting is the solution of one least-squares problem.
+
+Wrist angles: two anatomical ones, and a third that no wrist has.
+
+Also how they change with a rotation.
+
+Most probable mounting as one least-squares problem.
 
 Given what marker rig, wrist camera and IMU saw of one motion.
 
@@ -13,12 +19,16 @@ share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
   however the wrist is bent, and its joint stays where it is;
 - **the wrist**, which bends and does not twist:
   R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
-  (`common.hand.wrist_joint`);
+  (`common.hand.wrist`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
 The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
 Marquardt; outliers are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
 all epochs of a second together count as a few.
+
+Maximum a posteriori estimate of the mounting.
+
+First fits a part of the motion from several guesses, then all of it from the best one.
 """
 
 from collections.abc import Sequence
@@ -29,30 +39,57 @@ import numpy as np
 from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import HandModel
-from master.calibrate.extrinsics.hands import HandProblem, Hands
-from master.calibrate.extrinsics.lines_of_sight import FINGERS, SEEN, LinesOfSight
-from master.calibrate.extrinsics.normal import Normal
-from master.calibrate.extrinsics.seen import OUTLIER_SIGMAS, Fit, StrobeCycles
-from master.calibrate.extrinsics.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
+from common.hand.wrist import wrist_angles_of
+from master.calibrate.extrinsics.normal import HandProblem, Hands, Normal
+from master.calibrate.extrinsics.tracks import (
+    FINGERS,
+    SEEN,
+    HandTrack,
+    ImuOrientations,
+    ImuTrack,
+    LinesOfSight,
+    Markers,
+)
 from master.calibrate.extrinsics.unknown import (
     CAMERA_IMU,
     CAMERA_LATE,
     FOREARM_IMU,
     GAIN,
     IMU_LATE,
+    OUTLIER_SIGMAS,
     REACH,
     RIG_WORLD,
     SHIFT,
     THICK,
     UNKNOWN,
     ZERO,
+    Fit,
+    StrobeCycles,
     Unknown,
     prior_sigma,
 )
-from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
-from master.estimator.body_points import BodyPoints
+from master.estimator.kinematics import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of
+
+
+def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
+    """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
+    return np.concatenate([wrist_angles_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
+
+
+def bends_by_rotation(R_forearm_palm: Float) -> Float:
+    """Return the derivatives (T, 3, 3) of `wrist_rotation_angles`.
+
+    By a rotation of the palms (T, 3, 3), forearm axes.
+    """
+    here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
+    for k in range(3):
+        difference_step = 1e-5
+        rotated = rotation_vector_to_matrix(difference_step * np.eye(3)[k]) @ R_forearm_palm
+        out[..., k] = (wrist_rotation_angles(rotated) - here) / difference_step
+    return out
+
 
 _TWIST_RAD = np.radians(1.0)
 _WRIST_RAD = np.radians(15.0)
@@ -384,3 +421,42 @@ def _loosest(posture_prior: PosturePrior) -> PosturePrior:
         prior_share * part[-1:] for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant)
     )
     return PosturePrior(normal, pull, constant, posture_prior.log_density[-1:])
+
+
+_COARSE_ROUNDS = (4, 4, 4)  # epochs and steps of a first look
+_ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
+
+
+def fit_extrinsics(
+    lines_of_sight: LinesOfSight,
+    model: HandModel,
+    names: tuple[str, ...],
+    hand: HandTrack,
+    imu: ImuTrack,
+    cycles: StrobeCycles,
+    px_per_m: float,
+    firsts: Sequence[Unknown],
+) -> Fit:
+    """Fit the mounting.
+
+    Args:
+        sights: Forward function of the device.
+        model: The hand.
+        names: Of the markers, in the order of the track's.
+        hand, imu: What was seen of the hand, and felt.
+        cycles: What was seen from the wrist.
+        px_per_m: What a metre at the tips is in the image.
+        firsts: First guesses, of which one is right to some 15 degrees, 15 mm and 20 ms.
+    """
+    # epochs and steps of a first look
+    some = np.unique(np.linspace(0, len(cycles.t_s) - 1, 40).astype(np.int64))
+    coarse = cycles.of(some)
+    best: tuple[float, Unknown] | None = None
+    for first in firsts:
+        problem = Problem(lines_of_sight, model, names, hand, imu, coarse, px_per_m, first)
+        unknown, hands, _ = problem.followed(first, _COARSE_ROUNDS)
+        if best is None or problem.cost(unknown, hands) < best[0]:
+            best = problem.cost(unknown, hands), unknown
+    first = firsts[0] if best is None else best[1]
+    problem = Problem(lines_of_sight, model, names, hand, imu, cycles, px_per_m, first)
+    return problem.result(*problem.followed(first, _ROUNDS))

@@ -1,13 +1,42 @@
-"""Unknowns of a mounting: a point on a manifold, steps on it, and its prior."""
+"""The unknowns of a mounting have a prior, observations and a first guess.
 
-from dataclasses import dataclass
+Unknowns of a mounting: a point on a manifold, steps on it, and its prior.
+
+Observations of a motion from the wrist, and the mounting fitted to them.
+
+Initial guess of a mounting: how the IMU lies, and the clock offsets.
+
+To some degrees and ms.
+
+**Turns.** With a wrist that is about straight the palm's turn is R_rig_palm = R_rig_world R_world_imu R_imu_palm with
+two constant turns. In quaternions the sum of the cosines of half of what is left is bilinear in the two,
+
+    sum_t <q_rig_palm, q_rig_world q_world_imu q_imu_palm> = q_rig_world' M q_imu_palm,
+
+so the first singular vectors of M (4, 4) are the turns, and its singular value is how well the two tracks agree: it
+is greatest where the IMU's clock is right.
+
+**Tips.** Camera and IMU are one body, which is carried by the wrist joint. So where the camera should see a marker on a
+fingertip is given by markers and IMU, however the wrist is bent and fingers are. The camera's clock is right where the
+tips that it sees move as these do.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
-from common.arrays import Float
-from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from common.hand.palmar_surface import SPREAD
+from common.arrays import Bool, Float, Int
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import (
+    cross,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    rigid,
+    rotation_vector_to_matrix,
+)
+from common.hand.skin import SPREAD
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 
 UNKNOWN = 34
 CAMERA_IMU, SHIFT, FOREARM_IMU, RIG_WORLD, ZERO = (slice(3 * k, 3 * k + 3) for k in range(5))
@@ -84,3 +113,195 @@ def prior_sigma() -> Float:
     reach_m = 2e-3
     sigma[THICK], sigma[REACH], sigma[GAIN] = SPREAD, reach_m, gain
     return sigma
+
+
+OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is down-weighted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StrobeCycles:
+    """Observations of the device over T strobe cycles.
+
+    Fingers index ... little; NaN: not seen.
+
+    Attributes:
+        t_s: (T,) stamps [s], rising.
+        laser_m, laser_sigma_m: (T, 4, 2) on the plane, across and along, and standard deviations of the sensing.
+        tip_uv: (T, 4, 2) [px], seen `tip_late_s` later than the laser.
+        tip_sigma_px: (T, 4).
+        tip_late_s: Of the frame that shows the tips.
+    """
+
+    t_s: Float
+    laser_m: Float
+    laser_sigma_m: Float
+    tip_uv: Float
+    tip_sigma_px: Float
+    tip_late_s: float
+
+    def of(self, rows: Int | Bool) -> "StrobeCycles":
+        """Some of them."""
+        return StrobeCycles(
+            self.t_s[rows],
+            self.laser_m[rows],
+            self.laser_sigma_m[rows],
+            self.tip_uv[rows],
+            self.tip_sigma_px[rows],
+            self.tip_late_s,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The most probable mounting.
+
+    Attributes:
+        unknown: It.
+        covariance: (UNKNOWN, UNKNOWN) of steps on it.
+        wrist_angles_rad: (T, 2) flexion and deviation of the wrist in each strobe cycle.
+        twist_rad: (T,) what no wrist does.
+        off: (T, 4, SEEN) seen minus fitted, in standard deviations; NaN: not seen.
+        sigma: (T, 4, SEEN) these [m, px].
+        shown: (T, 4, SEEN) as fitted.
+        marker_m: Rms of what is left at the markers.
+        steps: SensorMessage.
+    """
+
+    unknown: Unknown
+    covariance: Float
+    wrist_angles_rad: Float
+    twist_rad: Float
+    off: Float
+    sigma: Float
+    shown: Float
+    marker_m: float
+    steps: int
+
+    @property
+    def rms(self) -> float:
+        """Return the root mean square of `off`, with outliers clipped at their limit."""
+        return float(np.sqrt(np.nanmean(np.minimum(np.abs(self.off), 2.0 * OUTLIER_SIGMAS) ** 2)))
+
+    @property
+    def outlier_share(self) -> float:
+        """Share of the sights that are farther off than noise explains."""
+        pairs = np.hypot(self.off[..., 0::2], self.off[..., 1::2])
+        return float((pairs > 2.0 * OUTLIER_SIGMAS).sum() / max(np.isfinite(pairs).sum(), 1))
+
+
+_SEARCH_S = np.arange(-0.12, 0.1201, 0.01)
+_FEWEST = 20  # epochs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A first guess.
+
+    Attributes:
+        T_camera_palm: (4, 4) of the rig file.
+        R_palm_imu, R_rig_world: (3, 3).
+        imu_late_s, camera_late_s: How much later the samples, the frames are than their stamps state.
+    """
+
+    T_camera_palm: Float
+    R_palm_imu: Float
+    R_rig_world: Float
+    imu_late_s: float
+    camera_late_s: float
+
+    @property
+    def unknown(self) -> Unknown:
+        """As what is to be fitted."""
+        return Unknown(
+            self.T_camera_palm[:3, :3] @ self.R_palm_imu,
+            self.T_camera_palm[:3, 3],
+            self.R_palm_imu,
+            self.R_rig_world,
+            np.zeros(12),
+            self.camera_late_s,
+            self.imu_late_s,
+            np.zeros(4),
+            np.zeros(4),
+        )
+
+
+def started(
+    hand: HandTrack,
+    tips_m: Float,
+    imu: ImuTrack,
+    optics: CameraModel,
+    T_camera_palm: Float,
+    cycles: StrobeCycles,
+) -> Start | None:
+    """The first guess; None: hand and IMU were hardly seen at the same time.
+
+    Args:
+        hand, imu: What was seen of the hand, and felt.
+        tips_m: (N, 4, 3) the markers on index ... little of the hand's epochs, rig frame; NaN: not seen.
+        optics: The wrist camera.
+        T_camera_palm: (4, 4) first guess of the rig file.
+        cycles: What was seen from the wrist.
+    """
+    best: tuple[float, float, Float, Float] | None = None
+    for late_s in _SEARCH_S.tolist():
+        found = _aligned(hand, imu, late_s)
+        if found is not None and (best is None or found[0] > best[0]):
+            best = (found[0], late_s, found[1], found[2])
+    if best is None:
+        return None
+    start = Start(T_camera_palm, best[3].T, best[2], best[1], 0.0)
+    return replace(start, camera_late_s=_camera_late_s(hand, tips_m, imu, optics, start, cycles))
+
+
+def _aligned(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
+    """Align the hand's and the IMU's orientations for a given latency of the samples.
+
+    Returns how well the tracks agree (1: exactly), R_rig_world and R_imu_palm.
+    """
+    held = imu.held_at(hand.t_s - late_s)
+    known = np.isfinite(held[:, 0, 0])
+    if known.sum() < _FEWEST:
+        return None
+    palm = _continuous(matrix_to_quaternion(hand.T_rig_palm[known, :3, :3]))
+    world = _continuous(matrix_to_quaternion(held[known]))
+    # <p, w q v> over all unit quaternions e_i, e_j in place of w and v.
+    e = np.eye(4)
+    left = _product(e[:, None], world[None])  # (4, T, 4)
+    M = np.einsum("tk,itjk->ij", palm, _product(left[:, :, None], e[None, None])) / len(palm)
+    u, s, vt = np.linalg.svd(M)
+    return float(s[0]), quaternion_to_matrix(u[:, 0]), quaternion_to_matrix(vt[0])
+
+
+def _camera_late_s(
+    hand: HandTrack, tips_m: Float, imu: ImuTrack, optics: CameraModel, first: "Start", cycles: StrobeCycles
+) -> float:
+    """By the correlation of tips that are seen with where markers on them should be."""
+    held = imu.held_at(hand.t_s - first.imu_late_s)
+    R_camera_imu = first.T_camera_palm[:3, :3] @ first.R_palm_imu
+    R = R_camera_imu @ np.swapaxes(first.R_rig_world @ held, 1, 2)  # camera by rig
+    arm = tips_m - hand.T_rig_palm[:, None, :3, 3]
+    expected = optics.project(arm @ np.swapaxes(R, 1, 2) + first.T_camera_palm[:3, 3])
+    agree = np.zeros(len(_SEARCH_S))
+    for f, axis in np.ndindex(tips_m.shape[1], 2):
+        known, seen = np.isfinite(expected[:, f, axis]), np.isfinite(cycles.tip_uv[:, f, axis])
+        if known.sum() < _FEWEST or seen.sum() < _FEWEST:
+            continue
+        at, shown = cycles.t_s[seen] + cycles.tip_late_s, cycles.tip_uv[seen, f, axis]
+        for k, late_s in enumerate(_SEARCH_S.tolist()):
+            off = shown - np.interp(at + late_s, hand.t_s[known], expected[known, f, axis])
+            agree[k] -= float(np.abs(off - np.median(off)).mean())
+    return float(_SEARCH_S[int(agree.argmax())])
+
+
+def _continuous(q: Float) -> Float:
+    """Quaternions (T, 4) with the signs that let each be near the last."""
+    flips = np.sign(np.vecdot(q[1:], q[:-1]))
+    signs = np.multiply.accumulate(np.concatenate([[1.0], np.where(flips == 0.0, 1.0, flips)]))
+    return q * np.asarray(signs, np.float64)[:, None]
+
+
+def _product(p: Float, q: Float) -> Float:
+    """Hamilton's product of quaternions (..., 4)."""
+    w: Float = p[..., :1] * q[..., :1] - np.vecdot(p[..., 1:], q[..., 1:])[..., None]
+    v: Float = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + cross(p[..., 1:], q[..., 1:])
+    return np.asarray(np.concatenate([w, v], axis=-1), np.float64)

@@ -10,16 +10,22 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from common.calibration import HandProfile, load
+from common.command_line import echo
 from common.errors import CalibrationError
-from common.hand.back_markers import with_three_back_markers
+from common.hand.fitting import with_three_back_markers
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile, mirrored_profile, scaled_profile
 from common.hand.routine import ROUTINE_S, STEPS
-from common.terminal import echo
-from master.calibrate.hand.live import observe_live
-from master.calibrate.hand.measure import hand_length_of, measure_hand
+from master.calibrate.hand.measure import (
+    hand_length_of,
+    measure_hand,
+    measured_profile,
+    quick_profile,
+    report_json,
+    report_lines,
+)
 from master.calibrate.hand.observed import read_observed
-from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
+from master.calibrate.hand.session import observe_live
 from master.calibrate.tree_files import load_marker_rig, write_hand
 from master.commands.summary import write_summary
 

@@ -1,4 +1,26 @@
-"""Hand file from a motion capture.
+"""A motion capture yields a hand file: palm, bone lengths and couplings.
+
+Joint couplings of a person's fingers, from a motion capture.
+
+How the joints flex together: the couplings of the hand file.
+
+    DIP = ratio . PIP,  MCP = ratio . PIP        index ... little, least squares through zero, with the weights of Huber
+
+Zero is the straight finger in the palm's plane, which is where profiles from joints have it. Noise of the joints, which
+shows in bones that change their length, turns short bones; it is taken out of the spread. A DIP that keeps its ratio
+to half a degree was not measured: trackers make it from the PIP (the Leap does so). An MCP that is off by more than 25
+degrees has no coupling: people bend it alone as well, and what was done in the recording constrains too little.
+
+Palm in a motion capture: its frame at every epoch, and which hand it is.
+
+Wrist, knuckles and the thumb's root are one rigid body, whose shape is the mean of all frames laid on one another
+(generalised Procrustes analysis; Gower, 1975). The palm frame is that in which this shape lies nearest to the generated
+profile's, scaled: so it is the frame of all our hands, origin at the wrist, +z to the fingers, +y out of the back.
+
+Knuckles and wrist are nearly a plane, and a plane is its own mirror image: which side is the back, and so which hand it
+is, follows from the fingers. They bend into the palm, towards -y.
+
+Hand file from a motion capture.
 
 Bones and hinges from its joints, couplings where it is long enough.
 
@@ -14,23 +36,252 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from common.arrays import Bool, Float
-from common.calibration import HandProfile, Provenance, RestJoint
+from common.arrays import Bool, Float, Int
+from common.calibration import Couplings, HandProfile, Provenance, RestJoint
 from common.errors import FitError
-from common.geometry.transforms import matrix_to_quaternion
-from common.hand.fitting import profile_from_joints
+from common.geometry.transforms import fit_rigid, matrix_to_quaternion
+from common.hand.fitting import joint_angles, profile_from_joints
 from common.hand.model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
-from common.hand.posture import joint_angles
-from common.hand.profiles import generated_profile, joint_frame
-from master.calibrate.hand.measure import hand_length_of
-from master.calibrate.hand.motion_couplings import MotionCouplings, motion_couplings
-from master.calibrate.hand.palm import Palm, find_palm
-from master.calibrate.hand.save import TOOL
+from common.hand.profiles import generated_profile, joint_frame, preset_couplings
+from master.calibrate.hand.measure import TOOL, hand_length_of
 from master.calibrate.tree_files import provenance
 from master.mocap.compare import joint_track
-from master.mocap.joint_motion import JointMotion
+from master.mocap.joint_motion import JointMotion, Side, known
 from master.mocap.read import require
-from master.mocap.track import known
+
+_MOVES_RAD_S = np.radians(10.0)
+_BENT_RAD = np.radians(15.0)  # the PIP, where it determines a ratio
+_RANGE_RAD = np.radians(20.0)  # of the PIP from the 5th to the 95th hundredth, at least
+_MADE_RAD = np.radians(0.5)
+_NO_COUPLING_RAD = np.radians(25.0)
+_ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """One angle against the PIP.
+
+    Attributes:
+        per_pip: The ratio.
+        spread_rad: Standard deviation about it, that of noise taken out; 0: no more than noise.
+        noise_rad: What noise of the joints makes of it.
+    """
+
+    per_pip: float
+    spread_rad: float
+    noise_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class MotionCouplings:
+    """Couplings measured from a motion.
+
+    Attributes:
+        moved_s: How long any PIP moved.
+        dip, mcp: The ratios; None: fingers bend too little.
+        couplings: Those of the default with what was measured; None: nothing was.
+        remarks: What was not taken, and why.
+    """
+
+    moved_s: float
+    dip: Ratio | None
+    mcp: Ratio | None
+    couplings: Couplings | None
+    remarks: tuple[str, ...]
+
+
+def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCouplings:
+    """Couplings from a motion.
+
+    Args:
+        angles_rad: (T, 5, 4) [rad] of `common.hand.fitting.joint_angles`.
+        chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is estimated from bones that change.
+        t_ns: (T,) [ns] times.
+    """
+    angles = angles_rad[:, 1:, 1:]
+    step_s = 1e-9 * np.diff(t_ns)
+    rate = np.abs(np.diff(angles[:, :, 1], axis=0)).max(axis=1) / step_s
+    # longer, two frames are no step
+    moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < 0.1)].sum())
+    low, high = np.percentile(angles[:, :, 1], [5.0, 95.0])
+    # of movement, at least
+    if moved_s < 20.0 or high - low < _RANGE_RAD:
+        why = f"fingers move for {moved_s:.0f} s, and {np.degrees(high - low):.0f}° at the PIP"
+        return MotionCouplings(
+            moved_s, None, None, None, (f"couplings are the default: {why}; 20 s and 20° are needed",)
+        )
+    first, middle, last = _joint_noise(chains_m)
+    dip = _ratio(angles[..., 2], angles[..., 1], (last, middle))
+    mcp = _ratio(angles[..., 0], angles[..., 1], (first, middle))
+    couplings, remarks, taken = preset_couplings("K"), list[str](), False
+    if np.hypot(dip.spread_rad, dip.noise_rad) < _MADE_RAD:
+        remarks.append(
+            f"DIP is {dip.per_pip:.2f} PIP to {np.degrees(dip.spread_rad):.1f}°: its tracker made it so; the default"
+            " stays"
+        )
+    else:
+        couplings, taken = replace(couplings, dip_per_pip=dip.per_pip, dip_spread_rad=dip.spread_rad), True
+    if mcp.spread_rad > _NO_COUPLING_RAD or mcp.per_pip <= 0.0:
+        remarks.append(
+            f"MCP deviates by {np.degrees(mcp.spread_rad):.0f}° from {mcp.per_pip:.2f} PIP: no coupling; the default"
+            " stays"
+        )
+    else:
+        couplings, taken = replace(couplings, mcp_per_pip=mcp.per_pip), True
+    return MotionCouplings(moved_s, dip, mcp, couplings if taken else None, tuple(remarks))
+
+
+def _joint_noise(chains_m: Float) -> tuple[float, float, float]:
+    """Return the standard deviations [rad] of MCP, PIP and DIP by joint noise.
+
+    Mean square over index ... little.
+
+    A bone from a to b of length L turns by the noise across it; b moves both bones at an angle. The noise is that along
+    the bones, whose length does not change in truth, alike in all directions.
+    """
+    length = np.linalg.norm(np.diff(chains_m[:, 1:], axis=2), axis=3)
+    variance = 0.5 * length.var(axis=0).mean(axis=1, keepdims=True)  # of a joint, per axis; (4, 1)
+    inverse = 1.0 / length.mean(axis=0)
+    joined = inverse[:, :-1] ** 2 + (inverse[:, :-1] + inverse[:, 1:]) ** 2 + inverse[:, 1:] ** 2
+    first = np.sqrt((variance * 2.0 * inverse[:, :1] ** 2).mean())
+    middle, last = np.sqrt((variance * joined).mean(axis=0))
+    return float(first), float(middle), float(last)
+
+
+def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
+    """Of angles (T, 4) [rad] to PIPs, where these are bent, and the noise of both."""
+    bent = pip > _BENT_RAD
+    x, y = pip[bent], angle[bent]
+    weight, slope = np.ones(len(x)), 0.0
+    off, spread = np.zeros(len(x)), 0.0
+    for _ in range(_ROUNDS):
+        slope = float((weight * x * y).sum() / (weight * x * x).sum())
+        off = np.asarray(np.abs(y - slope * x), np.float64)
+        spread = max(1.4826 * float(np.median(off)), 1e-6)
+        huber = 1.345
+        weight = np.minimum(1.0, huber * spread / np.maximum(off, 1e-12))
+    outlier = 4.0
+    typical = off < outlier * spread
+    spread = float(np.sqrt((off[typical] ** 2).mean()))
+    noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
+    left = spread * spread - noise * noise
+    least_share = 0.25  # of a variance: less is noise
+    return Ratio(slope, float(np.sqrt(left)) if left > least_share * spread * spread else 0.0, noise)
+
+
+PALM_JOINTS = (WRIST, *CHAINS[:, 0].tolist(), *METACARPALS)
+_SIDES: tuple[Side, Side] = ("right", "left")
+_PALM_ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Palm:
+    """The palm of one hand.
+
+    Attributes:
+        side: right or left.
+        mirrored: Positions were turned over in x first: their axes are left-handed.
+        chains_m: (T, 5, 4, 3) [m] the joints of `CHAINS` in the palm frame.
+        shape_m: (26, 3) [m] the palm's own joints in it; NaN: not in the file, or not of the palm.
+        rms_m: How far the palm's joints are off that shape.
+        outlier: (T,) frames whose palm is none.
+    """
+
+    side: Side
+    mirrored: bool
+    chains_m: Float
+    shape_m: Float
+    rms_m: float
+    outlier: Bool
+
+
+def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
+    """Find the palm frame of joints (T, 26, 3) [m].
+
+    NaN: not seen. Of the given side, or of the side that the joints show.
+
+    Raises:
+        FitError: The palm is never seen whole, or the fingers do not determine which side is the back.
+    """
+    mine = list(PALM_JOINTS)
+    there = [joint for joint in mine if known(joints_m[:, joint]).mean() > 0.5]
+    least_joints = 4
+    if WRIST not in there or len(there) < least_joints:
+        raise FitError(f"{where}: wrist and three knuckles, or more, must be seen in half of the frames")
+    body = joints_m[:, there]
+    whole = np.asarray(known(body).all(axis=1), np.bool_)
+    if whole.sum() < 2:
+        raise FitError(f"{where}: wrist, knuckles and thumb root are never seen together")
+    shape, T_file_shape, distance = _mean_shape(body[whole])
+    outlier = np.zeros(len(joints_m), np.bool_)
+    outlier[~whole] = True
+    # of the median distance of a frame's palm from the shape
+    floor_m = 5e-3  # real palms arch by a millimetre or two
+    outlier[np.flatnonzero(whole)[distance > max(4.0 * float(np.median(distance)), floor_m)]] = True
+    in_shape = np.full_like(joints_m, np.nan)
+    transposed = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
+    moved = joints_m[whole] - T_file_shape[:, None, :3, 3]
+    in_shape[whole] = np.einsum("tij,tkj->tki", transposed, moved)
+    fits: dict[Side, Float] = {one: palm_axes(shape, there, one) for one in _SIDES}
+    shown = _side_shown(in_shape[~outlier], fits, where)
+    wanted = side or shown
+    flip = np.array([-1.0 if wanted != shown else 1.0, 1.0, 1.0])
+    R = palm_axes(shape * flip, there, wanted)
+    local = (in_shape * flip - shape[there.index(WRIST)] * flip) @ R
+    own = np.full((26, 3), np.nan)
+    own[there] = (shape - shape[there.index(WRIST)]) * flip @ R
+    rms = float(np.sqrt((distance[~outlier[whole]] ** 2).mean()))
+    return Palm(wanted, wanted != shown, local[:, CHAINS], own, rms, outlier)
+
+
+def _mean_shape(body_m: Float) -> tuple[Float, Float, Float]:
+    """Return the mean shape (K, 3) of a body's points (T, K, 3).
+
+    Also its poses (T, 4, 4) and the points' distances (T,) from it.
+    """
+    shape = body_m[len(body_m) // 2]
+    T = np.zeros((len(body_m), 4, 4))
+    for _ in range(_PALM_ROUNDS):
+        T = fit_rigid(body_m, np.broadcast_to(shape, body_m.shape))
+        back = np.einsum("tji,tkj->tki", T[:, :3, :3], body_m - T[:, None, :3, 3])
+        shape = np.asarray(np.median(back, axis=0), np.float64)
+    T = fit_rigid(body_m, np.broadcast_to(shape, body_m.shape))
+    back = np.einsum("tji,tkj->tki", T[:, :3, :3], body_m - T[:, None, :3, 3])
+    return shape, T, np.sqrt(((back - shape) ** 2).sum(axis=2).mean(axis=1))
+
+
+def palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
+    """The palm's axes as columns (3, 3), in those of a shape (K, 3) of some joints."""
+    rest = HandModel.of(generated_profile("palm", side)).rest_position_m[joints]
+    size = np.linalg.norm(shape_m - shape_m.mean(axis=0)) / np.linalg.norm(rest - rest.mean(axis=0))
+    return fit_rigid(shape_m, size * rest)[:3, :3]
+
+
+def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
+    """Return the side of the hand whose fingers flex towards -y.
+
+    That is about +x, whatever the knuckles do.
+
+    Raises:
+        FitError: They bend too little, or aside.
+    """
+    chains = in_shape[:, CHAINS[1:]]
+    chains = chains[known(chains).all(axis=(1, 2))]
+    bones = np.diff(chains, axis=2)
+    bones /= np.linalg.norm(bones, axis=3, keepdims=True)
+    normal = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=(0, 1, 2))
+    length = float(np.linalg.norm(normal))
+    along = {side: float(normal @ R[:, 0]) / max(length, 1e-12) for side, R in fits.items()}
+    sure = 0.5  # of the mean axis about which fingers bend, along +x
+    right: list[Side] = [side for side in _SIDES if along[side] > sure]
+    if len(right) != 1:
+        raise FitError(
+            f"{where}: fingers bend about an axis that is {along['right']:+.2f} that of a right hand and"
+            f" {along['left']:+.2f} that of a left one, where +1 is expected of one alone: record fists; if names were"
+            " matched wrongly, give --joints"
+        )
+    return right[0]
+
 
 _NEEDED = tuple(JOINTS[joint] for joint in (WRIST, *CHAINS.ravel().tolist()))
 _BONES = (("metacarpal", "proximal", "distal"), ("proximal", "intermediate", "distal"))

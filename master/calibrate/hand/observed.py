@@ -1,6 +1,16 @@
-"""Observations of a hand during the routine, checked.
+"""Observations of a hand are checked, and aligned in time with the routine.
+
+Observations of a hand during the routine, checked.
 
 Places of its markers over time, from a file of poses.
+
+Temporal alignment of the scripted routine with what was seen.
+
+Answers when the user did what.
+
+Users begin late and vary their pace. So the markers are compared with those of a template hand that does the routine,
+and the two are matched monotonously in time (dynamic time warping: Sakoe & Chiba, 1978). The palm of the template is
+put where the flat hand is: the stretch of stillness whose markers fit the flat template best.
 """
 
 from collections.abc import Sequence
@@ -11,9 +21,10 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import CalibrationError, FitError, RecordingError
+from common.geometry.transforms import fit_rigid, transform
 from common.hand.model import JOINTS, TIPS, HandModel
-from common.hand.routine import ROUTINE_S
-from common.recording.npz import read_npz
+from common.hand.routine import MOVES, ROUTINE_S, STEPS, posture_at
+from common.recording.recorded_files import read_npz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,3 +132,200 @@ def _check_length(t_s: Float) -> None:
             f"markers are seen {len(t_s) / span:.1f} times a second, {fewest_hz:.0f} are needed: the cameras lose the"
             " hand most of the time, or run too slowly"
         )
+
+
+GRID_S = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The routine laid over the observations.
+
+    Attributes:
+        T_rig_palm: (4, 4) of the flat hand.
+        time_s: (N,) grid of observed times [s].
+        script_s: (N,) where in the routine the user was.
+        cost_m: Root mean square distance between the markers and the template's.
+    """
+
+    T_rig_palm: Float
+    time_s: Float
+    script_s: Float
+    cost_m: float
+
+    def at(self, t_s: Float) -> Float:
+        """Routine times of observed times (N,) [s]."""
+        return np.interp(t_s, self.time_s, self.script_s)
+
+
+def align(observed: Observed, model: HandModel) -> Alignment:
+    """Lay the routine over what was seen of a hand.
+
+    Raises:
+        FitError: No moment of stillness with four finger tips and more.
+    """
+    time_s, points = _gridded(observed)
+    script = np.arange(0.0, ROUTINE_S + 0.5 * GRID_S, GRID_S)
+    angles = np.array([posture_angles(t) for t in script])
+    hands = model.forward(np.broadcast_to(np.eye(4), (len(script), 4, 4)), angles)
+    template = model.marker_points(hands, observed.names)
+    tried = [_warped(pose, time_s, points, script, template) for pose in _flat_poses(points, template[0])]
+    return min(tried, key=lambda alignment: alignment.cost_m)
+
+
+def posture_angles(script_s: float) -> Float:
+    """Angles (5, 4) [rad] that the routine asks for."""
+    posture = np.radians(posture_at(script_s))
+    dip_per_pip = 0.75
+    return np.column_stack([posture, dip_per_pip * posture[:, 2]])
+
+
+def flat_scale(observed: Observed, model: HandModel) -> float:
+    """How much larger the hand is than the template, by the markers of the flat hand.
+
+    Raises:
+        FitError: As `align`.
+    """
+    _, points = _gridded(observed)
+    flat = model.marker_points(model.forward(np.eye(4), posture_angles(0.0)), observed.names)
+    best: list[tuple[float, float]] = []
+    for window in _still(points):
+        seen = np.isfinite(window[:, 0])
+        a, b = window[seen] - window[seen].mean(axis=0), flat[seen] - flat[seen].mean(axis=0)
+        scale = float(np.sqrt((a**2).sum() / (b**2).sum()))
+        off = window[seen] - transform(fit_rigid(window[seen], scale * flat[seen]), scale * flat[seen])
+        best.append((float((off**2).mean()), scale))
+    return min(best)[1]
+
+
+def missing_steps(observed: Observed, alignment: Alignment, model: HandModel) -> list[str]:
+    """What was not done, or not seen: one line for each step and finger concerned."""
+    script = alignment.at(observed.t_s)
+    lines: list[str] = []
+    flat = observed.points_m[script <= MOVES[0].stop_s]
+    if not len(flat):
+        return ["flat: not seen"]
+    home = np.array([_median(flat[:, f]) for f in range(5)])
+    asked = _reach(model)
+    for number, step in enumerate(STEPS):
+        inside = (script > _start(number)) & (script <= _stop(number))
+        for f, finger in enumerate(observed.names[:5]):
+            if asked[number, f] < 0.02:
+                continue
+            track = observed.points_m[inside, f]
+            seen = np.isfinite(track[:, 0])
+            if seen.sum() < 0.5 * max(len(track), 1) or not len(track):
+                lines.append(
+                    f"{step.name}: the marker {finger!r} is seen in {100 * seen.mean() if len(seen) else 0:.0f} % of it"
+                )
+                continue
+            reach = float(np.linalg.norm(track[seen] - home[f], axis=1).max())
+            if not reach > 0.4 * asked[number, f]:
+                lines.append(
+                    f"{step.name}: the marker {finger!r} moved by {1e3 * reach:.0f} mm, about"
+                    f" {1e3 * asked[number, f]:.0f} mm are asked for"
+                )
+    return lines
+
+
+def _start(step: int) -> float:
+    return next(move.start_s for move in MOVES if move.step == step)
+
+
+def _stop(step: int) -> float:
+    return max(move.stop_s for move in MOVES if move.step == step)
+
+
+def _reach(model: HandModel) -> Float:
+    """(steps, 5) [m] by how much each tip is to move away from the flat hand."""
+
+    def tips(script_s: float) -> Float:
+        return model.forward(np.eye(4), posture_angles(script_s)).position_m[TIPS]
+
+    home = tips(0.0)
+    out = np.zeros((len(STEPS), 5))
+    for move in MOVES:
+        away = np.linalg.norm(tips(move.stop_s - 1e-6) - home, axis=1)
+        out[move.step] = np.maximum(out[move.step], away)
+    return out
+
+
+def _median(points: Float) -> Float:
+    seen = points[np.isfinite(points[:, 0])]
+    return np.median(seen, axis=0) if len(seen) else np.full(3, np.nan)
+
+
+def _gridded(observed: Observed) -> tuple[Float, Float]:
+    """Times (N,) and mean places (N, M, 3) of the markers around them; NaN: not seen."""
+    t = observed.t_s
+    grid = np.arange(t[0], t[-1], GRID_S)
+    cell = np.minimum(((t - t[0]) / GRID_S).astype(np.int64), len(grid) - 1)
+    seen = np.isfinite(observed.points_m[..., 0])
+    total = np.zeros((len(grid), *observed.points_m.shape[1:]))
+    count = np.zeros((len(grid), len(observed.names)))
+    np.add.at(total, cell, np.nan_to_num(observed.points_m))
+    np.add.at(count, cell, seen)
+    with np.errstate(invalid="ignore"):
+        return grid + 0.5 * GRID_S, total / count[..., None]
+
+
+def _still(points: Float) -> list[Float]:
+    """Return the mean places (M, 3) of every still stretch.
+
+    All that is seen rests there; four tips at least.
+    """
+    still_s, still_m = 0.4, 4e-3
+    length = round(still_s / GRID_S)
+    out: list[Float] = []
+    for start in range(0, len(points) - length, 2):
+        window = points[start : start + length]
+        seen = np.asarray(np.isfinite(window[..., 0]).all(axis=0), np.bool_)
+        if seen[:5].sum() >= 4 and np.ptp(window[:, seen], axis=0).max() < still_m:
+            out.append(np.where(seen[:, None], window.mean(axis=0), np.nan))
+    if not out:
+        raise FitError(
+            "no moment in which the hand is still and four finger tips are seen: begin with the flat hand, held still"
+            " for a second, where all cameras see its tips"
+        )
+    return out
+
+
+def _flat_poses(points: Float, flat: Float) -> list[Float]:
+    """Palm poses (4, 4) of the flattest stretches, the best first."""
+    poses: list[tuple[float, int, Float]] = []
+    for number, window in enumerate(_still(points)):
+        seen = np.isfinite(window[:, 0])
+        pose = fit_rigid(window[seen], flat[seen])
+        off = window[seen] - transform(pose, flat[seen])
+        poses.append((float((off**2).mean()), number, pose))
+    tried = 4  # stretches of stillness
+    return [pose for _, _, pose in sorted(poses, key=lambda entry: entry[:2])[:tried]]
+
+
+def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: Float) -> Alignment:
+    """Find the cheapest path through the table of observed and scripted distances.
+
+    N observed and S scripted epochs.
+    """
+    asked = transform(pose, template)
+    square = ((points[:, None] - asked[None]) ** 2).sum(axis=-1)  # (N, S, M)
+    seen = np.isfinite(square)
+    far_m = 0.08  # farther off than this carries no more information
+    near = np.where(seen, np.minimum(square, far_m**2), 0.0)
+    cost = near.sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
+    count = len(script)
+    total = np.where(np.arange(count) == 0, cost[0], np.inf)
+    came = np.zeros((len(time_s), count), np.int64)
+    for i in range(1, len(time_s)):
+        tempo = 3  # the user's fastest, times the routine's
+        ways = np.full((tempo + 1, count), np.inf)
+        for k in range(tempo + 1):
+            step_cost = 1e-5  # [m^2] of leaving the routine's tempo
+            ways[k, k:] = total[: count - k] + step_cost * abs(k - 1)
+        came[i] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + cost[i]
+    way = np.empty(len(time_s), np.int64)
+    way[-1] = count - 1
+    for i in range(len(time_s) - 1, 0, -1):
+        way[i - 1] = way[i] - came[i, way[i]]
+    return Alignment(pose, time_s, script[way], float(np.sqrt(total[-1] / len(time_s))))

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.errors import RecordingError
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 

@@ -1,8 +1,12 @@
-"""Guided hand routine with a person.
+"""A session guides a person through the hand routine on a running master.
+
+Guided hand routine with a person.
 
 Steps are announced one by one, and a step whose markers were not seen is repeated.
 
 What was seen in a step that is done again is dropped and its time taken out, so that the rest is one routine.
+
+The routine with the master that runs: opens the bus and a person's terminal.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,10 +15,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from common.arrays import Float, Int
-from common.clock import Clock
-from common.errors import FitError
+from common.clock import Clock, SystemClock
+from common.command_line import echo
+from common.errors import CalibrationError, FitError
+from common.hand.model import HandModel
 from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
+from master.calibrate.hand.observed import Observed, marker_rows
+from master.run.process import join_bus
 
 Receive = Callable[[float], HandPose | None]
 
@@ -114,3 +122,39 @@ def _during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
         if pose is not None:
             poses.append(pose)
     return poses
+
+
+def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed:
+    """Lead the user through the routine.
+
+    Args:
+        bus: Endpoint of the running master's bus.
+        names: The rig's markers.
+        model: The hand to begin with.
+
+    Raises:
+        BusError: Nobody listens there.
+        CalibrationError: The master's poses have other markers.
+        FitError: The routine was not seen.
+    """
+    tips = marker_rows(names, model)[:5]
+    link = join_bus(bus)
+    try:
+        depth = 256  # poses that may wait while a line is printed
+        poses = link.subscribe("hand", depth=depth)
+
+        def receive(timeout_s: float) -> HandPose | None:
+            message = poses.get(timeout_s)
+            if message is None or not isinstance(message, HandPose):
+                return None
+            if len(message.markers_raw_m) != len(names):
+                raise CalibrationError(
+                    f"the running master has {len(message.markers_raw_m)} markers, the rig {len(names)}: name its"
+                    " rig with --rig"
+                )
+            return message
+
+        track = guide(receive, tips, names, SystemClock(), echo)
+    finally:
+        link.close()
+    return Observed.of(*track.arrays(), names, model)

@@ -1,11 +1,16 @@
-"""Printable box of tags to cut out and fold.
+"""The command `phalanx calibrate cube` draws a box of tags to cut and fold.
+
+Printable box of tags to cut out and fold.
 
 Its five faces as one net at true scale, and the file of the object.
 
 The top is in the middle of the net and the four sides stand about it, each with its upper edge at the top. The frame
 of the object is in the middle of the box: x to the right and y up on the top as it is printed, z out of it.
+
+`phalanx calibrate cube`: a box of tags to print and fold, and its object file.
 """
 
+from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +21,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from common.arrays import Float
+from common.calibration import save
+from common.calibration.files import Matrix4, replacing
 from common.calibration.object_profile import BoxShape, ObjectProfile, Tag, TagFamily, Tags
-from common.calibration.parts import Matrix4
-from common.calibration.replacing import replacing
+from common.command_line import UsageError, echo
 from common.errors import CalibrationError
 from common.geometry.tag_family import GRIDS, tag_image
 from common.geometry.transforms import rigid
@@ -152,3 +158,16 @@ def print_box(path: Path, box: TagBox) -> None:
 def _rows(T: Float) -> Matrix4:
     a, b, c, d = ((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T + 0.0)
     return a, b, c, d
+
+
+def cube(options: Namespace) -> None:
+    """Draw the net of a box of tags at true scale and write objects/<name>.json."""
+
+    box = TagBox(options.name, options.family, options.first, 1e-3 * options.side_mm, 1e-3 * options.edge_mm)
+    path = options.calibration / "objects" / f"{options.name}.json"
+    if path.exists():
+        raise UsageError(f"--name {options.name}: {path} is there already, which is not overwritten")
+    path.parent.mkdir(exist_ok=True)
+    print_box(options.out, box)
+    save(path, box.profile())
+    echo(f"wrote {options.out} and {path}. Print it at 100 % and measure the ruler: 100 mm")

@@ -1,6 +1,10 @@
-"""Guided object motion with a person.
+"""A session guides a person through the object motion on a running master.
+
+Guided object motion with a person.
 
 Every second reports what is seen and what is still missing, until it is enough.
+
+The guided motion with the master that runs: opens its bus.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,12 +12,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from common.calibration import RigCalibration
-from common.clock import Clock
+from common.clock import Clock, SystemClock
 from common.errors import FitError
 from common.messages import HandPose
-from master.calibrate.object.bundle import first_body, usable
+from master.calibrate.object.bundle import Seen, first_body, seen_in, usable
 from master.calibrate.object.measure import ENOUGH, ENOUGH_LOOKS, MOTION, looks_of
-from master.calibrate.object.seen import Seen, seen_in
+from master.run.process import join_bus
 
 Receive = Callable[[float], HandPose | None]
 
@@ -37,7 +41,7 @@ def guide(
         longest_s: How long the motion may take [s].
 
     Raises:
-        CalibrationError: As `master.calibrate.object.seen.seen_in`.
+        CalibrationError: As `master.calibrate.object.bundle.seen_in`.
         FitError: No pose came.
     """
     poses = list[HandPose]()
@@ -90,3 +94,35 @@ def progress(seen: Seen) -> tuple[str, bool]:
     else:
         hint = "go on like this"
     return f"{100 * share:3.0f} %  {whole} epochs, {looks} ways of turning and places. {hint}", share >= 1.0
+
+
+def observe_live(
+    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
+) -> Seen:
+    """Lead the user through the motion.
+
+    Args:
+        bus: Endpoint of the running master's bus.
+        rig: That it runs.
+        names: Of the beads.
+        longest_s: How long the motion may take [s].
+        notify: Called with one line at a time.
+
+    Raises:
+        BusError: Nobody listens there.
+        CalibrationError: The master runs another rig.
+        FitError: No pose came.
+    """
+    link = join_bus(bus)
+    try:
+        depth = 512  # poses that may wait while a line is printed
+        poses = link.subscribe("hand", depth=depth)
+
+        def receive(timeout_s: float) -> HandPose | None:
+            message = poses.get(timeout_s)
+            # A wrist device alone reports hands without markers.
+            return message if isinstance(message, HandPose) and len(message.markers_raw_m) else None
+
+        return guide(receive, rig, names, SystemClock(), notify, longest_s)
+    finally:
+        link.close()

@@ -1,21 +1,128 @@
-"""`phalanx calibrate tracker`: registration of a tracking system to the rig.
+"""The command `calibrate tracker` reads a motion and writes a registration.
+
+What a registration is made from, and what comes of it, as files.
+
+`phalanx calibrate tracker`: registration of a tracking system to the rig.
 
 Also of its device on an object.
 """
 
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from msgspec.structs import replace
 
-from common.calibration import load
+from common.arrays import Float
+from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
-from common.errors import CalibrationError, FitError
-from common.terminal import echo
-from master.calibrate.tracker.registration import Registration, register
-from master.calibrate.tracker.save import read_motion, write_motion, write_registration
-from master.calibrate.tree_files import load_marker_rig
+from common.command_line import echo
+from common.errors import CalibrationError, FitError, RecordingError
+from common.messages import ObjectPose, ObjectSource, TrackerPose
+from common.recording.recorded_files import read_npz, write_npz
+from master.calibrate.tracker.registration import Registration, documented, register
+from master.calibrate.tree_files import load_marker_rig, rig_in_tree, write_rig
 from master.commands.summary import write_summary
+
+_KEYS = {"t_ns": (), "position_m": (3,), "orientation_wxyz": (4,)}
+_FIX = "it needs t_ns, position_m and orientation_wxyz, each with object_ and tracker_ before it (docs/tracker.md)"
+
+
+def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> None:
+    """Save the cameras' and the tracker's poses of a motion as an .npz file.
+
+    `read_motion` reads it.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    own = [one for one in objects if one.tracked]
+    arrays = {
+        "object_t_ns": np.array([one.t_ns for one in own], np.int64),
+        "object_position_m": np.array([one.position_m for one in own]).reshape(-1, 3),
+        "object_orientation_wxyz": np.array([one.orientation_wxyz for one in own]).reshape(-1, 4),
+        "object_cov": np.array([one.cov for one in own]).reshape(-1, 6, 6),
+        "object_source": np.array([one.source for one in own], np.uint8),
+        "tracker_t_ns": np.array([one.t_ns for one in tracked], np.int64),
+        "tracker_position_m": np.array([one.position_m for one in tracked]).reshape(-1, 3),
+        "tracker_orientation_wxyz": np.array([one.orientation_wxyz for one in tracked]).reshape(-1, 4),
+    }
+    try:
+        write_npz(path, arrays)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], list[TrackerPose]]:
+    """Read the poses of one object from cameras and tracker, both on one clock.
+
+    NaN: not seen, lost.
+
+    Raises:
+        RecordingError: The file is missing or broken, or lacks a key; the text states which.
+    """
+    names = [f"{who}_{key}" for who in ("object", "tracker") for key in _KEYS]
+    arrays = read_npz(path, names, _FIX, also=("object_cov", "object_source"))
+    sizes = {who: _checked(path, arrays, who) for who in ("object", "tracker")}
+    cov = arrays.get("object_cov", np.full((sizes["object"], 6, 6), np.nan))
+    source = arrays.get("object_source", np.full(sizes["object"], ObjectSource.TAGS))
+    if cov.shape != (sizes["object"], 6, 6) or source.shape != (sizes["object"],):
+        raise RecordingError(f"{path}: object_cov, object_source: not one for each of object_t_ns")
+    try:
+        objects = [
+            ObjectPose(
+                profile.name, int(t), p, q, c, float("nan"), int(s), bool(np.isfinite(p).all()), 1, 1, False
+            )
+            for t, p, q, c, s in zip(*(arrays[f"object_{key}"] for key in _KEYS), cov, source, strict=True)
+        ]
+        name = profile.tracker or profile.name
+        tracked = [
+            TrackerPose(name, 0, k, int(t), p, q)
+            for k, (t, p, q) in enumerate(zip(*(arrays[f"tracker_{key}"] for key in _KEYS), strict=True))
+        ]
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    return objects, tracked
+
+
+def _checked(path: Path, arrays: dict[str, Float], who: str) -> int:
+    """How many poses; all keys have as many.
+
+    Raises:
+        RecordingError: They have not, or are no numbers.
+    """
+    count = len(arrays[f"{who}_t_ns"]) if arrays[f"{who}_t_ns"].ndim == 1 else -1
+    for key, shape in _KEYS.items():
+        array = arrays[f"{who}_{key}"]
+        if array.shape != (count, *shape) or array.dtype.kind not in "fiu":
+            raise RecordingError(f"{path}: {who}_{key}: shape {array.shape}, {_FIX}")
+    return count
+
+
+def write_registration(
+    out: Path, rig_name: str, rig: RigCalibration, profile: ObjectProfile, found: Registration, source: str
+) -> tuple[Path, Path]:
+    """Write rigs/<rig_name>.json and objects/<object>.json of the tree `out`.
+
+    Returns their paths.
+
+    The files there are kept but for the new keys: T_rig_tracking; T_object_tracker, stamp_offset_us.
+
+    Raises:
+        CalibrationError: A file there is broken or cannot be written, or is of other cameras.
+    """
+    path = out / "objects" / f"{profile.name}.json"
+    base = load(path, ObjectProfile) if path.exists() else profile
+    base = replace(base, tracker=profile.tracker)
+    new_rig, new_object = documented(rig_in_tree(out, rig_name, rig), base, found, source)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
+    written = write_rig(out, rig_name, new_rig)
+    save(path, new_object)
+    return written, path
 
 
 def tracker(options: Namespace) -> None:
@@ -25,7 +132,7 @@ def tracker(options: Namespace) -> None:
     used = load_marker_rig(options.calibration, options.rig)
     profile = profile_of(options.calibration, options.name, options.device)
     if options.motion is None:
-        from master.calibrate.tracker.live import observe_live
+        from master.calibrate.tracker.session import observe_live
 
         session = observe_live(options.bus, profile, options.seconds, echo)
         objects, tracked, source = session.objects, session.tracked, "live"
@@ -42,7 +149,7 @@ def tracker(options: Namespace) -> None:
     for line in found.report:
         echo(line)
     if options.picture is not None:
-        from master.calibrate.tracker.picture import draw_registration  # matplotlib takes a second to import
+        from master.calibrate.picture import draw_registration
 
         draw_registration(options.picture, found)
         echo(f"drew {options.picture}")

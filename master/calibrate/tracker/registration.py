@@ -19,12 +19,16 @@ from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.messages import ObjectPose, TrackerPose
-from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.tracker.coverage import Coverage, coverage_of
-from master.calibrate.tracker.fit import Fit, fit_registration, late_sigma_s, sigma_at
-from master.calibrate.tracker.start import first_lag, first_places
-from master.calibrate.tracker.tracks import object_track, shared_epochs, tracker_track
-from master.calibrate.tree_files import provenance
+from master.calibrate.tracker.fit import (
+    Fit,
+    first_lag,
+    first_places,
+    fit_registration,
+    late_sigma_s,
+    sigma_at,
+)
+from master.calibrate.tracker.tracks import Coverage, coverage_of, object_track, shared_epochs, tracker_track
+from master.calibrate.tree_files import matrix_of, provenance
 
 TOOL = "calibrate tracker"
 MOTION = (

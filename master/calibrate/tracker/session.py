@@ -1,21 +1,26 @@
-"""Guided tracker motion with a person.
+"""A session guides a person through the tracker motion on a running master.
+
+Guided tracker motion with a person.
 
 Every second reports what was seen so far and what is still missing.
 
 The machine that counts is `Session`; `guide` gives it what comes and talks.
+
+The guided motion with the master that runs: opens its bus.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from common.clock import Clock
+from common.calibration.object_profile import ObjectProfile
+from common.clock import Clock, SystemClock
 from common.errors import FitError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from master.calibrate.tracker.coverage import Coverage, coverage_of
+from master.calibrate.tracker.fit import first_lag
 from master.calibrate.tracker.registration import MOTION
-from master.calibrate.tracker.start import first_lag
-from master.calibrate.tracker.tracks import object_track, tracker_track
+from master.calibrate.tracker.tracks import Coverage, coverage_of, object_track, tracker_track
+from master.run.process import join_bus
 
 SILENT_S = 3.0
 
@@ -117,3 +122,33 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
 
 def _recent(t_ns: list[int], now_ns: int) -> bool:
     return bool(t_ns) and now_ns - t_ns[0] < SILENT_S * 1e9
+
+
+def observe_live(
+    bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
+) -> Session:
+    """Lead the user through the motion.
+
+    Args:
+        bus: Endpoint of the running master's bus.
+        profile: The object; it has a tracker.
+        longest_s: How long the motion may take [s].
+        notify: Called with one line at a time.
+
+    Raises:
+        BusError: Nobody listens there.
+        FitError: Nothing was received from the cameras or the tracker.
+    """
+    link = join_bus(bus)
+    try:
+        depth = 1024  # poses that may wait while a line is printed
+        objects = link.subscribe("object", profile.name, depth)
+        devices = link.subscribe("device", profile.tracker or profile.name, depth)
+
+        def receive(timeout_s: float) -> ObjectPose | TrackerPose | None:
+            message = objects.get(0.0) or devices.get(timeout_s)
+            return message if isinstance(message, ObjectPose | TrackerPose) else None
+
+        return guide(receive, SystemClock(), notify, longest_s)
+    finally:
+        link.close()

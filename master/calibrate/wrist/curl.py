@@ -1,17 +1,38 @@
-"""Line of each finger's laser point, from a guided curl.
+"""The command `wrist curl` fits the line of each finger's laser point.
+
+Line of each finger's laser point, from a guided curl.
 
 Outliers are rejected, then the principal axis is taken.
+
+Observations of a curling hand by a slave.
+
+Laser points on their plane and fingertips, strobe cycle by strobe cycle.
+
+`phalanx calibrate wrist curl`: the line of each finger's laser point.
+
+Along which line the point moves, and how far.
 """
 
+from argparse import Namespace
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Bool, Float
-from common.calibration.wrist import FingerLine
+from common.calibration import RigCalibration
+from common.calibration.rig import FingerLine
+from common.command_line import echo
 from common.errors import FitError
+from common.geometry.transforms import intersect_plane
 from common.hand.model import FINGERS
-from master.estimator.finger_lines import principal_line
+from common.hand.wrist import laser_plane_of
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
+from master.commands.summary import write_summary
+from master.estimator.priors import principal_line
+from master.replay.recorded import recorded_cycles
 
 MIN_POINTS = 20  # two thirds of a second of strobe cycles
 
@@ -100,3 +121,106 @@ def _together(points: Float) -> Bool:
     low, high = np.quantile(along[near[:, best]], [0.01, 0.99])
     alone_m = 3e-3  # beyond all but one per cent of the points along the line
     return near[:, best] & (along > low - alone_m) & (along < high + alone_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curled:
+    """Observations of T strobe cycles, fingers thumb ... little.
+
+    NaN: not seen.
+
+    Attributes:
+        laser_m: (T, 5, 3) [m] on the laser plane, camera frame.
+        tip_uv: (T, 5, 2) [px].
+    """
+
+    laser_m: Float
+    tip_uv: Float
+
+
+def read_curled(detections: Path, device: Device) -> Curled:
+    """Read the strobe cycles of detections_<camera>.npz.
+
+    The laser points are put on the plane of the device.
+
+    Raises:
+        RecordingError: The file is missing or broken.
+        CalibrationError: The rig has no laser plane yet, or one that crosses no finger.
+    """
+    normal, offset_m = laser_plane_of(device.rig, f"rig {device.file_name!r}")
+    cycles = list(recorded_cycles(detections, device.camera.name))
+    uv = np.array([cycle.laser_uv for cycle in cycles]).reshape(-1, 5, 2)
+    tips = np.array([cycle.tip_uv for cycle in cycles]).reshape(-1, 5, 2)
+    points = intersect_plane(np.zeros(3), device.optics.ray(uv), normal, offset_m)
+    return Curled(points, tips)
+
+
+def curl(options: Namespace) -> None:
+    """Measure along which line the laser point of each finger moves.
+
+    From a guided curl of ten seconds.
+    """
+    device = device_of(options.recording, options.rig, options.calibration, options.out)
+    seen = read_curled(options.detections, device)
+    try:
+        curls = fit_curls(seen.laser_m)
+    except FitError as error:
+        raise FitError(f"{options.recording}: {error}") from error
+    print_line(report_lines(curls))
+    if options.picture is not None:
+        from master.calibrate.picture import draw_curls
+
+        draw_curls(options.picture, curls)
+        echo(f"drew {options.picture}")
+    summary = ", ".join(found.finger for found in curls if found.line is not None)
+    written = write_device(options.out, device, rig_with_lines(device, curls), f"finger_lines of {summary}")
+    if options.json_file is not None:
+        write_summary(
+            options.json_file,
+            {
+                "fingers": {found.finger: _json_of(found) for found in curls},
+                "written": None if written is None else str(written),
+            },
+        )
+
+
+def report_lines(curls: tuple[FingerCurl, ...]) -> list[str]:
+    """The table for a person."""
+    lines = [f"{'finger':8} {'points':>6} {'left out':>8} {'range mm':>8} {'residual mm':>11}"]
+    for found in curls:
+        left = found.seen - len(found.points_m)
+        text = f"{found.finger:8} {len(found.points_m):6} {left:8}"
+        if found.line is None:
+            lines.append(f"{text}  left out: {found.reason}")
+        else:
+            lines.append(f"{text} {1e3 * found.line.range_m[1]:8.1f} {1e3 * found.line.residual_m:11.2f}")
+    return lines
+
+
+def rig_with_lines(device: Device, curls: tuple[FingerCurl, ...]) -> RigCalibration:
+    """The device's rig with the new lines and where they come from."""
+    lines: dict[str, FingerLine] = {}
+    residual: dict[str, float] = {}
+    for found in curls:
+        if found.line is not None:
+            lines[found.finger] = found.line
+            residual[f"{found.finger}_mm"] = round(1e3 * found.line.residual_m, 4)
+    missing = [found.finger for found in curls if found.line is None]
+    note = f"not measured: {', '.join(missing)}" if missing else ""
+    how = provenance("calibrate wrist curl", (device.source,), residual, note)
+    rig = device.rig
+    return replace(
+        rig, finger_lines=rig.finger_lines | lines, provenance=rig.provenance | {"finger_lines": how}
+    )
+
+
+def _json_of(found: FingerCurl) -> dict[str, object]:
+    summary: dict[str, object] = {"points": len(found.points_m), "seen": found.seen}
+    if found.line is None:
+        return summary | {"refused": found.reason}
+    return summary | {
+        "range_mm": round(1e3 * found.line.range_m[1], 4),
+        "residual_mm": round(1e3 * found.line.residual_m, 4),
+        "origin_m": list(found.line.origin_m),
+        "direction": list(found.line.direction),
+    }

@@ -11,18 +11,23 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration
+from common.command_line import echo
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.recording.frame_recording import Illumination
-from common.terminal import echo
-from master.calibrate.cameras.boards import Board
-from master.calibrate.cameras.options import board_of
+from master.calibrate.cameras.boards import Board, board_of
 from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.board_pose import board_pose
-from master.calibrate.wrist.device import Device, device_of, print_line, write_device
-from master.calibrate.wrist.line import line_on_board
-from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
-from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
+from master.calibrate.wrist.device import (
+    Device,
+    LitView,
+    board_pose,
+    device_of,
+    grouped_by_reason,
+    lit_views,
+    print_line,
+    write_device,
+)
+from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane, line_on_board
 from master.commands.summary import write_summary
 
 
@@ -53,7 +58,7 @@ def laser_plane(options: Namespace) -> None:
         raise FitError(f"{options.source}: {error}{reasons}") from error
     print_line(report_lines(fit, seen, len(views)))
     if options.picture is not None:
-        from master.calibrate.wrist.picture import draw_plane  # matplotlib takes a second to import
+        from master.calibrate.picture import draw_plane
 
         draw_plane(options.picture, fit, seen.lines, device.optics)
         echo(f"drew {options.picture}")

@@ -5,7 +5,7 @@ For a hand of which little is known.
 Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
 and how long. Unknown in each strobe cycle are three angles per finger; the DIP follows the PIP. What is seen are the
 laser point on its plane and the fingertip. Both are made as the master does (`master.calibrate.laser_intersection`,
-`common.hand.fingertips`), so that what is fitted is what will be used.
+`common.hand.model`), so that what is fitted is what will be used.
 """
 
 from dataclasses import dataclass
@@ -17,12 +17,11 @@ from msgspec.structs import replace
 from common.arrays import Float
 from common.calibration import Finger, HandProfile
 from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
-from common.hand.fingertips import Fingertips
-from common.hand.model import CHAINS, JOINTS, Chains, HandModel
-from common.hand.palmar_surface import PalmarSurface
+from common.hand.model import CHAINS, JOINTS, Chains, Fingertips, HandModel
+from common.hand.skin import PalmarSurface
 from master.calibrate.laser_intersection import LaserIntersection
-from master.estimator.flexion_synergy import DIP, FlexionSynergy
-from master.estimator.laser_plane import PlaneAxes
+from master.estimator.priors import DIP, FlexionSynergy
+from master.estimator.sensors import PlaneAxes
 from master.rig.wrist import WristSetup
 
 FINGERS = slice(1, 5)

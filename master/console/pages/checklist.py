@@ -6,7 +6,7 @@ Otherwise it states that all is well.
 from nicegui import ui
 
 from common.messages import CheckItem, Checklist
-from master.console.labels import readable
+from master.console.controls import readable
 from master.console.state import ConsoleState
 
 

@@ -13,7 +13,7 @@ from common.calibration import load
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.errors import CalibrationError, PhalanxError
 from common.messages import Gesture
-from master.console.labels import gesture_line, readable
+from master.console.controls import gesture_line, readable
 from master.console.state import ConsoleState
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")

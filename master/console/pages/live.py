@@ -8,8 +8,15 @@ from html import escape
 from nicegui import ui
 
 from common.messages import HandPose
-from master.console.elements import CameraView, HandBox
-from master.console.labels import gesture_lines, hand_line, joint_states, object_line, readable
+from master.console.controls import (
+    CameraView,
+    HandBox,
+    gesture_lines,
+    hand_line,
+    joint_states,
+    object_line,
+    readable,
+)
 from master.console.state import ConsoleState
 
 _UPDATE_S = 0.5

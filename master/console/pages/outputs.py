@@ -1,11 +1,236 @@
-"""The page Outputs: what goes to other programs, and recordings."""
+"""Page Outputs shows what goes to other programs, and recordings.
 
-from nicegui import ui
+Settings of the live outputs, and the process that follows them.
 
-from master.console.output_panel import output_panel
+The page changes the settings. All of it blocks.
+
+Live outputs on the page.
+
+For each output they show a switch and the address, whether it is open, and what it sent.
+
+The page Outputs: what goes to other programs, and recordings.
+"""
+
+import asyncio
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, get_args, get_origin
+
+import msgspec
+from nicegui import background_tasks, ui
+
+from common.calibration import parse, save
+from common.calibration.output_settings import OutputPart, OutputSettings
+from common.errors import PhalanxError
+from common.messages import Health
 from master.console.play_panel import play_panel
 from master.console.recording_panel import recording_panel
 from master.console.state import ConsoleState
+from master.outputs.network.outputs import OUTPUTS, switched_on
+from master.outputs.network.sender import NAME, settings_of
+
+PROCESS = "send"
+
+
+def outputs_path(state: ConsoleState) -> Path:
+    """The settings file that the page edits."""
+    return state.settings.calibration / "outputs" / "default.json"
+
+
+def read_outputs(state: ConsoleState) -> OutputSettings:
+    """The settings as they are now.
+
+    Raises:
+        CalibrationError: The file is broken.
+    """
+    return settings_of(outputs_path(state))
+
+
+def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> OutputSettings:
+    """Change one output in the settings file, whole or not at all.
+
+    The process runs while any output is on.
+
+    Raises:
+        CalibrationError: The file is broken or read-only, or a value is none; the text names the key.
+        PhalanxError: The process cannot be started.
+    """
+    path = outputs_path(state)
+    settings = settings_of(path)
+    part: OutputPart = OUTPUTS[name].part(settings)
+    new_part = msgspec.structs.replace(part, **change)
+    new = msgspec.structs.replace(settings, **{name: new_part})
+    new = parse(msgspec.json.encode(new), OutputSettings, f"{path}: {name}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(path, new)
+    follow(state, new)
+    return new
+
+
+def follow(state: ConsoleState, settings: OutputSettings) -> None:
+    """Run the output process exactly while some output is on.
+
+    A process that somebody else started is left alone.
+
+    Raises:
+        PhalanxError: It cannot be started.
+    """
+    wanted = any(switched_on(settings).values())
+    ours = PROCESS in state.local.running()
+    if wanted and not ours and not _of_others(state):
+        tree = ["--calibration", str(state.settings.calibration), "--bus", state.settings.bus]
+        state.local.start(PROCESS, [sys.executable, "-m", "master", "send", *tree], {})
+    elif not wanted and ours:
+        state.local.stop(PROCESS)
+
+
+def _of_others(state: ConsoleState) -> bool:
+    """Return whether somebody else runs the output process.
+
+    Our own process that has just ended stays visible a moment longer, so this waits until it is gone.
+    """
+    gone_s = 3.0  # so long one that has ended is still seen on the bus
+    until = time.monotonic() + (gone_s if state.local.get(PROCESS) is not None else 0.0)
+    while NAME in state.alive and time.monotonic() < until:
+        time.sleep(0.1)
+    return NAME in state.alive
+
+
+_TITLES = {
+    "osc": ("OSC", "Open Sound Control: hands, objects, contact and gestures over UDP"),
+    "vmc": ("VMC", "Virtual Motion Capture: the fingers of a VRM avatar"),
+    "ros2": ("ROS 2", "topics by a zenoh router, without ROS on this machine"),
+    "lsl": ("LSL", "Lab Streaming Layer: a stream for each hand"),
+    "web": ("WebSocket", "JSON in the joint order of WebXR, and a page with the hand"),
+}
+
+
+def output_panel(state: ConsoleState) -> None:
+    """Build the panel."""
+    client = ui.context.client
+    with ui.element("section").classes("panel").props('aria-label="Live outputs"'):
+        ui.label("Live outputs").classes("panel-title")
+        ui.label("A process of their own sends them; tracking never waits for it.").classes("soft")
+        error = ui.label("").classes("problem").props('role="alert"')
+        error.set_visibility(False)
+        try:
+            settings = read_outputs(state)
+        except PhalanxError as problem:
+            ui.label(str(problem)).classes("problem").props('role="alert"')
+            return
+
+        def change(name: str, values: dict[str, object]) -> None:
+            async def work() -> None:
+                try:
+                    await asyncio.to_thread(change_output, state, name, values)
+                    error.set_visibility(False)
+                except PhalanxError as problem:
+                    error.set_text(str(problem))
+                    error.set_visibility(True)
+                    with client:
+                        ui.notify(str(problem), type="negative", multi_line=True, close_button="OK")
+
+            background_tasks.create(work(), name=f"output {name}")
+
+        def begin() -> None:
+            async def work() -> None:
+                try:
+                    await asyncio.to_thread(lambda: follow(state, read_outputs(state)))
+                except PhalanxError as problem:
+                    error.set_text(str(problem))
+                    error.set_visibility(True)
+
+            background_tasks.create(work(), name="start sending")
+
+        rows = {name: _row(name, settings, change) for name in OUTPUTS}
+        start = ui.button("Start sending", icon="play_arrow").props("outline").classes("q-mt-sm")
+        start.on_click(begin)
+        log = ui.label("").classes("mono").props('role="log" aria-label="Output of the sending process"')
+
+    def update() -> None:
+        report = state.health.get(NAME)
+        running = PROCESS in state.local.running()
+        for name, (switch, label) in rows.items():
+            words = status_words(name, report)
+            label.set_text(words or (waiting_words(state, running, report) if switch.value else ""))
+        idle = any(switch.value for switch, _ in rows.values()) and not running and NAME not in state.alive
+        start.set_visibility(idle)
+        process = state.local.get(PROCESS)
+        if process is not None:
+            log.set_text("\n".join(process.tail(4)))
+
+    update()
+    update_s = 1.0
+    ui.timer(update_s, update)
+
+
+def status_words(name: str, report: Health | None) -> str:
+    """How an output does, by the report of the sending process."""
+    if report is None or not report.metrics.get(f"on.{name}"):
+        return ""
+    sent, failed, dropped = (report.counts.get(f"{what}.{name}", 0) for what in ("sent", "failed", "dropped"))
+    words = f"{'open' if report.metrics.get(f'open.{name}') else 'not open'}, {sent} sent"
+    return words + (f", {failed} failed" if failed else "") + (f", {dropped} dropped" if dropped else "")
+
+
+def waiting_words(state: ConsoleState, running: bool, report: Health | None) -> str:
+    """Return why an output that is switched on sends nothing yet."""
+    if report is not None:
+        return "a moment …"  # the process looks at its file once a second
+    if not running and NAME not in state.alive:
+        return "nobody sends it"
+    return "starting …" if "master" in state.alive else "waiting for a master"
+
+
+def _row(
+    name: str, settings: OutputSettings, change: Callable[[str, dict[str, object]], None]
+) -> tuple[ui.switch, ui.label]:
+    title, what = _TITLES.get(name, (name, ""))
+    part = OUTPUTS[name].part(settings)
+    with ui.element("div").classes("output"):
+        switch = ui.switch(
+            title, value=part.on, on_change=lambda event: change(name, {"on": bool(event.value)})
+        )
+        switch.props(f'aria-label="{title}: {what}"').classes("output-switch")
+        status = ui.label("").classes("soft output-status").props('role="status"')
+        ui.label(what).classes("soft output-what")
+        with ui.row().classes("gap-2 output-fields"):
+            for field in msgspec.structs.fields(part):
+                value: object = getattr(part, field.name)
+                if get_origin(field.type) is Literal:
+                    _choice(name, field.name, [str(one) for one in get_args(field.type)], str(value), change)
+                elif field.name != "on" and isinstance(value, str | int):
+                    _field(name, field.name, value, change)
+    return switch, status
+
+
+def _choice(
+    output: str, key: str, options: list[str], value: str, change: Callable[[str, dict[str, object]], None]
+) -> None:
+    box = ui.select(
+        options, value=value, label=key, on_change=lambda event: change(output, {key: str(event.value)})
+    )
+    box.props(f'dense outlined aria-label="{output} {key}"').classes("output-field")
+
+
+def _field(output: str, key: str, value: str | int, change: Callable[[str, dict[str, object]], None]) -> None:
+    box = ui.input(key.replace("_", " "), value=str(value)).props(
+        f'dense outlined aria-label="{output} {key}"'
+    )
+    box.classes("output-field")
+    last = [str(value)]
+
+    def done() -> None:
+        text = str(box.value or "").strip()
+        if text == last[0]:
+            return
+        last[0] = text
+        change(output, {key: int(text) if isinstance(value, int) and text.isdigit() else text})
+
+    box.on("blur", done)
+    box.on("keydown.enter", done)
 
 
 def build(state: ConsoleState) -> None:

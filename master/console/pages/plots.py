@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from nicegui import ui
 
-from master.console.history import SPAN_S, History
-from master.console.state import ConsoleState
+from master.console.state import SPAN_S, ConsoleState, History
 
 _GREY = "#7d8590"  # readable on light and on dark
 _COLOURS = ("#2f81f7", "#e3702f", "#2da44e", "#bf4b8a", "#9a6700", "#0e9aa7", "#8250df", "#cf222e")

@@ -12,13 +12,12 @@ from contextlib import ExitStack
 
 from common.bus.keys import link_key
 from common.clock import SystemClock
+from common.command_line import echo
 from common.errors import PhalanxError
-from common.terminal import echo
-from master.calibrate.cameras.capture_command import cameras_of
+from master.calibrate.cameras.capture import cameras_of
 from master.commands.options import add_bus, add_calibration, add_link, add_rig, address
 from master.run.ingest import Ingest
-from master.run.master_bus import host_bus
-from master.run.stopping import stop_on_signals
+from master.run.process import host_bus, stop_on_signals
 
 
 def meet(words: Sequence[str]) -> None:

@@ -19,8 +19,7 @@ from master.console.setup import (
     panel_track,
 )
 from master.console.setup.parts import CSS, Desk
-from master.console.setup.session import Session, session_of, wizard_named
-from master.console.setup.steps import Done, Step
+from master.console.setup.session import Done, Session, Step, session_of, wizard_named
 from master.console.state import ConsoleState
 
 PANELS: dict[str, Callable[[Desk], None]] = {

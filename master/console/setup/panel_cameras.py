@@ -7,8 +7,7 @@ from nicegui import ui
 
 from common.errors import CalibrationError
 from master.console.setup.commands import world_of_project
-from master.console.setup.files import WORLDS, CameraPlan, Plan
-from master.console.setup.modes import KINDS, SIMULATED, Kind, modes_of
+from master.console.setup.files import KINDS, SIMULATED, WORLDS, CameraPlan, Kind, Plan, modes_of
 from master.console.setup.parts import Desk, heading
 
 NAMES = ("left", "right", "left2", "right2", "camera5", "camera6", "camera7", "camera8")

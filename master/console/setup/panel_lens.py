@@ -9,10 +9,9 @@ from typing import cast
 
 from nicegui import ui
 
-from master.console.setup.fields import Value
+from master.console.setup.commands import Value
 from master.console.setup.job import Job
-from master.console.setup.job_view import job_view
-from master.console.setup.parts import Desk, heading, previews
+from master.console.setup.parts import Desk, heading, job_view, previews
 from master.console.setup.session import LENS
 from master.console.setup.wizards import WIZARDS
 

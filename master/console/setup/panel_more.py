@@ -7,11 +7,9 @@ from nicegui import ui
 
 from common.errors import PhalanxError
 from master.cli.table import CALIBRATIONS
-from master.console.setup.fields import Field, Value, fields_of
-from master.console.setup.job_view import job_view
-from master.console.setup.parts import Desk, heading, previews
-from master.console.setup.recording import recording_stages
-from master.console.setup.wizards import FILLED, GROUPS, Wizard
+from master.console.setup.commands import Field, Value, fields_of
+from master.console.setup.parts import Desk, heading, job_view, previews
+from master.console.setup.wizards import FILLED, GROUPS, Wizard, recording_stages
 
 
 def build(desk: Desk) -> None:

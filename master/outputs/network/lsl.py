@@ -1,4 +1,20 @@
-"""Hands as streams of the Lab Streaming Layer.
+"""The Lab Streaming Layer carries hands as streams of this machine.
+
+Confinement of a library's sockets to this machine.
+
+The library listens on every network, and has no setting to do otherwise.
+
+Linux gives a socket that is bound to a device only what comes through that device. The loopback device carries all that
+a machine sends to itself, under each of its addresses, and nothing else.
+
+Parts of pylsl that Phalanx uses.
+
+Its interface as types, and the one place that imports it.
+
+It needs liblsl, a C++ library that its wheels bring for the usual machines only, so it is imported when the output is
+switched on. Names and meanings were read in pylsl 1.18 (info.py, outlet.py, util.py, lib/__init__.py).
+
+Hands as streams of the Lab Streaming Layer.
 
 To be recorded beside EEG, EMG, eye trackers and markers.
 
@@ -6,9 +22,15 @@ One outlet a hand, opened with its first pose; a sample a pose, at the time at w
 is this machine's, so a recording aligns hands with whatever other machines measure.
 """
 
+import importlib
 import logging
+import os
 import socket
-from typing import ClassVar
+import sys
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Protocol, cast
 
 import numpy as np
 
@@ -18,9 +40,184 @@ from common.clock import now_ns
 from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS
 from common.messages import HandPose, ResultMessage
-from master.outputs.network.here_only import keep_here, sockets
-from master.outputs.network.lsl_library import PORTS, Library, Outlet, load_library
-from master.outputs.network.times import Times
+from master.outputs.network.conventions import Times
+
+_LOOPBACK = b"lo\0"
+_ANYWHERE = frozenset({"0.0.0.0", "::"})
+_FOLDER = Path("/proc/self/fd")
+Socket = tuple[int, str]
+
+
+def sockets() -> frozenset[Socket]:
+    """Return the descriptors of all sockets of this process.
+
+    Each with its own name in the kernel, as another one may have the number later; none where the system does not
+    report them.
+    """
+    found: set[Socket] = set()
+    if _FOLDER.is_dir():
+        for entry in _FOLDER.iterdir():
+            with suppress(OSError):  # closed meanwhile
+                if (name := str(entry.readlink())).startswith("socket:"):
+                    found.add((int(entry.name), name))
+    return frozenset(found)
+
+
+def keep_here(before: Collection[Socket], ports: range) -> bool:
+    """Bind new sockets that listen everywhere to the loopback device.
+
+    Those at one of the ports that were not there before.
+
+    Args:
+        before: `sockets` before the library opened its own.
+        ports: Where it may listen.
+
+    Returns:
+        Whether each is bound; False: there is one that is not, or the system cannot determine it, or do it.
+    """
+    bound = [
+        _bound(one) for one in _listening((number for number, _ in sockets() - frozenset(before)), ports)
+    ]
+    return bool(bound) and all(bound)
+
+
+def _listening(descriptors: Iterable[int], ports: range) -> Iterator[socket.socket]:
+    """Copies of those sockets that listen everywhere at one of the ports."""
+    for descriptor in descriptors:
+        with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family not in (socket.AF_INET, socket.AF_INET6):
+                continue
+            address, port = one.getsockname()[:2]
+            if address in _ANYWHERE and port in ports:
+                yield one
+
+
+def _bound(one: socket.socket) -> bool:
+    if sys.platform != "linux":
+        return False
+    try:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK)
+    except OSError:  # before Linux 5.7 only root may
+        return False
+    return True
+
+
+INSTALL = (
+    "pip install 'phalanx-hand[lsl]'; where that brings no liblsl, install it"
+    " (https://github.com/sccn/liblsl/releases) and name it in the variable PYLSL_LIB"
+)
+PORTS = range(16572, 16604)  # where liblsl listens for who reads a stream, and for who compares clocks
+# Discovery by a datagram on the loopback interface, nothing joined and nothing sent on any other.
+_MACHINE = """[log]
+level = -2
+[ports]
+IPv6 = disable
+AllowRandomPorts = 0
+[multicast]
+ResolveScope = machine
+ListenAddress = 127.0.0.1
+"""
+
+
+class XmlElement(Protocol):
+    """`pylsl.XMLElement`: the description of a stream."""
+
+    def append_child(self, name: str) -> "XmlElement":
+        """A new element below this one."""
+        ...
+
+    def append_child_value(self, name: str, value: str) -> "XmlElement":
+        """A new element with a text below this one; returns this one."""
+        ...
+
+
+class Info(Protocol):
+    """`pylsl.StreamInfo`: what a stream is."""
+
+    def desc(self) -> XmlElement:
+        """Its description."""
+        ...
+
+
+class Outlet(Protocol):
+    """`pylsl.StreamOutlet`: a stream that this process offers.
+
+    It is offered until nothing holds it any more.
+    """
+
+    def push_sample(self, x: Sequence[float], timestamp: float) -> None:
+        """Offer one sample of all channels; `timestamp` [s] on `local_clock`."""
+        ...
+
+
+class Library(Protocol):
+    """The module `pylsl`."""
+
+    IRREGULAR_RATE: float
+    cf_float32: int
+
+    def StreamInfo(  # noqa: D102
+        self,
+        name: str,
+        type: str,  # noqa: A002
+        channel_count: int,
+        nominal_srate: float,
+        channel_format: int,
+        source_id: str,
+    ) -> Info: ...
+
+    def StreamOutlet(self, info: Info, chunk_size: int, max_buffered: int) -> Outlet:
+        """Offer a stream.
+
+        For a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`.
+        """
+        ...
+
+    def local_clock(self) -> float:
+        """LSL's clock on this machine [s]."""
+        ...
+
+    def set_config_content(self, content: str) -> None:
+        """Configure liblsl, once, before anything else.
+
+        Raises `NotImplementedError` before liblsl 1.17.7.
+        """
+        ...
+
+
+def load_library(scope: str, bound_scope: str | None) -> Library:
+    """Import the module and set who can find its streams.
+
+    Args:
+        scope: "machine" or "network".
+        told: What liblsl was configured with before in this process, which is for ever; None: nothing yet.
+
+    Raises:
+        PhalanxError: It is not installed, has no liblsl, or one that is too old or was configured otherwise.
+    """
+    try:
+        library = cast(Library, importlib.import_module("pylsl"))
+    except ImportError as error:
+        raise PhalanxError(f"pylsl is not installed: {INSTALL}") from error
+    except (OSError, RuntimeError) as error:  # liblsl is loaded at once
+        raise PhalanxError(f"pylsl finds no liblsl that runs here: {INSTALL}") from error
+    if bound_scope is not None:
+        if bound_scope != scope:
+            raise PhalanxError(
+                f"lsl.scope is {scope!r}, but liblsl began with {bound_scope!r} in this process: start"
+                " `phalanx send` anew"
+            )
+        return library
+    if scope == "machine":
+        try:
+            library.set_config_content(_MACHINE)
+        except NotImplementedError as error:
+            raise PhalanxError(
+                f"liblsl is older than 1.17.7 and cannot be kept to this machine: {INSTALL};"
+                " or set lsl.scope network"
+            ) from error
+    return library
+
 
 FINGER_ANGLES = ("abduction", "flexion", "pip", "dip")
 THUMB_ANGLES = ("cmc-abduction", "cmc-flexion", "mcp", "ip")

@@ -1,13 +1,18 @@
-"""Sender that feeds the live outputs from the bus.
+"""The sender of `phalanx send` feeds the live outputs from the bus.
+
+Sender that feeds the live outputs from the bus.
 
 Follows their settings file, obeys commands, reports.
 
 On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file states
 otherwise; `report` states how it is; `stop` ends it.
+
+`phalanx send`: the live outputs as one process beside a running master.
 """
 
 import secrets
 import threading
+from argparse import Namespace
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -15,17 +20,19 @@ import msgspec
 from msgspec import Struct
 
 from common.bus.bus import Bus, Subscription
+from common.bus.zenoh_bus import ZenohBus
 from common.calibration import load
-from common.calibration.file_monitor import MonitoredFiles
+from common.calibration.files import MonitoredFiles
 from common.calibration.output_settings import OutputSettings, default_outputs
 from common.clock import Clock, SystemClock
+from common.command_line import echo
 from common.errors import BusError, PhalanxError
 from common.machine import program
 from common.messages import Command, Health, Message, ResultMessage
 from common.messages.streams import MASTER
-from master.outputs.network.line import Counters, OutputLine
-from master.outputs.network.outputs import OUTPUTS, switched_on, who_reads
-from master.outputs.network.times import MasterTimes
+from master.outputs.network.conventions import MasterTimes
+from master.outputs.network.outputs import OUTPUTS, Counters, OutputLine, switched_on, who_reads
+from master.run.process import bus_of_master, stop_on_signals
 
 NAME = "outputs"
 STREAMS = ("hand", "object", "contact", "gesture")
@@ -320,3 +327,42 @@ def refuse_unknown(names: Collection[str]) -> None:
 def _known(name: str) -> None:
     if name not in OUTPUTS:
         raise PhalanxError(f"output {name!r}: unknown; there are {', '.join(OUTPUTS)}")
+
+
+def send(options: Namespace) -> None:
+    """Send hands, objects, contact and gestures to other programs.
+
+    OSC, VMC, ROS 2, LSL, WebSocket.
+    """
+    path = options.calibration / "outputs" / f"{options.outputs}.json"
+    settings = settings_of(path)
+    names = [] if options.only is None else [name.strip() for name in options.only.split(",") if name.strip()]
+    refuse_unknown(names)  # now, not when a master is there
+    stop = stop_on_signals()
+    connection = bus_of_master(
+        options.bus, stop, lambda error: _print(f"waiting for a master: {error}"), options.site
+    )
+    if connection is None:
+        return
+    try:
+        _refuse_second(connection)
+        run_sender(connection, settings, path, names, stop, _print)
+    finally:
+        connection.close()
+
+
+def _refuse_second(connection: ZenohBus) -> None:
+    """Two would send everything twice, and answer each other's commands.
+
+    Raises:
+        BusError: One is there.
+    """
+    if NAME in connection.alive():
+        raise BusError(
+            f"{NAME!r} is on the bus already: another `phalanx send` runs beside this master;"
+            " switch its outputs in its settings file, or end it"
+        )
+
+
+def _print(line: str) -> None:
+    echo(f"outputs: {line}")

@@ -1,4 +1,26 @@
-"""Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol.
+"""Virtual Motion Capture carries hands as bones of a VRM avatar.
+
+Bones of a VRM avatar's hands from the poses of a hand.
+
+Local rotations and positions, in Unity's axes.
+
+Three frames, and one rest pose:
+
+- *avatar*: OpenXR axes, right-handed: x to the avatar's right, y up, z to its back.
+- *Unity*: left-handed: x right, y up, z to the front. A place (x, y, z) of the avatar frame is (x, y, -z) there, and a
+  turn, seen in that mirror, keeps w and z of its quaternion and flips x and y.
+- *joint*: OpenXR: -z along the bone to the tip, y dorsal, so that a flexion by a is a turn by -a about x.
+- *T-pose* (VRMC_vrm-1.0, "VRM T-pose", definitions 1.6 to 1.8): hands and fingers lie along x, right hand to +x, left
+  hand to -x, palms and finger pads down; thumbs point half way between their fingers and the front, parallel to the
+  ground, rolled outward by 90 degrees: their nails face half way between the front and the other hand.
+
+A normalized bone is turned by nothing in the T-pose, whichever way it points. So a joint whose orientation is R_A_joint
+in the avatar frame, and B there in the T-pose, turns its bone by G = R_A_joint B^T, and the local rotation of a bone is
+that seen from its parent's, L = G_parent^T G. The bones of the fingers hang on the hand: Unity has no metacarpals, and
+calls the thumb's metacarpal its proximal bone. For joints of one chain the room cancels out; the hand's own bone hangs
+on an arm that nobody tracks and that is taken to be in the T-pose.
+
+Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol.
 
 OSC over UDP, protocol.vmc.info, 3.1.
 
@@ -6,18 +28,151 @@ Two datagrams a pose, each below the size that a network splits: what is availab
 bones of the hand. Bones of which nothing is known are left out, so that the avatar keeps them as they are.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration.output_settings import VmcOutput
-from common.geometry.transforms import quaternion_to_matrix
-from common.hand.wrist_joint import forearm_palm
+from common.geometry.transforms import cross, matrix_to_quaternion, quaternion_to_matrix
+from common.hand.model import CHAINS, WRIST
+from common.hand.wrist import forearm_palm
 from common.messages import HandPose, ResultMessage
-from master.outputs.network.osc_packets import Blank, BlankBundle, floats, ints
-from master.outputs.network.sides import Side, side_of
-from master.outputs.network.times import Times
-from master.outputs.network.udp import UdpSender
-from master.outputs.network.vmc_bones import BoneMap, bone_names
+from master.outputs.network.conventions import Side, Times, side_of
+from master.outputs.network.osc import Blank, BlankBundle, UdpSender, floats, ints
+
+_SEGMENTS = ("Proximal", "Intermediate", "Distal")
+_FINGERS = ("Thumb", "Index", "Middle", "Ring", "Little")
+_JOINT_PALM = np.diag([-1.0, 1.0, -1.0])  # palm axes -> axes of the wrist joint in a flat hand
+
+JOINT_OF_BONE = (WRIST, *(int(joint) for chain in CHAINS for joint in chain[:3]))  # (16,)
+_PARENT = (
+    -1,
+    *(parent for f in range(5) for parent in (0, 1 + 3 * f, 2 + 3 * f)),
+)  # row of each bone's parent
+_PARENT_ROWS = np.array(_PARENT[1:])
+_ROWS = np.array(JOINT_OF_BONE)
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _hamilton() -> Float:
+    """Return the linear map (16, 4) of quaternion multiplication.
+
+    From all products of an element of a with one of b to the quaternion a b, wxyz.
+    """
+    table = np.zeros((4, 4, 4))
+    table[0] = np.eye(4)  # 1 times anything
+    table[:, 0] = np.eye(4)
+    for i, j, k in ((1, 2, 3), (2, 3, 1), (3, 1, 2)):
+        table[i, i, 0] = -1.0
+        table[i, j, k], table[j, i, k] = 1.0, -1.0
+    return table.reshape(16, 4)
+
+
+_PRODUCT = _hamilton()
+
+
+def bone_names(side: Side) -> tuple[str, ...]:
+    """Return Unity's `HumanBodyBones` of one hand (16).
+
+    The hand, then thumb ... little from the palm outward.
+    """
+    top = side.capitalize()
+    return (f"{top}Hand", *(f"{top}{finger}{segment}" for finger in _FINGERS for segment in _SEGMENTS))
+
+
+def t_pose(side: Side) -> Float:
+    """Return T-pose orientations (16, 3, 3) of the joints behind the bones.
+
+    Joint axes -> avatar axes.
+    """
+    out = 1.0 if side == "right" else -1.0
+    half = np.sqrt(0.5)
+    finger = _axes(np.array([out, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    thumb = _axes(np.array([out * half, 0.0, -half]), np.array([-out * half, 0.0, -half]))
+    return np.stack([finger, *[thumb] * 3, *[finger] * 12])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bones:
+    """The bones of one hand, rows as `bone_names`, Unity's axes; NaN: not known.
+
+    Attributes:
+        position_m: (16, 3) [m] from the parent bone, in the parent's turned frame; row 0 is NaN, see `hand_bone`.
+        rotation_xyzw: (16, 4) quaternion against the parent bone.
+    """
+
+    position_m: Float
+    rotation_xyzw: Float
+
+
+class BoneMap:
+    """Map from poses of one side to bones.
+
+    Holds the T-pose, and the rotation from rig to avatar, as linear maps.
+
+    Quaternions all along: the maps are products with constant ones, and there is no trigonometry in a pose.
+    """
+
+    def __init__(self, side: Side, R_avatar_rig: Float) -> None:
+        """For one side; `R_avatar_rig` (3, 3): rig axes -> avatar axes."""
+        self._rest = t_pose(side)
+        self._R_avatar_rig = R_avatar_rig
+        before = _left(matrix_to_quaternion(R_avatar_rig))
+        after = [_right(q) for q in matrix_to_quaternion(self._rest.swapaxes(1, 2))]
+        self._to_bone = np.stack([before @ one for one in after])  # (16, 4, 4): orientation wxyz -> G
+
+    def bones(self, pose: HandPose) -> Bones:
+        """Return all bones of a pose.
+
+        The bone of the hand is rotated as the palm is oriented in the room, behind an arm in the T-pose.
+        """
+        joint = np.where(pose.valid[_ROWS, None], pose.orientation_wxyz[_ROWS], np.nan)
+        bone = (self._to_bone @ joint[..., None])[..., 0]  # G, (16, 4) wxyz
+        parent = bone[_PARENT_ROWS] * _CONJUGATE
+        local = bone.copy()
+        local[1:] = (parent[:, :, None] * bone[1:, None, :]).reshape(-1, 16) @ _PRODUCT
+        local *= np.where(local[:, :1] < 0.0, -1.0, 1.0)
+        place = pose.position_m[_ROWS] @ self._R_avatar_rig.T
+        position = np.full((len(_ROWS), 3), np.nan)
+        link, axis = place[1:] - place[_PARENT_ROWS], parent[:, 1:]
+        twice = 2.0 * cross(axis, link)
+        position[1:] = (link + parent[:, :1] * twice + cross(axis, twice)) * [1.0, 1.0, -1.0]
+        return Bones(position, mirrored_xyzw(local))
+
+    def flexed(self, R_forearm_palm: Float) -> Float:
+        """Return the rotation xyzw (4,) of the hand's bone for a flexed wrist.
+
+        Flexed by `R_forearm_palm` (3, 3); Unity's axes.
+        """
+        C = self._rest[0] @ _JOINT_PALM  # palm axes of the T-pose -> avatar
+        return mirrored_xyzw(matrix_to_quaternion(C @ R_forearm_palm @ C.T))
+
+
+def mirrored_xyzw(q_wxyz: Float) -> Float:
+    """Quaternions (..., 4) wxyz of the avatar frame as Unity's, xyzw."""
+    return q_wxyz[..., [1, 2, 3, 0]] * [-1.0, -1.0, 1.0, 1.0]
+
+
+def _left(q_wxyz: Float) -> Float:
+    """Matrix (4, 4) that multiplies a quaternion by this one (4,) from the left."""
+    return np.stack([product(q_wxyz, unit) for unit in np.eye(4)], axis=-1)
+
+
+def _right(q_wxyz: Float) -> Float:
+    """Matrix (4, 4) that multiplies a quaternion by this one (4,) from the right."""
+    return np.stack([product(unit, q_wxyz) for unit in np.eye(4)], axis=-1)
+
+
+def product(a_wxyz: Float, b_wxyz: Float) -> Float:
+    """Hamilton's product a b (4,) of two quaternions (4,)."""
+    return np.outer(a_wxyz, b_wxyz).ravel() @ _PRODUCT
+
+
+def _axes(along: Float, dorsal: Float) -> Float:
+    """Joint axes (3, 3) of a bone that points `along` and whose back faces `dorsal`."""
+    return np.stack([np.cross(dorsal, -along), dorsal, -along], axis=-1)
+
 
 OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"
 _LOADED = ints([1, 3, 0])  # a model is loaded, it is calibrated, normal mode

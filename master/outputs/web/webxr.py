@@ -24,7 +24,7 @@ from msgspec import Struct
 from common.arrays import Float
 from common.hand.model import WEBXR_JOINTS
 from common.messages import HandPose, ObjectPose, ObjectSource, Source
-from master.outputs.network.sides import Side, side_of
+from master.outputs.network.conventions import Side, side_of
 
 FORMAT_VERSION = 1
 Frame = Literal["webxr", "rig"]

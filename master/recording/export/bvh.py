@@ -20,11 +20,20 @@ from typing import IO, Literal
 import numpy as np
 
 from common.arrays import Float
-from common.calibration.replacing import replacing
+from common.calibration.files import replacing
 from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import WRIST
-from master.recording.export.motion import Motion
-from master.recording.export.skeleton import CHILDREN, ORDER, PARENT, Skeleton, back, name_of, rotate, times
+from master.recording.export.motion import (
+    CHILDREN,
+    ORDER,
+    PARENT,
+    Motion,
+    Skeleton,
+    back,
+    name_of,
+    rotate,
+    times,
+)
 
 Up = Literal["y", "rig"]
 Unit = Literal["m", "cm", "mm"]

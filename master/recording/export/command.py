@@ -4,8 +4,8 @@ import sys
 from argparse import Namespace
 
 from common.clock import now_ns
+from common.command_line import echo
 from common.errors import PhalanxError
-from common.terminal import echo
 from master.commands.summary import write_summary
 from master.recording.lines import ProgressLine, bar
 
@@ -27,7 +27,7 @@ def export(options: Namespace) -> None:
             _refuse(bool(given), option, "exporting", f"--compare {options.compare}")
         from master.mocap.read import Reading
         from master.recording.export import truth
-        from master.recording.export.window import Window
+        from master.recording.export.take import Window
 
         part, how = (
             Window(options.from_s, options.to_s),
@@ -68,7 +68,7 @@ def export(options: Namespace) -> None:
     from master.recording.export.bvh import Axes
     from master.recording.export.run import Wanted
     from master.recording.export.run import export as export_source
-    from master.recording.export.window import Window
+    from master.recording.export.take import Window
 
     wanted = Wanted(
         options.to,

@@ -16,8 +16,7 @@ from master.evaluation.run_results import contact_row, object_row
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.recording.export.take import Take
-from master.rig.files import load_setups
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setups
 
 
 def setup_of(hand: str, tree: Path, rigs: Sequence[str], profiles: Sequence[Path]) -> RigSetup:

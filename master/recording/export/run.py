@@ -12,22 +12,21 @@ from common.calibration import HandProfile, load
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.hand.model import HandModel
 from master.outputs.poses import Poses, record
-from master.outputs.table_file import cannot_write
+from master.outputs.result_files import cannot_write
 from master.recording.export.bvh import Axes, write_bvh
-from master.recording.export.columns import (
+from master.recording.export.gltf import write_gltf
+from master.recording.export.motion import Motion, Skeleton, complete, name_of, resample
+from master.recording.export.rrd import setup_of, write_take
+from master.recording.export.table import (
     Column,
+    TableKind,
     contact_columns,
     gesture_columns,
     hand_columns,
     object_columns,
+    write_table,
 )
-from master.recording.export.gltf import write_gltf
-from master.recording.export.motion import Motion, complete, resample
-from master.recording.export.rrd import setup_of, write_take
-from master.recording.export.skeleton import Skeleton, name_of
-from master.recording.export.table import TableKind, write_table
-from master.recording.export.take import Take, open_take
-from master.recording.export.window import Window
+from master.recording.export.take import Take, Window, open_take
 
 Kind = Literal["csv", "parquet", "bvh", "gltf", "rrd"]
 SUFFIXES: dict[Kind, tuple[str, ...]] = {

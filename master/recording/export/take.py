@@ -1,4 +1,10 @@
-"""Sources of an export: the files of a run, or a recording of messages.
+"""A take is the source of an export, a run or a recording, in a window.
+
+Time window of a source that is exported.
+
+It goes from and to a time, in seconds after the source's beginning.
+
+Sources of an export: the files of a run, or a recording of messages.
 
 They are read in batches, so that an hour fits.
 """
@@ -6,12 +12,15 @@ They are read in batches, so that an hour fits.
 import tempfile
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, fields, replace
+from math import isfinite
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from common.errors import RecordingError
+from common.arrays import Bool, Int
+from common.errors import PhalanxError, RecordingError
 from common.messages import (
     Contact,
     Detections,
@@ -22,8 +31,7 @@ from common.messages import (
     WristDetections,
 )
 from common.recording.messages import MessageRecording, open_messages
-from master.outputs.files import load_poses, path_of_hand
-from master.outputs.poses import Poses
+from master.outputs.poses import Poses, load_poses, path_of_hand
 from master.outputs.result_files import (
     GESTURES,
     Contacts,
@@ -33,8 +41,63 @@ from master.outputs.result_files import (
     load_gesture_messages,
     load_object,
 )
-from master.recording.export.window import Window
 from master.recording.files import recorded_rigs, unpack
+
+_Table = TypeVar("_Table", Poses, ObjectPoses, Contacts)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of time.
+
+    Attributes:
+        from_s, to_s: Seconds after the source's beginning, both included; None: from there on, until its end.
+    """
+
+    from_s: float | None = None
+    to_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what holds nothing.
+
+        Raises:
+            PhalanxError: Its end is before its beginning, or one of them is no number.
+        """
+        for option, value in (("--from", self.from_s), ("--until", self.to_s)):
+            if value is not None and not isfinite(value):
+                raise PhalanxError(f"{option} {value}: give seconds, or leave it out")
+        if self.from_s is not None and self.to_s is not None and self.to_s < self.from_s:
+            raise PhalanxError(f"--until {self.to_s:g} is before --from {self.from_s:g}")
+
+    def span_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
+        """First and last time [ns]."""
+        first, last = (
+            None if one is None else begin_t_ns + round(one * 1e9) for one in (self.from_s, self.to_s)
+        )
+        return first, last
+
+    def inside(self, t_ns: Int, begin_t_ns: int) -> Bool:
+        """Which times (T,) [ns] are in it."""
+        first, last = self.span_ns(begin_t_ns)
+        good = np.ones(len(t_ns), np.bool_)
+        if first is not None:
+            good &= t_ns >= first
+        if last is not None:
+            good &= t_ns <= last
+        return good
+
+    def of(self, table: _Table, begin_t_ns: int) -> _Table:
+        """The rows of a table that are in it."""
+        good = self.inside(table.t_ns, begin_t_ns)
+        if good.all():
+            return table
+        arrays: dict[str, Any] = {
+            one.name: getattr(table, one.name)[good]
+            for one in fields(table)
+            if one.name not in ("hand", "object")
+        }
+        return replace(table, **arrays)
+
 
 _Kind = TypeVar("_Kind", HandPose, ObjectPose, Contact, Gesture, MarkerDetections, WristDetections)
 _BATCH = 1024

@@ -13,14 +13,11 @@ from common.calibration import RigCalibration, load
 from common.errors import PhalanxError, RecordingError
 from common.hand.model import JOINTS
 from master.mocap.align import Alignment, align
-from master.mocap.compare import compare, figures
-from master.mocap.joint_motion import MARKERS, JointMotion
+from master.mocap.compare import alignment_json, alignment_lines, compare, figures, table_lines
+from master.mocap.joint_motion import MARKERS, JointMotion, Track, known
 from master.mocap.read import Reading, read_motion
-from master.mocap.report import alignment_json, alignment_lines, table_lines
-from master.mocap.track import Track, known
 from master.outputs.poses import Poses
-from master.recording.export.take import Take, open_take
-from master.recording.export.window import Window
+from master.recording.export.take import Take, Window, open_take
 
 _SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is stated
 

@@ -7,18 +7,24 @@ import pytest
 from msgspec.structs import replace
 
 from common.link.datagram import Address, Kind, Refusal, Sealer, parse
-from common.link.handshake import RULES, Event, Key, Role, Rule, State, state_pages
 from common.link.session import (
+    RULES,
     Beacon,
     EchoAnswer,
     EchoAsk,
+    Event,
     Handshake,
     Hello,
+    Key,
     RigKeys,
+    Role,
+    Rule,
     SessionKeys,
+    State,
     Unproven,
     Welcome,
     seal,
+    state_pages,
 )
 from master.run.link import MasterLink
 from slave.link import SlaveLink

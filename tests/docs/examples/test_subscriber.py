@@ -13,7 +13,7 @@ import pytest
 from common.bus.keys import access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.hand.model import JOINTS
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from tests.master.send.hands import hand_pose
 from tests.network_helpers import free_endpoint
 

@@ -18,8 +18,7 @@ from common.sim.motion import REST, HandState, angles_of, smooth_step
 from common.sim.scene import view_centre
 from master.gestures.recogniser import GestureRecogniser
 from master.outputs.bus import BusSink
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 from tests.docs.examples.loading import example
 
 HZ = 60.0

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from common.messages import CheckItem, Health
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow
-from master.checklist.monitor import ChecklistMonitor
-from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.checklist.publisher import ChecklistMonitor
+from master.run.link_senders import MarkerCounts, RejectedPeer
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 CAMERAS = (

@@ -10,7 +10,7 @@ import pytest
 
 from master.checklist.facts import Plan, plan_of
 from master.checklist.files import FileMonitor
-from master.rig.files import load_setups
+from master.rig.setup import load_setups
 
 ROOT = Path(__file__).resolve().parents[3]
 

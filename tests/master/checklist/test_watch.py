@@ -7,9 +7,9 @@ import pytest
 
 from common.messages import CheckItem
 from master.checklist.facts import Verdict
-from master.checklist.monitor import CODES
-from master.checklist.moved_rule import MovedRule
-from master.run.rejected_peers import MarkerCounts, RejectedPeer
+from master.checklist.publisher import CODES
+from master.checklist.slave_rules import MovedRule
+from master.run.link_senders import MarkerCounts, RejectedPeer
 from tests.master.checklist.checked import MARKERS, Bench
 
 WITHIN_S = 2.0

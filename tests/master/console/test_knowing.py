@@ -11,19 +11,14 @@ from common.calibration import CameraCalibration, RigCalibration, load, save
 from common.calibration.output_settings import OutputSettings
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Gesture, Health
-from master.console.elements import full_frame_uv
-from master.console.filter_trial import save_filter, try_filter
-from master.console.history import History
-from master.console.labels import hand_line
-from master.console.local_mirror import update_copy
-from master.console.output_files import change_output
+from master.console.controls import full_frame_uv, hand_line
+from master.console.link import PreviewLeases
+from master.console.pages.outputs import change_output
 from master.console.play_panel import start_playing
-from master.console.preview_leases import PreviewLeases
-from master.console.received_gestures import KEPT, ReceivedGestures
 from master.console.recording_panel import recording_path
-from master.console.request_filter import names_of, refusal
-from master.console.state import ConsoleSettings, ConsoleState, Newest
-from master.console.tuner import Range, Tuner
+from master.console.serving import names_of, refusal
+from master.console.state import KEPT, ConsoleSettings, ConsoleState, History, Newest, ReceivedGestures
+from master.console.tuner import Range, Tuner, save_filter, try_filter, update_copy
 from tests.master.console.fakes import FakeSlave, pose, tree
 from tests.network_helpers import until
 

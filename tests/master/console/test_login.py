@@ -18,9 +18,17 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from common.bus.bus import LoopbackBus
 from common.errors import PhalanxError
 from master.console.app import PAGES, LoginPage, console_app, login_of, register
-from master.console.login import HASH_FILE, PasswordHash, kept_password, new_password, password_from
-from master.console.login_page import LoginRequired
-from master.console.login_sessions import LONGEST_WAIT_S, Backoff, Sessions
+from master.console.login import (
+    HASH_FILE,
+    LONGEST_WAIT_S,
+    Backoff,
+    LoginRequired,
+    PasswordHash,
+    Sessions,
+    kept_password,
+    new_password,
+    password_from,
+)
 from master.console.neighbours import same_user
 from master.console.state import ConsoleSettings, ConsoleState
 

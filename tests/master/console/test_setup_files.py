@@ -20,20 +20,23 @@ from common.errors import CalibrationError, PhalanxError
 from common.hand.model import HandModel
 from common.messages import Health
 from master.calibrate.tree_files import provenance
-from master.console.setup.colour_sampling import keep_colours, pixel_of, ranges_of
 from master.console.setup.files import (
     KEY_FILE,
+    KINDS,
+    MODES,
     PLAN,
     CameraPlan,
     Plan,
     key_of,
     load_plan,
+    modes_of,
+    new_file,
     replace_file,
     write_cameras,
     write_rig,
 )
-from master.console.setup.modes import KINDS, MODES, modes_of, new_file
-from master.console.setup.steps import Done, steps_of, usable
+from master.console.setup.panel_colours import keep_colours, pixel_of, ranges_of
+from master.console.setup.session import Done, steps_of, usable
 
 LENS = Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=320.0, cy_px=240.0)
 RANGE = HsvRange(hsv_low=(10, 60, 60), hsv_high=(20, 255, 255))

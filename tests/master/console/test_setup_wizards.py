@@ -12,14 +12,12 @@ from common.bus.keys import rig_key
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
 from master.cli.table import CALIBRATIONS
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from master.console.local import LocalProcesses
-from master.console.setup.commands import VIEWS, Commands, epoch_of
-from master.console.setup.fields import arguments_of, fields_of
+from master.console.setup.commands import VIEWS, Commands, arguments_of, epoch_of, fields_of
 from master.console.setup.files import CameraPlan, Plan, write_cameras, write_rig
-from master.console.setup.job import Job, JobState, Stage
+from master.console.setup.job import Job, JobState, Stage, fault, progress, share_of
 from master.console.setup.panel_lens import judged
-from master.console.setup.progress import fault, progress, share_of
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
 from tests.cli import invoke

@@ -10,11 +10,10 @@ from common.arrays import Bool, Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector
 from common.hand.model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
-from master.estimator.epoch import Epoch, Fitted, FittedHand, OrientationMeasurement
+from master.estimator.epoch import Epoch, Fitted, FittedHand, OrientationMeasurement, SolvedHand
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
-from master.fabrik.estimate import SolvedHand
 from tests.hand_helpers import (
     BACK_NORMAL,
     MARKERS,

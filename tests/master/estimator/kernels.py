@@ -6,28 +6,23 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
-from master.estimator.cameras import CameraArrays, project
-from master.estimator.extras import keep_extras, predict_extras
+from master.estimator.covariance import CovarianceScratch, add_second_order, linear, surer
 from master.estimator.finger_surface import MOVES, laser_centroid, look
-from master.estimator.joint_covariance import CovarianceScratch, linear, surer
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
+from master.estimator.parameters import truncated_mean
+from master.estimator.posterior import Model
 from master.estimator.priors import PosturePrior
-from master.estimator.problem import Rig
-from master.estimator.residuals import Observations, marker_rows
-from master.estimator.second_order import add_second_order
+from master.estimator.problem import Observations, Rig, marker_rows, rotation_vector_jacobian
+from master.estimator.sensors import CameraArrays, flexed_palm, project
 from master.estimator.solve import linearise
-from master.estimator.state import grow, hide
-from master.estimator.truncated import truncated_mean
-from master.estimator.workspace import Model
-from master.estimator.wrist_device import flexed_palm
-from master.estimator.wrist_rows import rotation_vector_jacobian
+from master.estimator.state import grow, hide, keep_extras, predict_extras
 
 __all__ = ["CovarianceScratch", "Scratch"]
 
 
 @kernel
 def project_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
-    """`master.estimator.cameras.project`."""
+    """`master.estimator.sensors.project`."""
     return project(cameras, c, point, uv, J)
 
 
@@ -35,7 +30,7 @@ def project_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float)
 def marker_rows_at(
     cameras: CameraArrays, observed: Observations, m: int, point: Float, boxed_work: Any
 ) -> tuple[float, float]:
-    """`master.estimator.residuals.marker_rows`; the record in its array."""
+    """`master.estimator.problem.marker_rows`; the record in its array."""
     return marker_rows(cameras, observed, m, point, boxed_work[0])
 
 
@@ -64,13 +59,13 @@ def linearise_at(
 def truncated_mean_at(
     boxed_hand: Any, normal: Float, gradient: Float, x: Float, boxed_cut: Any, mean: Float
 ) -> None:
-    """`master.estimator.truncated.truncated_mean`; records in their arrays."""
+    """`master.estimator.parameters.truncated_mean`; records in their arrays."""
     truncated_mean(boxed_hand[0], normal, gradient, x, boxed_cut[0], mean)
 
 
 @kernel
 def surer_at(now: Float, past: Float, boxed_scratch: Any, out: Float) -> None:
-    """`master.estimator.joint_covariance.surer`; the record in its array."""
+    """`master.estimator.covariance.surer`; the record in its array."""
     surer(now, past, boxed_scratch[0], out)
 
 
@@ -121,7 +116,7 @@ def joint_covariances(
 
 @kernel
 def rotation_vector_jacobian_at(rotation: Float, J: Float) -> None:
-    """`master.estimator.wrist_rows.rotation_vector_jacobian`."""
+    """`master.estimator.problem.rotation_vector_jacobian`."""
     rotation_vector_jacobian(rotation, J)
 
 
@@ -157,7 +152,7 @@ def predict_extras_at(
     boxed_prior: Any,
     boxed_scratch: Any,
 ) -> None:
-    """`master.estimator.extras.predict_extras`; records in their arrays."""
+    """`master.estimator.state.predict_extras`; records in their arrays."""
     predict_extras(
         boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_prior[0], boxed_scratch[0]
     )
@@ -174,5 +169,5 @@ def keep_extras_at(
     scale: float,
     boxed_scratch: Any,
 ) -> None:
-    """`master.estimator.extras.keep_extras`; records in their arrays."""
+    """`master.estimator.state.keep_extras`; records in their arrays."""
     keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_prior[0], z, cov, scale, boxed_scratch[0])

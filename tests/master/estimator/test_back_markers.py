@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.hand.back_markers import with_three_back_markers
+from common.hand.fitting import with_three_back_markers
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from tests.hand_helpers import MARKERS, natural_angles, palm

@@ -9,10 +9,9 @@ from bench.hands.certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, PALM, TIPS, HandModel
-from common.messages.records import boxed
-from common.sim.motion import HandMotion, ScriptedMotion
-from common.sim.poses import StudyPoses
-from master.estimator.joint_covariance import CovarianceScratch
+from common.kernels import boxed
+from common.sim.motion import HandMotion, ScriptedMotion, StudyPoses
+from master.estimator.covariance import CovarianceScratch
 from tests.hand_helpers import RIGHT, natural_angles, palm
 from tests.master.estimator.fitted import PARAMETERS, STEP_NS, estimator, found, places, push
 from tests.master.estimator.kernels import surer_at

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.calibration.wrist import FingerLine
+from common.calibration.rig import FingerLine
 from common.hand.model import FINGERS
-from master.estimator.cubic import ROOT_MM, CubicLaw, cubic_pip, simulated_lines
-from master.estimator.finger_lines import on_line
+from master.estimator.priors import ROOT_MM, CubicLaw, cubic_pip, on_line, simulated_lines
 from tests.master.estimator.wrist_case import WristCase, natural
 
 

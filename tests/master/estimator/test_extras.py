@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.messages.records import boxed
-from master.estimator.extras import ExtrasScratch, stationary_of
+from common.kernels import boxed
 from master.estimator.problem import EpochPrior
+from master.estimator.sensors import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from master.estimator.settings import DEFAULT
-from master.estimator.state import HandState
-from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
+from master.estimator.state import ExtrasScratch, HandState, stationary_of
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
 N = 8

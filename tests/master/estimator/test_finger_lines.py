@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import FitError
-from master.estimator.finger_lines import on_line, principal_line
+from master.estimator.priors import on_line, principal_line
 
 
 @given(st.floats(-1.4, 1.4), st.floats(0.02, 0.1), st.integers(0, 99))

@@ -8,9 +8,9 @@ import pytest
 
 from common.arrays import Float
 from common.hand.model import CHAINS
-from common.hand.wrist_joint import STRAIGHT
+from common.hand.wrist import STRAIGHT
 from master.calibrate.laser_intersection import LaserIntersection
-from master.estimator.laser_plane import PlaneAxes
+from master.estimator.sensors import PlaneAxes
 from master.rig.wrist import WristSetup
 from tests.master.estimator.wrist_case import NO_TWIST, PIP, WristCase, bent, natural
 from tests.wrist_run import mirrored_setup

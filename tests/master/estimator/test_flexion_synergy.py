@@ -6,7 +6,7 @@ import numpy as np
 from common.calibration import Couplings
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
-from master.estimator.flexion_synergy import FlexionSynergy
+from master.estimator.priors import FlexionSynergy
 
 
 def test_a_finger_bends_by_the_ratios_of_the_paper_unless_its_hand_states_others() -> None:

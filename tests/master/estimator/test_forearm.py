@@ -20,14 +20,12 @@ from common.geometry.transforms import (
     rigid,
     rotation_vector_to_matrix,
 )
-from common.hand.wrist_joint import forearm_palm
-from master.estimator.cycle_reader import CycleReader
-from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
+from common.hand.wrist import forearm_palm
+from master.estimator.epoch import CycleReader, Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
-from master.estimator.forearm import Forearm
-from master.estimator.fused import WristSide
-from master.estimator.wrist_device import HEADING, RATE, WRIST_ANGLES
-from master.estimator.wrist_model import WristModel, loosened
+from master.estimator.priors import WristModel, loosened
+from master.estimator.sensors import HEADING, RATE, WRIST_ANGLES
+from master.estimator.wrist_pipeline import Forearm, WristSide
 from tests.hand_helpers import any_rotation, small_cov
 from tests.master.estimator.fitted import PAIR, found
 from tests.master.estimator.test_back_markers import EIGHT as MARKERS

@@ -12,10 +12,10 @@ from bench.played import START_NS
 from common.arrays import Bool
 from common.hand.model import CHAINS
 from common.messages import HandPose, ImuSample, MarkerDetections, SolverMode, Source, WristDetections
-from master.estimator.fused import FusedPipeline
 from master.estimator.settings import DEFAULT
+from master.estimator.wrist_pipeline import FusedPipeline
 from master.rig.pipeline import pipeline_of
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 
 SECONDS, GONE_S, BACK_S = 3.2, 1.8, 2.5
 Seen = tuple[Both, list[Observed]]

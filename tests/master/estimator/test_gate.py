@@ -5,10 +5,10 @@ import pytest
 
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
-from master.estimator.cameras import CameraArrays
-from master.estimator.gate import SETTINGS, Association, Prior, among, associate
+from master.estimator.sensors import CameraArrays
+from master.fabrik.intersection import SETTINGS, Association, Prior, among, associate
 from master.rig.pipeline import line_of
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.messages.records import boxed
-from master.estimator.hand_tables import HandTables
+from common.kernels import boxed
+from master.estimator.parameters import HandTables
+from master.estimator.sensors import NO_EXTRAS
 from master.estimator.settings import DEFAULT
 from master.estimator.state import NEVER_NS, HandState, Hidden
-from master.estimator.wrist_device import NO_EXTRAS
 from tests.hand_helpers import RIGHT, within
 from tests.master.estimator.fitted import FREE, PARAMETERS, STEP_NS
 from tests.master.estimator.kernels import hide_at

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.geometry.transforms import axis_rotation
-from master.estimator.laser_plane import PlaneAxes, laser_points
+from master.estimator.sensors import PlaneAxes, laser_points
 from master.rig.wrist import WristSetup
 from tests.wrist_run import wrist_setup
 

@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from common.messages.records import boxed
-from master.estimator.body_points import BodyPoints
-from master.estimator.cameras import CameraArrays
-from master.estimator.kinematics import Scratch
+from common.kernels import boxed
+from master.estimator.kinematics import BodyPoints, Scratch
 from master.estimator.parameters import HandParameters
-from master.estimator.residuals import Observations
+from master.estimator.problem import Observations
+from master.estimator.sensors import CameraArrays
 from tests.hand_helpers import BACK_NORMAL, MARKERS, any_rotation
 from tests.master.estimator.fitted import PAIR
 from tests.master.estimator.kernels import marker_rows_at, project_at

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.estimator.blend import Blend
+from master.estimator.smoothing import Blend
 
 STEP_S, SPEED = 1 / 60, 0.12
 ON_PALM = np.array([False, True])

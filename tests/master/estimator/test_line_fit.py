@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.hand.model import HandModel
-from master.estimator.body_points import BodyPoints
+from master.estimator.kinematics import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov

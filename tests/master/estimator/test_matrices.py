@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from master.estimator.matrices import inverse_3_plus
+from master.fabrik.linear_algebra import inverse_3_plus
 
 
 def test_a_matrix_is_inverted_as_by_numpy() -> None:

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
+from common.kernels import boxed
 from common.messages import Source
-from common.messages.records import boxed
-from master.estimator.epoch import Fitted
-from master.estimator.pose import pose_of
+from master.estimator.epoch import Fitted, MarkerPositions
+from master.estimator.estimator import pose_of
 from master.estimator.settings import DEFAULT
-from master.fabrik.estimate import MarkerPositions
 from tests.hand_helpers import MARKERS, RIGHT, natural_angles, palm, small_cov, within
 from tests.master.estimator.fitted import (
     STEP_NS,

@@ -14,7 +14,7 @@ from master.estimator.pipeline import MarkerPipeline
 from master.estimator.settings import DEFAULT
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
 

@@ -7,17 +7,14 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import CHAINS, TIPS, WRIST, HandModel
-from common.messages.records import boxed
-from master.estimator.body_points import BodyPoints
-from master.estimator.cameras import CameraArrays
+from common.kernels import boxed
+from master.estimator.covariance import CovarianceScratch
 from master.estimator.epoch import FittedHand
-from master.estimator.hand_tables import HandTables, Mounts
-from master.estimator.joint_covariance import CovarianceScratch
-from master.estimator.kinematics import Scratch
-from master.estimator.parameters import HandParameters
+from master.estimator.kinematics import BodyPoints, Scratch
+from master.estimator.parameters import HandParameters, HandTables, Mounts
+from master.estimator.posterior import Model
+from master.estimator.sensors import CameraArrays, Device
 from master.estimator.settings import DEFAULT
-from master.estimator.workspace import Model
-from master.estimator.wrist_device import Device
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import PAIR, fit, forgetful, found, places
 from tests.master.estimator.kernels import joint_covariances

@@ -11,7 +11,7 @@ from common.hand.model import CHAINS, TIPS
 from master.estimator.epoch import Epoch, Fitted, FittedHand
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
-from master.estimator.smooth import HandOneEuro
+from master.estimator.smoothing import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
 from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, camera_models, palm, rig_file, within
 

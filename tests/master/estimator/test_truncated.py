@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
 from common.arrays import Float
-from common.messages.records import boxed
-from master.estimator.hand_tables import HandTables
-from master.estimator.truncated import Cut
+from common.kernels import boxed
+from master.estimator.parameters import Cut, HandTables
 from tests.hand_helpers import RIGHT
 from tests.master.estimator.fitted import FREE, PARAMETERS
 from tests.master.estimator.kernels import truncated_mean_at

@@ -14,10 +14,10 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, Volume, load
 from common.errors import CalibrationError
 from common.hand.model import CHAINS, FINGERS, METACARPALS, HandModel
-from common.hand.palmar_surface import SPREAD, PalmarSurface
+from common.hand.skin import SPREAD, PalmarSurface
 from common.messages import HandPose, SolverMode, Source, WristDetections
+from master.estimator.sensors import LED_SCALE
 from master.estimator.settings import DEFAULT
-from master.estimator.wrist_device import LED_SCALE
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.setup import RigSetup
 from master.rig.wrist import WristSetup

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry.transforms import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
-from common.hand.wrist_joint import forearm_palm
-from master.estimator.wrist_device import HEADING, LED_SCALE, TILT, WRIST_ANGLES
+from common.hand.wrist import forearm_palm
+from master.estimator.sensors import HEADING, LED_SCALE, TILT, WRIST_ANGLES
 from tests.hand_helpers import any_rotation
 from tests.master.estimator.kernels import rotation_vector_jacobian_at
 from tests.master.estimator.whole import Whole, silent

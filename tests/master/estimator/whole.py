@@ -7,21 +7,16 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Couplings
-from common.calibration.hand_presets import preset_couplings
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
-from common.hand.profiles import generated_profile
-from common.kernels import constant
-from common.messages.records import boxed
-from master.estimator.cameras import CameraArrays
-from master.estimator.hand_tables import HandTables, Mounts
-from master.estimator.parameters import HandParameters
+from common.hand.profiles import generated_profile, preset_couplings
+from common.kernels import boxed, constant
+from master.estimator.parameters import HandParameters, HandTables, Mounts
+from master.estimator.posterior import Model
 from master.estimator.priors import posture_prior_of
-from master.estimator.problem import EpochPrior, Search
-from master.estimator.residuals import Observations
+from master.estimator.problem import EpochPrior, Observations, Search
+from master.estimator.sensors import EXTRAS, NO_EXTRAS, CameraArrays, Device
 from master.estimator.settings import DEFAULT
-from master.estimator.workspace import Model
-from master.estimator.wrist_device import EXTRAS, NO_EXTRAS, Device
 from tests.hand_helpers import MARKERS, natural_angles, palm, walls
 from tests.master.estimator.fitted import PAIR
 from tests.master.estimator.kernels import linearise_at

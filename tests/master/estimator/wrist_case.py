@@ -8,14 +8,13 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.hand.model import CHAINS
-from common.hand.wrist_joint import STRAIGHT
+from common.hand.wrist import STRAIGHT
+from common.kernels import boxed
 from common.messages import HandPose, WristDetections
-from common.messages.records import boxed
 from master.estimator.finger_surface import Surface
-from master.estimator.hand_tables import HandTables
-from master.estimator.parameters import HandParameters
-from master.estimator.wrist_device import Device
-from master.estimator.wrist_model import WristModel, loosened
+from master.estimator.parameters import HandParameters, HandTables
+from master.estimator.priors import WristModel, loosened
+from master.estimator.sensors import Device
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.wrist import WristSetup
 from tests.master.estimator.kernels import laser_centroid_at, look_at

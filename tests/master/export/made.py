@@ -11,7 +11,7 @@ from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, ResultMessage, Source
 from master.outputs.poses import Poses
-from master.recording.export.skeleton import Skeleton
+from master.recording.export.motion import Skeleton
 from tests.hand_helpers import any_rotation, natural_angles
 
 RIGHT = HandModel.of(generated_profile("made-right", "right"))

@@ -12,8 +12,7 @@ from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import CHAINS, JOINTS
 from common.messages import HandPose
 from master.recording.export.bvh import PER_METRE, Axes, Unit, Up, euler_zxy_deg, write_bvh
-from master.recording.export.motion import complete, resample
-from master.recording.export.skeleton import Skeleton
+from master.recording.export.motion import Skeleton, complete, resample
 from tests.hand_helpers import any_rotation
 from tests.master.export.made import LEFT, NEAR_M, REST, STEP_NS, poses_of, positions, stacked
 

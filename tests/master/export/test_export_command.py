@@ -9,10 +9,10 @@ from common.calibration import save
 from common.errors import PhalanxError, RecordingError
 from common.messages import Message
 from common.recording.messages import MessageWriter
-from master.outputs.files import PosesFile
+from master.outputs.poses import PosesFile
 from master.recording.export.bvh import Axes
 from master.recording.export.run import SUFFIXES, Wanted, export, skeleton_of
-from master.recording.export.window import Window
+from master.recording.export.take import Window
 from master.recording.files import rigs_text
 from tests.cli import invoke
 from tests.hand_helpers import camera_file, rig_file

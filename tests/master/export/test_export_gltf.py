@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from common.arrays import Float
 from common.hand.model import JOINTS
 from common.messages import HandPose
-from master.recording.export.gltf import write_gltf
-from master.recording.export.hand_mesh import skin_of
+from master.recording.export.gltf import skin_of, write_gltf
 from master.recording.export.motion import complete
 from tests.browser import WAIT_MS, chromium
 from tests.master.export.made import NEAR_M, REST, STEP_NS, poses_of, positions, stacked

@@ -11,6 +11,8 @@ from common.hand.model import TIPS, WRIST
 from master.recording.export.motion import (
     FRAMES_OF_POSE,
     FREE_FRAMES,
+    ORDER,
+    PARENT,
     Motion,
     complete,
     local,
@@ -18,7 +20,6 @@ from master.recording.export.motion import (
     slerp,
     world,
 )
-from master.recording.export.skeleton import ORDER, PARENT
 from tests.master.export.made import BEGIN_NS, REST, STEP_NS, poses_of, positions, stacked
 
 

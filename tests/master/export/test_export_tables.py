@@ -11,17 +11,16 @@ from hypothesis import strategies as st
 
 from common.hand.model import FINGERS, JOINTS
 from common.messages import Contact, Gesture, HandPose, ObjectPose
-from master.outputs.files import PosesFile, RunFiles
-from master.outputs.poses import Poses
+from master.outputs.poses import Poses, PosesFile, RunFiles
 from master.outputs.result_files import ObjectPoses, load_contact
-from master.recording.export.columns import (
+from master.recording.export.run import Wanted, export
+from master.recording.export.table import (
     Column,
     contact_columns,
     gesture_columns,
     hand_columns,
     object_columns,
 )
-from master.recording.export.run import Wanted, export
 from tests.master.export.made import BEGIN_NS, LEFT, NEAR_M, STEP_NS, poses_of, positions, results
 
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import generated_profile
-from master.fabrik.chain import Chain, Link
-from master.fabrik.fabrik import Fabrik, solve_chain
-from master.fabrik.finger import Finger
+from master.fabrik.fabrik import Chain, Fabrik, Link, solve_chain
 from master.fabrik.joints import Hinge, Rotor
-from master.fabrik.rotations import IDENTITY, as_vector
+from master.fabrik.linear_algebra import IDENTITY, as_vector
+from master.fabrik.solver import Finger
 
 _SPREAD_M = (0.0, 0.01, 0.04)
 """How far a target is beside a legal one; the last is out of reach for most fingers."""

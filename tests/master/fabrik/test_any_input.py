@@ -20,7 +20,7 @@ from master.fabrik.caps import CapTables
 from master.fabrik.depth import PowerLaw
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig.pipeline import build_pipeline, line_of
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run
 

@@ -11,9 +11,8 @@ from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.hand.model import HandJoints
 from common.recording.frame_recording import open_recording
-from master.estimator.cameras import CameraArrays
-from master.fabrik.cap_views import TILTED, hidden_part, tilted
-from master.fabrik.caps import CapTables, cap_surface
+from master.estimator.sensors import CameraArrays
+from master.fabrik.caps import TILTED, CapTables, cap_surface, hidden_part, tilted
 from master.fabrik.intersection import triangulate
 from tests.hand_helpers import (
     MARKERS,

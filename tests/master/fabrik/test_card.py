@@ -14,13 +14,12 @@ from common.geometry.transforms import axis_rotation
 from common.messages import HandPose, MarkerDetections
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
-from master.fabrik.finger import Finger
 from master.fabrik.one_euro import OneEuro
+from master.fabrik.solver import Finger
 from master.fabrik.triangulate import DepthTriangulator
-from master.rig.files import load_setup
 from master.rig.pipeline import build_pipeline
-from master.rig.setup import RigSetup
-from master.run.stages import StageTimes
+from master.rig.setup import RigSetup, load_setup
+from master.run.app import StageTimes
 from tests.hand_helpers import cap_views, detections, natural_angles, palm
 from tests.synthetic_run import SyntheticRun, synthetic_run
 

@@ -10,14 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.calibration.hand_presets import preset_couplings, preset_limits
 from common.hand.model import FINGERS, HandModel
-from common.hand.profiles import generated_profile
-from master.fabrik.chain import Chain, Coupling, Link, least_root_to_end
-from master.fabrik.fabrik import ChainResult, Fabrik, Reach
-from master.fabrik.finger import FingerSolver, finger_chain
+from common.hand.profiles import generated_profile, preset_couplings, preset_limits
+from master.fabrik.fabrik import Chain, ChainResult, Coupling, Fabrik, Link, Reach, least_root_to_end
 from master.fabrik.joints import Angles, Hinge, Rotor
-from master.fabrik.rotations import (
+from master.fabrik.linear_algebra import (
     IDENTITY,
     Vector,
     as_vector,
@@ -27,6 +24,7 @@ from master.fabrik.rotations import (
     rotate_back,
     rotation_about,
 )
+from master.fabrik.solver import FingerSolver, finger_chain
 
 Preset = Literal["K", "D"]
 

@@ -14,10 +14,9 @@ from scipy.optimize import least_squares
 
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile, load
-from common.calibration.hand_presets import preset_couplings, preset_limits
 from common.hand.model import FINGERS, TIPS, HandModel
-from common.hand.profiles import generated_profile
-from master.fabrik.finger import NOT_SEEN, Finger, FingerSolution, FingerSolver, Four
+from common.hand.profiles import generated_profile, preset_couplings, preset_limits
+from master.fabrik.solver import NOT_SEEN, Finger, FingerSolution, FingerSolver, Four
 
 Preset = Literal["K", "D"]
 DEGREE = math.pi / 180

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import axis_rotation, rigid
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import CapTables
 from master.fabrik.intersection import RAYS, Triangulation, limits_of, triangulate
 from master.fabrik.rays import RayTriangulator

@@ -8,13 +8,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from common.calibration.hand_presets import preset_limits
 from common.hand.model import HandModel
-from common.hand.profiles import generated_profile
-from master.fabrik.finger import finger_chain
-from master.fabrik.joints import Angles, Hinge, Joint, Rotor
-from master.fabrik.limits import swing_and_flex
-from master.fabrik.rotations import (
+from common.hand.profiles import generated_profile, preset_limits
+from master.fabrik.joints import Angles, Hinge, Joint, Rotor, swing_and_flex
+from master.fabrik.linear_algebra import (
     IDENTITY,
     Matrix,
     Vector,
@@ -25,6 +22,7 @@ from master.fabrik.rotations import (
     rotate_back,
     rotation_about,
 )
+from master.fabrik.solver import finger_chain
 
 DEGREE = math.pi / 180
 FINGER = Hinge(0.0, 110 * DEGREE)

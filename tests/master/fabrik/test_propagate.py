@@ -18,8 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.fabrik.propagate import SETTINGS, Reach, TrackHistory, propagate
-from master.fabrik.sync import FrameSet
+from master.fabrik.sync import SETTINGS, FrameSet, Reach, TrackHistory, propagate
 
 ROOT = Path(__file__).resolve().parents[3]
 MS = 1e6

@@ -16,9 +16,9 @@ from common.calibration import Provenance
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid
 from common.hand.model import TIPS, HandJoints
+from master.estimator.epoch import MarkerPositions, SolvedHand
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
-from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.rays import correct_centres as kernel_of_rays
 from tests.hand_helpers import (

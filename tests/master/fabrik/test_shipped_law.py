@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.estimator.cameras import CameraArrays
+from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import CalibrationResidual, depth_law, law_residual
 from master.fabrik.intersection import RAYS, limits_of, triangulate
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 SHIPPED = ("desk", "desk-fabrik", "desk-back3", "desk-cube", "desk-tracker", "desk-wand")
 

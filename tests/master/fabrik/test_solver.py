@@ -7,10 +7,10 @@ from common.arrays import Float
 from common.calibration import AffineDisparityCalibration
 from common.hand.model import CHAINS, TIPS
 from common.messages import MarkerDetections, Source
-from master.fabrik.estimate import HandEstimate
+from master.estimator.epoch import HandEstimate
 from master.fabrik.solver import FORGET_S, FabrikSolver
 from master.rig.pipeline import build_pipeline, line_of
-from master.run.stages import StageTimes
+from master.run.app import StageTimes
 from tests.hand_helpers import RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, synthetic_run
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.messages import MarkerDetections
-from master.fabrik.propagate import SETTINGS
-from master.fabrik.sync import SILENT_FRAMES, FrameSet, FrameSync
+from master.fabrik.sync import SETTINGS, SILENT_FRAMES, FrameSet, FrameSync
 from tests.hand_helpers import camera_models, detections, rig_file
 
 MS = 1_000_000

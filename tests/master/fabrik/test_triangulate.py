@@ -6,9 +6,9 @@ import pytest
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import axis_rotation, rigid
+from master.estimator.epoch import SolvedHand
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
-from master.fabrik.estimate import SolvedHand
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables, place_centroids
 from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, cap_bias_px, natural_angles, palm
 

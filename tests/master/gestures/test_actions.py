@@ -10,8 +10,13 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
-from common.calibration.gesture_actions import DialSettings, PinchSettings, check_actions
-from common.calibration.gesture_settings import GestureSettings, default_gestures
+from common.calibration.gesture_settings import (
+    DialSettings,
+    GestureSettings,
+    PinchSettings,
+    check_actions,
+    default_gestures,
+)
 from common.errors import CalibrationError
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, rigid
 from common.hand.model import TIPS, HandModel

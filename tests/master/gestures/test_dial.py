@@ -16,7 +16,7 @@ from common.hand.model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step
-from master.gestures.grip_history import GripHistory
+from master.gestures.dial import GripHistory
 from master.gestures.recogniser import GestureRecogniser
 
 STILL, FRAME_NS = np.zeros((5, 4)), 16_666_667

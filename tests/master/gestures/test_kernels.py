@@ -12,16 +12,15 @@ import pytest
 import master.gestures
 from common.calibration.gesture_settings import default_gestures
 from common.geometry.transforms import axis_rotation, rigid
-from common.hand.capsule_gaps import TaperedCapsules, gaps_between
 from common.hand.model import CHAINS
+from common.hand.skin import TaperedCapsules, gaps_between
 from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of
-from master.estimator.matrices import diagonalise, spread
-from master.gestures.features import FeatureExtractor
+from master.fabrik.linear_algebra import diagonalise, spread
+from master.gestures.features import FeatureExtractor, thumb_touch
 from master.gestures.grip import Tips, rotation_between
 from master.gestures.recogniser import GestureRecogniser
-from master.gestures.touch import thumb_touch
 from tests.hand_helpers import RIGHT, any_rotation
 from tests.master.gestures.shown_hands import FRAME_NS, shown
 

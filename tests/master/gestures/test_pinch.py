@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from common.calibration.gesture_settings import default_gestures
-from master.gestures.features import FeatureExtractor
-from master.gestures.pinch import PinchMonitor
-from master.gestures.touch import ThumbTouch, thumb_touch
+from master.gestures.actions import PinchMonitor
+from master.gestures.features import FeatureExtractor, ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, PINCH, posture, shown
 

@@ -6,8 +6,8 @@ import numpy as np
 from common.calibration.gesture_settings import default_gestures
 from common.hand.model import CHAINS
 from common.messages import Gesture
+from master.gestures.actions import PointMonitor
 from master.gestures.features import FeatureExtractor
-from master.gestures.point import PointMonitor
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, POINT, posture, shown
 

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.calibration.gesture_actions import TapSettings
-from common.calibration.gesture_settings import default_gestures
+from common.calibration.gesture_settings import TapSettings, default_gestures
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import CHAINS
 from common.messages import Gesture, HandPose
 from common.sim.motion import angles_of
-from master.gestures.features import FeatureExtractor
-from master.gestures.taps import ThumbTapMonitor
-from master.gestures.touch import thumb_touch
+from master.gestures.actions import ThumbTapMonitor
+from master.gestures.features import FeatureExtractor, thumb_touch
 from tests.hand_helpers import RIGHT, palm
 from tests.master.gestures.shown_hands import FRAME_NS, shown
 

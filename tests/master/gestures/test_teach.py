@@ -15,9 +15,8 @@ from common.messages import HandPose
 from master.gestures.command import seconds_of, with_pose
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import PoseRecogniser
-from master.gestures.template_session import template_session, what_lacks
-from master.gestures.templates import Example, learn
-from master.outputs.files import PosesFile
+from master.gestures.templates import Example, learn, template_session, what_lacks
+from master.outputs.poses import PosesFile
 from tests.cli import invoke
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, OPEN, PINCH, POINT, SMALL, posture, shown

@@ -5,8 +5,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand.model import CHAINS
-from master.gestures.features import FeatureExtractor
-from master.gestures.touch import ThumbTouch, thumb_touch
+from master.gestures.features import FeatureExtractor, ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import PINCH, posture, shown
 

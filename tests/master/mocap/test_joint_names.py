@@ -5,7 +5,7 @@ import pytest
 from common.errors import RecordingError
 from common.hand.model import JOINTS
 from master.mocap.joint_motion import Side
-from master.mocap.joint_names import choose_names
+from master.mocap.read import choose_names
 
 PARTS = ("metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
 

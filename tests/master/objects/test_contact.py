@@ -12,7 +12,7 @@ from common.calibration.object_profile import CylinderShape, ObjectProfile
 from common.geometry.transforms import matrix_to_quaternion, rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.messages import JOINT_COUNT, HandPose, ObjectPose
-from common.sim.grip import bar_in_palm, closed_round, gaps_m
+from common.sim.grasp import bar_in_palm, closed_round, gaps_m
 from common.sim.motion import REST, angles_of
 from master.objects.contact import ContactMonitor
 

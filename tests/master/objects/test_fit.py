@@ -7,9 +7,7 @@ from bench.objects.views import Where, wander
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
-from master.objects.fit import PoseFit
-from master.objects.motion import Motion
-from master.objects.sums import Observations
+from master.objects.fit import Motion, Observations, PoseFit
 
 POINTS = np.array([[0.0, 0.0, 0.115], [0.052, 0.0, -0.084], [-0.052, 0.0, -0.084], [0.0, 0.04, 0.0]])
 BEADS = np.full(4, 0.009)

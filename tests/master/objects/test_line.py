@@ -23,9 +23,8 @@ from common.geometry.transforms import (
     rotation_vector_to_matrix,
 )
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
-from master.objects.line import ObjectLine
-from master.objects.start import two_poses
-from master.objects.trajectory import HELD_S
+from master.objects.association import two_poses
+from master.objects.line import HELD_S, ObjectLine
 
 CALIBRATION = Path(__file__).parents[3] / "calib_json"
 Message = MarkerDetections | TagDetections

@@ -3,9 +3,8 @@
 import numpy as np
 
 from common.geometry.transforms import rigid
-from master.objects.fit import Fitted
-from master.objects.motion import ORDERS, Motion
-from master.objects.trajectory import HELD_S, Trajectory
+from master.objects.fit import ORDERS, Fitted, Motion
+from master.objects.line import HELD_S, Trajectory
 
 FRAME_NS = 16_666_667
 

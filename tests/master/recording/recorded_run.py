@@ -9,14 +9,13 @@ from typing import NamedTuple
 from common.bus.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
 from common.recording.messages import MessageWriter
-from master.recording.digest import ResultDigest
 from master.recording.files import carried_files, rigs_text
-from master.recording.player import world_of
+from master.recording.player import ResultDigest, world_of
 from master.recording.probe import Probe, Tapped, came_ns
-from master.rig.files import RigFiles
+from master.rig.setup import RigFiles
+from master.run.ingest import MessageQueue
 from master.run.link_senders import SensorMessage
-from master.run.load_shedding import LoadShedding
-from master.run.message_queue import MessageQueue
+from master.run.solver_supervisor import LoadShedding
 from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
 

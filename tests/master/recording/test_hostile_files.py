@@ -13,9 +13,9 @@ import pytest
 from common.messages import Health, MarkerDetections, Message, encode
 from common.messages.parts import MAX_TIME_NS
 from common.messages.streams import sender_of
-from common.recording.mcap_bounds import BOUNDS, CHUNK_RECORDS
+from common.recording.mcap_file import BOUNDS, CHUNK_RECORDS
 from master.recording.files import carried_files
-from master.rig.files import RigFiles
+from master.rig.setup import RigFiles
 from tests.commands import command
 from tests.common.hostile_mcap import (
     HostileMcap,

@@ -18,7 +18,7 @@ from common.errors import PhalanxError
 from common.messages import MAX_STILL_BYTES, Backlog, MarkerDetections, Message, Still, encode
 from common.messages.parts import MAX_TIME_NS
 from common.messages.streams import STREAMS, sender_of
-from common.recording.mcap_bounds import BOUNDS, CHUNK_RECORDS
+from common.recording.mcap_file import BOUNDS, CHUNK_RECORDS
 from common.recording.messages import MessageWriter, open_messages
 from master.recording.export.run import Wanted, export
 from master.recording.files import recorded_setups

@@ -12,13 +12,12 @@ from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, ResultMessage
 from common.messages.streams import MASTER
 from common.recording.messages import open_messages
-from master.outputs.files import load_poses
-from master.recording.clock import ReplayClock
+from master.outputs.poses import load_poses
 from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.play import PlaySettings, run_play
-from master.recording.player import Passed, Player
-from master.run.load_shedding import MOST
+from master.recording.player import Passed, Player, ReplayClock
+from master.run.solver_supervisor import MOST
 from tests.master.recording.recorded_run import MOST_FRAMES, RecordedRun, overloaded_run, recorded_run
 from tests.network_helpers import until
 

@@ -9,14 +9,13 @@ import pytest
 from common.bus.bus import LoopbackBus
 from common.errors import RecordingError
 from common.messages import Command, Health
-from common.messages.raw_wish import RawWish
+from common.messages.command_bodies import RawWish
 from common.recording.messages import open_messages
-from master.recording import process, raw
+from master.recording import record, recorder
 from master.recording.lines import raw_lines
-from master.recording.process import RecordSettings, run_recorder
-from master.recording.raw import RawAsker
-from master.recording.recorder import Progress
-from master.rig.files import RigFiles
+from master.recording.record import RecordSettings, run_recorder
+from master.recording.recorder import Progress, RawAsker
+from master.rig.setup import RigFiles
 from tests.master.recording.test_recorder import FakeMaster, recording
 from tests.network_helpers import until
 
@@ -52,7 +51,7 @@ def asker(cameras: Sequence[str], output: list[str]) -> RawAsker:
 def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
+    monkeypatch.setattr(record, "_PERIOD_NS", 20_000_000)
     hub = LoopbackBus()
     master, left = FakeMaster(hub.join()), FakeSlave(hub, "left")
     FakeSlave(hub, "right", "raw: this slave keeps no raw frames: start it with --raw-folder DIR")
@@ -126,5 +125,5 @@ def test_a_slave_that_is_gone_at_the_end_ends_by_itself() -> None:
     end.close()
     one.end(bus)
     assert output[1].startswith(
-        f"camera left: raw frames end within {raw.LEASE_S:g} s by themselves: no answer"
+        f"camera left: raw frames end within {recorder.LEASE_S:g} s by themselves: no answer"
     )

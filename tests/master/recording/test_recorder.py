@@ -17,14 +17,13 @@ from common.errors import BusError, CalibrationError, RecordingError
 from common.messages import Backlog, Command, Health, MarkerDetections, Message, Preview, Still
 from common.messages.streams import MASTER
 from common.recording.messages import MessageWriter, open_messages
-from master.recording import process, subscriber
+from master.recording import record
 from master.recording.lines import ProgressLine, events_of, progress_text
 from master.recording.probe import LEASE_NS, Probe, Tapped, came_ns
-from master.recording.process import NAME, RecordSettings, run_recorder
+from master.recording.record import NAME, MasterClock, RecordSettings, run_recorder
 from master.recording.recorder import MessageRecorder, Progress
-from master.recording.subscriber import MasterClock
-from master.rig.files import RigFiles
-from master.run.load_shedding import LoadShedding
+from master.rig.setup import RigFiles
+from master.run.solver_supervisor import LoadShedding
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 from tests.picture_helpers import TINY
 
@@ -214,7 +213,7 @@ def seqs_of(path: Path) -> list[int]:
 def test_a_recorder_keeps_what_a_master_receives_and_publishes(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
+    monkeypatch.setattr(record, "_PERIOD_NS", 20_000_000)
     hub = LoopbackBus()
     master, asker = FakeMaster(hub.join()), hub.join()
     asked = set[str]()
@@ -260,7 +259,7 @@ def test_a_recorder_keeps_what_a_master_receives_and_publishes(
 def test_a_recorder_outlives_its_master_and_reports_what_a_replay_cannot_repeat(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
+    monkeypatch.setattr(record, "_PERIOD_NS", 20_000_000)
     hub = LoopbackBus()
     first = FakeMaster(hub.join())
     path, output = tmp_path / "a.mcap", list[str]()
@@ -299,8 +298,8 @@ def test_a_recorder_outlives_its_master_and_reports_what_a_replay_cannot_repeat(
 def test_a_connection_that_is_dead_is_opened_anew(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
-    monkeypatch.setattr(subscriber, "_ASK_S", 0.3)
+    monkeypatch.setattr(record, "_PERIOD_NS", 20_000_000)
+    monkeypatch.setattr(record, "_ASK_S", 0.3)
     end, opened = free_endpoint(), list[Bus]()
     first = FakeMaster(ZenohBus(end, None))
 

@@ -15,10 +15,8 @@ from common.calibration.output_settings import LslOutput
 from common.clock import now_ns
 from common.errors import PhalanxError
 from common.hand.model import JOINTS
-from master.outputs.network.here_only import keep_here, sockets
-from master.outputs.network.lsl import LslSink, channels, sample_of
-from master.outputs.network.lsl_library import PORTS
-from master.outputs.network.times import MasterTimes
+from master.outputs.network.conventions import MasterTimes
+from master.outputs.network.lsl import PORTS, LslSink, channels, keep_here, sample_of, sockets
 from tests.master.send.hands import hand_pose
 
 

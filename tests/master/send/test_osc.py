@@ -11,9 +11,8 @@ from common.calibration.output_settings import OscOutput
 from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS
 from common.messages import Contact, Gesture, ObjectPose, ResultMessage
-from master.outputs.network.osc import OscSink
-from master.outputs.network.osc_packets import Blank, BlankBundle, floats, ints
-from master.outputs.network.times import MasterTimes
+from master.outputs.network.conventions import MasterTimes
+from master.outputs.network.osc import Blank, BlankBundle, OscSink, floats, ints
 from tests.master.send.hands import hand_pose
 from tests.master.send.osc_reader import Received, packet_of
 

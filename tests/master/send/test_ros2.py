@@ -15,9 +15,17 @@ from common.calibration.output_settings import Ros2Output
 from common.errors import BusError
 from common.hand.model import JOINTS
 from common.messages import HandPose, ObjectPose, ObjectSource
-from master.outputs.network.ros2 import Ros2Sink
-from master.outputs.network.ros2_messages import ANGLES, FRAME, hand_messages, object_messages
-from master.outputs.network.ros2_names import Node, Topic, gid_of, ros_name
+from master.outputs.network.ros2 import (
+    ANGLES,
+    FRAME,
+    Node,
+    Ros2Sink,
+    Topic,
+    gid_of,
+    hand_messages,
+    object_messages,
+    ros_name,
+)
 from tests.master.send.cdr_reader import flags, joint_state, pose_array, pose_with_covariance, transforms
 from tests.master.test_outputs_files import random_pose
 from tests.network_helpers import until

@@ -16,10 +16,9 @@ from common.messages import Command, Health, ResultMessage
 from common.messages.streams import MASTER
 from master.outputs.bus import BusSink
 from master.outputs.network import outputs as registry
-from master.outputs.network.line import DEPTH, Counters, OutputLine
-from master.outputs.network.outputs import OUTPUTS, Output
+from master.outputs.network.conventions import MasterTimes
+from master.outputs.network.outputs import DEPTH, OUTPUTS, Counters, Output, OutputLine
 from master.outputs.network.sender import NAME, Housekeeping, Sender, run_sender, settings_of
-from master.outputs.network.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
 FILE = Path(__file__).parents[3] / "calib_json" / "outputs" / "default.json"
@@ -151,7 +150,7 @@ def test_what_is_named_is_on_whatever_the_file_says(sinks: dict[str, Kept]) -> N
 def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on(
     sinks: dict[str, Kept], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("master.outputs.network.line.FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr("master.outputs.network.outputs.FIRST_RETRY_S", 0.01)
     one, output = sender(OSC_ON, "osc", "vmc")
     eventually(lambda: sinks.keys() == {"osc", "vmc"})
     eventually(lambda: all(one.health().metrics[f"open.{name}"] for name in sinks))

@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from common.errors import PhalanxError
-from master.outputs.network.udp import UdpSender
+from master.outputs.network.osc import UdpSender
 from tests.network_helpers import free_udp_port
 from tests.sockets import listeners
 

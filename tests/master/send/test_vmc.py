@@ -17,8 +17,7 @@ from common.calibration.output_settings import VmcOutput
 from common.geometry.transforms import axis_rotation, quaternion_to_matrix
 from common.hand.model import FINGER_JOINTS, PALM, WRIST
 from common.messages import HandPose
-from master.outputs.network.sides import Side, side_of
-from master.outputs.network.times import MasterTimes
+from master.outputs.network.conventions import MasterTimes, Side, side_of
 from master.outputs.network.vmc import VmcSink
 from tests.master.send.hands import MODELS, hand_pose, pose_of
 from tests.master.send.osc_reader import Received, packet_of

@@ -19,8 +19,8 @@ from websockets.sync.client import connect
 from common.calibration.output_settings import LslOutput, OscOutput, OutputSettings, WebOutput
 from common.errors import PhalanxError
 from master.outputs.network.outputs import who_reads
-from master.outputs.network.web import KEY_FILE, WebSink, address_of, request_filter_of
 from master.outputs.web.listening import is_loopback, page_certificate
+from master.outputs.web.server import KEY_FILE, WebSink, address_of, request_filter_of
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0

@@ -12,7 +12,7 @@ from playwright.sync_api import Page
 from common.arrays import Float
 from common.calibration.output_settings import WebOutput
 from common.messages import HandPose, ObjectPose
-from master.outputs.network.web import WebSink
+from master.outputs.web.server import WebSink
 from tests.browser import WAIT_MS, chromium
 from tests.master.send.hands import hand_pose
 

@@ -18,9 +18,8 @@ from websockets.typing import Origin
 from common.calibration.output_settings import WebOutput
 from common.errors import PhalanxError
 from common.messages import Gesture
-from master.outputs.network.web import WebSink
 from master.outputs.web import static_dir, three_js_path
-from master.outputs.web.server import SEND_BUFFER_BYTES, WebServer, foreign
+from master.outputs.web.server import SEND_BUFFER_BYTES, WebServer, WebSink, foreign
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0

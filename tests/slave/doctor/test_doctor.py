@@ -11,23 +11,30 @@ from pathlib import Path
 
 import pytest
 
-from common.bus.certificates import issue, new_authority
-from common.bus.keys import new_key
+from common.bus.keys import issue, new_authority, new_key
 from common.clock import SystemClock
 from common.machine import ROOT, Program
 from master.run.link import MasterLink
 from slave.__main__ import main
 from slave.cli.table import PROGRAM
-from slave.doctor.clock import check_clock
 from slave.doctor.command import examine
 from slave.doctor.devices import check_devices, check_groups
-from slave.doctor.finding import Finding, Verdict, as_json, as_text, exit_code, fail, ok, unseen, warn
-from slave.doctor.host import check_host
-from slave.doctor.identity import check_keys
-from slave.doctor.master import check_master
-from slave.doctor.programs import check_programs
-from slave.doctor.system import Ran, System, run
-from slave.doctor.unit import check_unit
+from slave.doctor.finding import (
+    Finding,
+    Ran,
+    System,
+    Verdict,
+    as_json,
+    as_text,
+    exit_code,
+    fail,
+    ok,
+    run,
+    unseen,
+    warn,
+)
+from slave.doctor.host import check_clock, check_host, check_programs, check_unit
+from slave.doctor.master import check_keys, check_master
 
 CALIBRATION = Path(__file__).resolve().parents[3] / "calib_json"
 NOW = datetime(2026, 11, 22, tzinfo=UTC)

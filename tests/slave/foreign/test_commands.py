@@ -10,7 +10,7 @@ import pytest
 
 from common.calibration import CameraCalibration, load, save
 from slave.__main__ import main
-from slave.offline import detect_recording
+from slave.commands.offline import detect_recording
 from tests.slave.foreign.foreign_videos import COUNT, write_tree, write_video
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 

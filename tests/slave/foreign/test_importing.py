@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from common.errors import PhalanxError, RecordingError
-from common.recording.frame_pictures import FramePictures
 from common.recording.frame_recording import FrameRecording, open_recording
+from common.recording.pictures import FramePictures
 from slave.foreign.importing import Wish, import_pictures
-from slave.foreign.times import read_times
+from slave.foreign.sources import read_times
 from tests.slave.foreign.foreign_videos import (
     COUNT,
     SIZE,

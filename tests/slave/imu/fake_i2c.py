@@ -6,7 +6,7 @@ from errno import EREMOTEIO
 
 from smbus2 import i2c_msg
 
-from slave.imu.lsm6dsox_fifo import Register
+from slave.imu.lsm6dsox import Register
 
 RATES = {code: 6667.0 / (1 << (10 - code)) for code in range(1, 7)}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from slave.imu.ximu3_protocol import Kind, plain, stuff
+from slave.imu.ximu3 import Kind, plain, stuff
 
 FACTORY: dict[str, object] = {
     "binary_mode_enabled": True,

@@ -10,7 +10,7 @@ from common.geometry.transforms import axis_rotation, matrix_to_quaternion
 from common.imu.csv_table import read_csv
 from common.imu.recording import read_imu
 from slave.__main__ import main
-from slave.imu.importing import import_table
+from slave.imu.recording import import_table
 
 HEADER = (
     "Packet;Timestamp (ms);Accelerometer X (g);Accelerometer Y (g);Accelerometer Z (g);gx_dps;gy_dps;gz_dps"

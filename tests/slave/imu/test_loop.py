@@ -16,8 +16,7 @@ from common.errors import ImuError
 from common.imu.fusion import OrientationFilter
 from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
-from slave.counters import imu_counters
-from slave.report import Reporter
+from slave.report import Reporter, imu_counters
 from slave.sender import ImuPipeline, run, skip_one, wait_for_start
 from slave.uplink import Uplink
 from tests.network_helpers import until

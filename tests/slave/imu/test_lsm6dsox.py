@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.lsm6dsox import SILENT_POLLS, I2cPlace, Lsm6dsoxImu, buses, rate_of
-from slave.imu.lsm6dsox_fifo import Register, Slots, temperature_c
+from slave.imu.lsm6dsox import (
+    SILENT_POLLS,
+    I2cPlace,
+    Lsm6dsoxImu,
+    Register,
+    Slots,
+    buses,
+    rate_of,
+    temperature_c,
+)
 from slave.reconnect import ReconnectingDriver
 from tests.slave.imu.fake_i2c import FakeLsm6dsox
 

@@ -11,8 +11,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.ximu3 import SerialPlace, Ximu3Imu, divisor, open_port
-from slave.imu.ximu3_protocol import Kind
+from slave.imu.ximu3 import Kind, SerialPlace, Ximu3Imu, divisor, open_port
 from slave.reconnect import ReconnectingDriver
 from slave.sources import ImuSource, Reporting
 from tests.slave.imu.fake_ximu3 import FakeXimu3

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from master.commands.keys_folder import make
+from master.commands.keys import make
 from slave.install import arguments, steps
+from slave.install.arguments import InstallError, plan_of
 from slave.install.bundle import calibration_of, keys_of
-from slave.install.errors import InstallError
-from slave.install.options import plan_of
 from slave.install.release import Source
 from slave.install.systemd import Systemd
 
@@ -22,8 +21,9 @@ ROOT = Path(__file__).resolve().parents[3]
 LOADED = (
     "live",
     "sender",
-    "devices",
-    "simulated",
+    "commands/__init__",
+    "commands/devices",
+    "commands/simulated",
 )  # by a release that is looked at
 
 
@@ -167,7 +167,8 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site_of(folder: Path, version: str, broken: bool = False, text: str = "", hangs: bool = False) -> Path:
     """site-packages with a slave that does nothing."""
     package = folder / "slave"
-    (package / "imu").mkdir(parents=True)
+    for room in ("imu", "commands"):
+        (package / room).mkdir(parents=True)
     for name in ("__init__", *LOADED):
         (package / f"{name}.py").write_text(f'"""Nothing. {text}"""\n')
     (package / "__main__.py").write_text("def main():\n    return 0\n")

@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slave.install import arguments
-from slave.install.boot_config import BEGIN, END, with_block, without_block
+from slave.install.arguments import InstallError, NotReadyError, Plan, plan_of
 from slave.install.bundle import calibration_of, keys_of
-from slave.install.errors import InstallError, NotReadyError
-from slave.install.options import Plan, plan_of
 from slave.install.probe import judge, probe
 from slave.install.systemd import Systemd
+from slave.install.wanted import BEGIN, END, with_block, without_block
 from tests.slave.install.conftest import ROOT, Board
 
 FILES = calibration_of(ROOT / "calib_json")

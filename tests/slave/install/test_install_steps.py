@@ -9,12 +9,10 @@ from pathlib import Path
 import pytest
 
 from slave.install import release, steps
-from slave.install.alone import LOCKED
-from slave.install.errors import InstallError
-from slave.install.options import STATE
+from slave.install.arguments import STATE, InstallError
 from slave.install.release import Source
-from slave.install.removal import uninstall
-from slave.install.transaction import NOTES, Transaction
+from slave.install.steps import uninstall
+from slave.install.transaction import LOCKED, NOTES, Transaction
 from slave.install.wanted import CALIB
 from tests.programs import needs
 from tests.slave.install.conftest import ROOT, Board, site_of

@@ -9,7 +9,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError, LightsError
 from slave.__main__ import main
-from slave.devices import choose_lights, light_limits, open_lights
+from slave.commands.devices import choose_lights, light_limits, open_lights
 from slave.lights.strobed import check_pulses, schedule_of
 from tests.slave.lights.stage import CAMERA, RIG, ROOT
 

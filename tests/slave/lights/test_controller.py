@@ -8,9 +8,8 @@ import pytest
 
 from common.clock import SystemClock
 from common.recording.frame_recording import Illumination
-from slave.lights.controller import FAILED_NS, StrobeController, Strober
+from slave.lights.controller import CYCLE, FAILED_NS, LEAST, StrobeController, Strober, StrobeSchedule
 from slave.lights.interlock import WINDOW_NS, Interlock
-from slave.lights.schedule import CYCLE, LEAST, StrobeSchedule
 from tests.slave.lights.stage import (
     AMBIENT,
     LASER,

@@ -11,9 +11,8 @@ from common.recording.frame_recording import Illumination
 from common.sim.wrist.scene import WristScene
 from slave.__main__ import main
 from slave.cameras.synthetic import SyntheticCamera
-from slave.lights.simulated import SimulatedStrobe, SyntheticLights, Timeline
-from slave.lights.strobed import StrobedCamera, schedule_of
-from slave.simulated import scene_of
+from slave.commands.simulated import scene_of
+from slave.lights.strobed import SimulatedStrobe, StrobedCamera, SyntheticLights, Timeline, schedule_of
 from slave.sources import Frame
 from slave.wrist.strobe import Strobe
 from tests.slave.lights.stage import (

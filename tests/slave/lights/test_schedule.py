@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slave.lights.schedule import AHEAD, LEAST, MARGIN_NS, Pulse, StrobeSchedule
+from slave.lights.controller import AHEAD, LEAST, MARGIN_NS, Pulse, StrobeSchedule
 from tests.slave.lights.stage import FIRST_NS, LASER, LED, MS, PERIOD_NS, exposures, stamp
 
 

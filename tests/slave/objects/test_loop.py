@@ -14,11 +14,11 @@ from common.clock import SkewedClock, SystemClock
 from common.errors import CalibrationError, TrackerError
 from common.geometry.transforms import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import Message, TrackerPose
-from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
+from common.sim.sensors import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
-from slave.counters import pose_counters
+from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
+from slave.report import pose_counters
 from slave.sender import PosePipeline, run, skip_one, wait_for_start
-from slave.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 KEY = "11" * 32
@@ -185,7 +185,7 @@ def test_the_command_says_in_one_line_what_is_missing(
 
 
 def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
-    from slave.devices import object_with
+    from slave.commands.devices import object_with
 
     rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
     with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):

@@ -11,9 +11,8 @@ from common.clock import SystemClock
 from common.errors import TrackerChoiceError, TrackerError
 from common.geometry.transforms import axis_rotation, rigid
 from common.messages import TrackerPose
-from slave.objects import openvr_library
-from slave.objects.openvr_library import connect, load_library
-from slave.objects.openvr_tracker import OpenVrTracker
+from slave.objects import openvr_tracker
+from slave.objects.openvr_tracker import OpenVrTracker, connect, load_library
 from slave.reconnect import ReconnectingTracker
 from tests.slave.objects.fake_openvr import (
     CONTROLLER,
@@ -171,7 +170,7 @@ def test_a_library_that_is_missing_or_does_not_run_here_is_reported(monkeypatch:
         (missing, r"not installed: pip install 'phalanx-hand\[vive\]'"),
         (foreign, "does not run here.*--device survive"),
     ):
-        monkeypatch.setattr(openvr_library.importlib, "import_module", broken)
+        monkeypatch.setattr(openvr_tracker.importlib, "import_module", broken)
         with pytest.raises(TrackerError, match=text):
             load_library()
 

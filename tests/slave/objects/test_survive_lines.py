@@ -9,16 +9,7 @@ from hypothesis import strategies as st
 
 from common.errors import TrackerChoiceError
 from common.geometry.transforms import quaternion_to_matrix
-from slave.objects.survive_lines import (
-    LONGEST,
-    Fault,
-    Gone,
-    LineDecoder,
-    Pose,
-    Serial,
-    SurviveDevice,
-    read_line,
-)
+from slave.objects.survive import LONGEST, Fault, Gone, LineDecoder, Pose, Serial, SurviveDevice, read_line
 from tests.slave.objects.recorded import HEAD, pose
 
 MS = 1_000_000

@@ -16,8 +16,8 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections, Message, TagDetections
 from common.recording.frame_recording import FrameRow, Illumination
-from slave.counters import DetectionCounters
-from slave.markers.null_detector import NullDetector
+from slave.markers.reloadable import NullDetector
+from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.tags.live import SHARE, LiveTags, Pace, finder_of
@@ -82,8 +82,8 @@ def test_without_tags_nothing_is_sent_counted_or_loaded() -> None:
     assert tags.push(Frame(0, 0, 0, picture()), 1, 0) is None
     assert tags.counts() == {}
     code = (
-        "import sys, slave.live, slave.offline, slave.__main__;"
-        "heavy = 'slave.tags.finder', 'slave.tags.reading', 'common.geometry.tag_family';"
+        "import sys, slave.live, slave.commands.offline, slave.__main__;"
+        "heavy = 'slave.tags.finder', 'slave.tags.finder', 'common.geometry.tag_family';"
         "sys.exit(any(n in sys.modules for n in heavy))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slave.wrist.background import lit
+from slave.wrist.strobe import lit
 
 
 def test_the_difference_saturates_at_zero_and_the_black_level_cancels() -> None:

@@ -10,7 +10,7 @@ from common.sim.board import BoardScene
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import SyntheticCamera
-from slave.simulated import scene_of
+from slave.commands.simulated import scene_of
 from slave.sources import Frame
 
 ROOT = Path(__file__).resolve().parents[3]

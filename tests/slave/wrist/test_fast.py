@@ -7,13 +7,13 @@ import pytest
 
 from common.arrays import Image
 from common.errors import PhalanxError
-from slave.wrist.background import lit
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import NUMPY, Engine, engine_named
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
 from slave.wrist.seams import FENCE
+from slave.wrist.strobe import lit
 from tests.slave.wrist.wrist_frames import VIEW, strobed
 
 pytest.importorskip("numba", reason="numba is not installed: the extra `fast`")
@@ -151,15 +151,15 @@ def test_a_finger_without_a_laser_point_has_no_tip(fast: Engine) -> None:
 
 
 def test_a_first_hand_finds_everything_compiled(fast: Engine) -> None:
-    from slave.wrist import fast as seams
-    from slave.wrist import fast_lines, fast_tips
+    from slave.wrist import fast as compiled
+    from slave.wrist import fast_tips
 
     functions = (
-        seams._minimum_cost_paths,
-        seams._energy,
-        fast_lines._scan,
-        fast_lines._link,
-        fast_lines._measure,
+        compiled._minimum_cost_paths,
+        compiled._energy,
+        compiled._scan,
+        compiled._link,
+        compiled._measure,
     )
     functions += (fast_tips._search,)
     before = [len(one.signatures) for one in functions]  # pyright: ignore[reportFunctionMemberAccess]

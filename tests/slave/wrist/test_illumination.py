@@ -10,7 +10,7 @@ import pytest
 
 from bench.wrist.strobe import Shown, rendered
 from common.arrays import Bool, Image
-from slave.wrist.illumination import SETTINGS, Evidence, brighter, coarse, evidence, unlit
+from slave.wrist.strobe import SETTINGS, Evidence, brighter, coarse, evidence, unlit
 
 LIGHTS = ("dark", "indoor", "bright")
 

@@ -3,9 +3,8 @@
 import numpy as np
 from msgspec.structs import replace
 
-from common.calibration.flat_field import flat_of
-from common.calibration.wrist import FlatField
-from slave.wrist.led_depth import depth_about, led_optics, nearness, shrink
+from common.calibration.rig import FlatField, flat_of
+from slave.wrist.led_image import depth_about, led_optics, nearness, shrink
 from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW
 

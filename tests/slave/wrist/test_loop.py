@@ -9,13 +9,12 @@ import pytest
 from common.hand.model import FINGERS
 from common.messages import Message, WristDetections
 from slave.__main__ import main
-from slave.counters import DetectionCounters
+from slave.report import DetectionCounters
 from slave.sender import DARK_AFTER, WristPipeline, run
 from slave.sources import Frame
-from slave.wrist.detector import WristDetector, WristFound
+from slave.wrist.detector import NullWristDetector, WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
-from slave.wrist.null_detector import NullWristDetector
 from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
 

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 
 from common.arrays import Float, Image
-from common.hand.wrist_joint import STRAIGHT
+from common.hand.wrist import STRAIGHT
 from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene, WristTruth
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
-from slave.wrist.background import lit
 from slave.wrist.detector import find
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
-from slave.wrist.led_depth import shrink
+from slave.wrist.led_image import shrink
 from slave.wrist.palm_pose import find_palm_pose, prepare, rotated_view, wrist_angles_seen
-from slave.wrist.strobe import StrobeCycle
+from slave.wrist.strobe import StrobeCycle, lit
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 WRIST_ANGLES = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))

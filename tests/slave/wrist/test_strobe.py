@@ -11,8 +11,7 @@ from bench.wrist.strobe import RATE_HZ, Delivered, Score, Shown, deliver, record
 from common.arrays import Image
 from common.recording.frame_recording import Illumination
 from slave.sources import Frame
-from slave.wrist.illumination import coarse, evidence
-from slave.wrist.strobe import Strobe, StrobeCycle
+from slave.wrist.strobe import Strobe, StrobeCycle, coarse, evidence
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
 PERIOD_NS = 1e9 / RATE_HZ

@@ -8,8 +8,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry.transforms import axis_rotation, invert, rigid, rotation_vector_to_matrix, transform
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners
-from master.calibrate.cameras.detect import ImageObservation
+from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, ImageObservation, board_corners
 from master.calibrate.cameras.views import BoardViews, View
 
 SIZE = (640, 480)

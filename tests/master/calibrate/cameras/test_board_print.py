@@ -11,9 +11,16 @@ import pytest
 from common.arrays import Float, Image
 from common.errors import CalibrationError
 from master.calibrate.cameras.board_print import page_for, print_board
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners, grid_edges
-from master.calibrate.cameras.detect import find_board
-from master.calibrate.cameras.options import board_of, options_of
+from master.calibrate.cameras.boards import (
+    Board,
+    Charuco,
+    Checkerboard,
+    board_corners,
+    board_of,
+    find_board,
+    grid_edges,
+    options_of,
+)
 
 PX_PER_MM = 6.0
 BOARDS = [

@@ -15,9 +15,8 @@ from common.messages import Still
 from common.sim.board import BOARD, BoardRenderer, BoardScene
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.capture import NOTES, Round, capture, new_folder
-from master.calibrate.cameras.image_sets import image_sets
-from master.calibrate.cameras.live_views import LiveViews
-from master.calibrate.cameras.views import look
+from master.calibrate.cameras.coverage import LiveViews
+from master.calibrate.cameras.views import image_sets, look
 
 CALIB = Path(__file__).parents[4] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)

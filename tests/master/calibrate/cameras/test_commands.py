@@ -12,10 +12,9 @@ from common.calibration import CameraCalibration, PowerLawCalibration, RigCalibr
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
-from master.calibrate.cameras.boards import Checkerboard, grid_edges
-from master.calibrate.cameras.detect import find_board
-from master.calibrate.cameras.files import without_wrong_law, write_files
-from master.calibrate.cameras.image_sets import image_sets
+from master.calibrate.cameras.boards import Checkerboard, find_board, grid_edges
+from master.calibrate.cameras.commands import without_wrong_law, write_files
+from master.calibrate.cameras.views import image_sets
 from tests.cli import calibrate
 from tests.hand_helpers import camera_file, rig_file
 from tests.master.calibrate.cameras.board_images import render

@@ -11,7 +11,7 @@ from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation, rigid
 from common.recording.frame_recording import FRAMES, MANIFEST
 from master.calibrate.cameras.coverage import advice, advice_so_far, coverage
-from master.calibrate.cameras.image_sets import MOST_VIEWS, image_sets
+from master.calibrate.cameras.views import MOST_VIEWS, image_sets
 from tests.master.calibrate.cameras.board_scenes import SIZE, scene
 
 MIDDLE = np.array([0.1, 0.06, 0.0])

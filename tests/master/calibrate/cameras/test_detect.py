@@ -6,8 +6,7 @@ import pytest
 
 from common.arrays import Image
 from common.errors import CalibrationError, FitError
-from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners, orderings
-from master.calibrate.cameras.detect import find_board
+from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners, find_board, orderings
 from master.calibrate.cameras.views import look
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import scene

@@ -9,11 +9,9 @@ import pytest
 
 from common.errors import FitError
 from common.geometry.transforms import invert
-from master.calibrate.cameras.boards import Charuco, Checkerboard, board_corners, orderings
-from master.calibrate.cameras.detect import ImageObservation
+from master.calibrate.cameras.boards import Charuco, Checkerboard, ImageObservation, board_corners, orderings
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
-from master.calibrate.cameras.report import report_lines
-from master.calibrate.cameras.result import result
+from master.calibrate.cameras.result import report_lines, result
 from master.calibrate.cameras.views import BoardViews, View
 from tests.master.calibrate.cameras.board_scenes import Scene, nudged, scene
 

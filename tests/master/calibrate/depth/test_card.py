@@ -8,13 +8,13 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.geometry.camera_model import CameraModel
 from common.sim.board import BOARD, BoardRenderer
-from common.sim.card import DISTANCES_M, MARKER, CardScene
+from common.sim.scenes import DISTANCES_M, MARKER, CardScene
 from master.calibrate.depth.fit import FITS
 from master.calibrate.depth.source import pair_of, parse_target, straightened
 from master.calibrate.depth.sweep import Sweep, checked
 from master.fabrik.depth import law_residual
-from slave.markers.light_adaptive import LightAdaptiveDetector
-from slave.markers.workers import Inline
+from slave.markers.reloadable import LightAdaptiveDetector
+from slave.markers.white_balance import Inline
 
 CALIB = Path(__file__).parents[4] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)

@@ -9,12 +9,12 @@ from common.arrays import Float
 from master.calibrate.depth.fit import (
     FITS,
     fit_affine_disparity,
+    fit_depth,
     fit_power_law,
     leave_one_out,
     outliers,
     relative_error,
 )
-from master.calibrate.depth.report import fit_depth
 from master.calibrate.depth.sweep import Sweep
 from master.fabrik.depth import AffineDisparity, PowerLaw
 

@@ -12,17 +12,9 @@ import pytest
 from common.arrays import Float
 from common.errors import CalibrationError, RecordingError
 from common.recording.frame_recording import FrameRecording, open_recording
-from common.recording.npz import write_npz
-from master.calibrate.depth.recording import (
-    Pairs,
-    by_file,
-    by_list,
-    by_truth,
-    read_pairs,
-    still_runs,
-)
-from master.calibrate.depth.sweep import Sweep
-from master.calibrate.depth.tables import parse_distances, read_table, write_table
+from common.recording.recorded_files import write_npz
+from master.calibrate.depth.source import Pairs, by_file, by_list, by_truth, read_pairs, still_runs
+from master.calibrate.depth.sweep import Sweep, parse_distances, read_table, write_table
 from master.fabrik.depth import AffineDisparity
 
 CAMERAS = ("left", "right")

@@ -15,8 +15,7 @@ from common.clock import SystemClock
 from common.errors import FitError
 from common.messages import ImuSample, MarkerDetections
 from master.calibrate.depth.session import Meter, Reading, measure, run_session
-from master.calibrate.depth.sweep import Sweep, checked
-from master.calibrate.depth.tables import read_table, write_table
+from master.calibrate.depth.sweep import Sweep, checked, read_table, write_table
 from master.fabrik.depth import AffineDisparity
 from master.run.ingest import Ingest
 from slave.uplink import Uplink

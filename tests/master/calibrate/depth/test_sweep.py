@@ -7,7 +7,7 @@ import pytest
 
 from common.arrays import Float
 from common.errors import FitError
-from master.calibrate.depth.report import fit_depth
+from master.calibrate.depth.fit import fit_depth
 from master.calibrate.depth.sweep import Sweep, checked
 from master.fabrik.depth import AffineDisparity
 

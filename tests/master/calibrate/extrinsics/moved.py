@@ -11,8 +11,8 @@ from common.calibration import RigCalibration
 from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
 from common.imu.fusion import OrientationFilter
 from common.messages import HandPose, ImuSample, WristDetections
-from common.sim.imu import InertialPart, SimulatedImu
-from master.calibrate.cameras.lens_files import matrix_of
+from common.sim.sensors import InertialPart, SimulatedImu
+from master.calibrate.tree_files import matrix_of
 from tests.master.calibrate.extrinsics.worn import both_of
 
 SECONDS, PACE, HAND_HZ, CYCLE_HZ = 6.4, 2.0, 60.0, 20.0

@@ -12,11 +12,9 @@ from common.geometry.transforms import quaternion_to_matrix
 from common.imu.recording import write_imu
 from common.messages import HandPose
 from common.recording.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
-from master.calibrate.extrinsics import command, extrinsics, fit
-from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
-from master.calibrate.extrinsics.report import refuse
-from master.calibrate.extrinsics.seen import Fit
-from master.calibrate.extrinsics.unknown import UNKNOWN
+from master.calibrate.extrinsics import command, extrinsics, problem
+from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics, refuse
+from master.calibrate.extrinsics.unknown import UNKNOWN, Fit
 from master.rig.setup import RigSetup
 from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
@@ -77,8 +75,8 @@ def test_the_command_writes_the_true_extrinsics_into_a_tree(
     # The line of the markers has tests of its own; without noise fewer steps are enough.
     monkeypatch.setattr(command, "marker_poses", as_seen)
     monkeypatch.setattr(extrinsics, "calibrate_extrinsics", noted)
-    monkeypatch.setattr(fit, "_COARSE_ROUNDS", (3,))
-    monkeypatch.setattr(fit, "_ROUNDS", (4, 3))
+    monkeypatch.setattr(problem, "_COARSE_ROUNDS", (3,))
+    monkeypatch.setattr(problem, "_ROUNDS", (4, 3))
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "extrinsics.png"
     files = ("--out", tree, "--picture", picture, "--json", tmp_path / "found.json")
     calibrate("extrinsics", folder, "--detections", folder, *files)

@@ -7,8 +7,8 @@ import pytest
 
 from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
-from master.calibrate.extrinsics.hands import HandProblem, Hands
-from master.estimator.body_points import BodyPoints
+from master.calibrate.extrinsics.normal import HandProblem, Hands
+from master.estimator.kinematics import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of
 from tests.master.calibrate.extrinsics.moved import moved

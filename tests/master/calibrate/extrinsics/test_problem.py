@@ -7,14 +7,12 @@ import pytest
 
 from common.arrays import Float
 from common.geometry.transforms import quaternion_to_matrix, rotation_vector_to_matrix
-from common.hand.wrist_joint import forearm_palm
+from common.hand.wrist import forearm_palm
 from master.calibrate.extrinsics.extrinsics import _cycles
-from master.calibrate.extrinsics.hands import Hands
-from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
-from master.calibrate.extrinsics.problem import Problem
-from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
+from master.calibrate.extrinsics.normal import Hands
+from master.calibrate.extrinsics.problem import Problem, bends_by_rotation, wrist_rotation_angles
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack, LinesOfSight
 from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, prior_sigma
-from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
 from master.rig.wrist import WristSetup
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 

@@ -15,8 +15,7 @@ from common.sim.motion import HandMotion, HandState
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene
 from master.calibrate.extrinsics.extrinsics import Extrinsics
-from master.rig.files import load_setup
-from master.rig.setup import RigSetup
+from master.rig.setup import RigSetup, load_setup
 
 CAMERA_LATE_S, IMU_LATE_S = 6e-3, -4e-3
 

@@ -11,7 +11,7 @@ from common.calibration import HandProfile, MarkerMount, RestJoint
 from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_matrix
 from common.hand.model import CHAINS, JOINTS, HandModel
 from common.hand.profiles import generated_profile
-from common.sim.routine import PERIOD_S, REST, HandRoutine
+from common.sim.people import PERIOD_S, REST, HandRoutine
 
 TIPS = ("thumb", "index", "middle", "ring", "little")
 MARKERS = (*TIPS, "back")

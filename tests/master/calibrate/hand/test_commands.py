@@ -10,7 +10,7 @@ from common.calibration import HandProfile, load, save
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
-from common.recording.npz import write_npz
+from common.recording.recorded_files import write_npz
 from tests.cli import calibrate
 from tests.master.calibrate.hand.routines import routine
 

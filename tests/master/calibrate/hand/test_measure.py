@@ -14,9 +14,15 @@ from common.errors import FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.hand.profiles import generated_profile
 from common.hand.routine import ROUTINE_S
-from master.calibrate.hand.measure import HandMeasurement, measure_hand
+from master.calibrate.hand.measure import (
+    HandMeasurement,
+    measure_hand,
+    measured_profile,
+    quick_profile,
+    report_json,
+    report_lines,
+)
 from master.calibrate.hand.observed import Observed
-from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
 from tests.master.calibrate.hand.routines import TIPS, SimulatedRoutine, routine, with_back
 
 

@@ -9,11 +9,9 @@ import pytest
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError, RecordingError
+from common.hand.fitting import joint_angles
 from common.hand.model import CHAINS, JOINTS, HandModel, couplings_of
-from common.hand.posture import joint_angles
-from master.calibrate.hand.motion import hand_from_motion, motion_lines
-from master.calibrate.hand.motion_couplings import Ratio, motion_couplings
-from master.calibrate.hand.palm import find_palm
+from master.calibrate.hand.motion import Ratio, find_palm, hand_from_motion, motion_couplings, motion_lines
 from master.mocap.joint_motion import Side
 from tests.cli import calibrate
 from tests.master.mocap.moved import LEFT, RIGHT, ROTATION, SHIFT, hand_at, motion_of, ns, write_table

@@ -9,7 +9,7 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import Bead, ObjectProfile
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.calibrate.object.seen import Seen, seen_by
+from master.calibrate.object.bundle import Seen, seen_by
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)

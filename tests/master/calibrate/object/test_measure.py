@@ -8,10 +8,8 @@ import pytest
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix, transform
-from master.calibrate.object.bundle import fit_bundle
-from master.calibrate.object.frame import frame_of, own_frame
-from master.calibrate.object.measure import Measurement, changes, measure_object
-from master.calibrate.object.seen import Seen, rows_of, seen_in
+from master.calibrate.object.bundle import Seen, fit_bundle, rows_of, seen_in
+from master.calibrate.object.measure import Measurement, changes, frame_of, measure_object, own_frame
 from tests.master.calibrate.object.motions import BEADS, PLACES_M, RIG, body, seen
 
 

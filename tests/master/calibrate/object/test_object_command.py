@@ -20,8 +20,8 @@ from master.__main__ import main
 from master.calibrate.object.session import guide, progress
 from master.objects.line import ObjectLine
 from master.replay.recorded import recorded_detections
-from master.rig.files import load_setup
-from slave.offline import detect_recording, save_detections
+from master.rig.setup import load_setup
+from slave.commands.offline import detect_recording, save_detections
 from tests.master.calibrate.object.motions import BEADS, CALIB, CAMERAS, RIG, seen
 
 WAND = load(CALIB / "objects" / "wand.json", ObjectProfile)

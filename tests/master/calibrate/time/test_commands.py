@@ -11,7 +11,7 @@ from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, PhalanxError
 from common.messages import MarkerDetections
 from common.recording.frame_recording import Manifest
-from master.calibrate.time.fit import measure_times, shifted
+from master.calibrate.time_offsets import measure_times, shifted
 from tests import timing_scenes as scenes
 from tests.cli import invoke
 from tests.hand_helpers import camera_file, rig_file

@@ -12,7 +12,7 @@ from common.geometry.transforms import (
     rotation_vector_to_matrix,
 )
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from master.calibrate.tracker.start import Placed
+from master.calibrate.tracker.fit import Placed
 
 ZERO_NS = 7_000_000_000_000
 MIDDLE = np.array([0.0, 0.0, 0.5])

@@ -15,14 +15,13 @@ from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
 from common.errors import FitError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
-from common.recording.npz import write_npz
+from common.recording.recorded_files import write_npz
 from master.__main__ import main
-from master.calibrate.tracker.coverage import coverage_of
-from master.calibrate.tracker.save import read_motion, write_motion
+from master.calibrate.tracker.command import read_motion, write_motion
 from master.calibrate.tracker.session import guide
-from master.calibrate.tracker.tracks import object_track, tracker_track
+from master.calibrate.tracker.tracks import coverage_of, object_track, tracker_track
 from master.objects.tracker import TrackerLine
-from master.outputs.devices import DevicePoses
+from master.outputs.bus import DevicePoses
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion
 
 CALIB = Path(__file__).resolve().parents[4] / "calib_json"

@@ -7,8 +7,8 @@ from msgspec.structs import replace
 from common.errors import FitError
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.messages import ObjectSource
+from master.calibrate.tracker.fit import Placed, closed_form, first_lag
 from master.calibrate.tracker.registration import register
-from master.calibrate.tracker.start import Placed, closed_form, first_lag
 from master.calibrate.tracker.tracks import object_track, tracker_track
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion, errors_of
 

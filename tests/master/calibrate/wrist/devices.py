@@ -7,13 +7,13 @@ from msgspec.structs import replace
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.calibration.wrist import LaserPlane
+from common.calibration.rig import LaserPlane
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.recording.frame_recording import Illumination
-from common.sim.wrist_board import ILLUMINATIONS, WristBoardRenderer, WristBoardScene, board_poses
+from common.sim.wrist.board import ILLUMINATIONS, WristBoardRenderer, WristBoardScene, board_poses
 from master.calibrate.cameras.boards import Checkerboard
-from master.calibrate.wrist.lit_views import LitView
+from master.calibrate.wrist.device import LitView
 from tests.conftest import ROOT
 
 BOARD = Checkerboard(9, 6, 0.015)

@@ -14,11 +14,11 @@ from common.errors import CalibrationError, FitError, PhalanxError, RecordingErr
 from common.hand.model import HandModel
 from common.recording.frame_recording import FRAMES, Illumination, Manifest
 from common.recording.frame_writing import RecordingWriter
-from common.recording.npz import write_npz
+from common.recording.recorded_files import write_npz
+from common.sim.wrist.board import WristBoardScene, record_wrist_board
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
-from master.calibrate.wrist.palm_board import BoardOffset
+from master.calibrate.wrist.palm import BoardOffset
 from master.rig.wrist import WristSetup
 from tests.cli import calibrate
 from tests.conftest import ROOT

@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.calibration.flat_field import field_at, terms_of
-from common.calibration.wrist import FLAT_FIELD_TERMS
+from common.calibration.rig import FLAT_FIELD_TERMS, field_at, terms_of
 from common.errors import FitError
 from common.recording.frame_recording import Illumination
-from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer
-from master.calibrate.wrist.board_pose import board_pose
-from master.calibrate.wrist.flat_field import (
-    WhiteSamples,
-    fit_flat_field,
-    white_samples,
-)
+from common.sim.wrist.board import LED_LOBE, LENS_POWER, WristBoardRenderer
+from master.calibrate.wrist.device import board_pose
+from master.calibrate.wrist.flat_field import WhiteSamples, fit_flat_field, white_samples
 from tests.master.calibrate.wrist.devices import BOARD, OPTICS, scene_of, view_of
 
 AMBIENT, LED = Illumination.AMBIENT, Illumination.LED

@@ -10,8 +10,8 @@ import pytest
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.hand.model import HandModel
 from master.calibrate.laser_intersection import LaserIntersection
-from master.estimator.flexion_synergy import FlexionSynergy
-from master.estimator.laser_plane import PlaneAxes
+from master.estimator.priors import FlexionSynergy
+from master.estimator.sensors import PlaneAxes
 from master.rig.wrist import WristSetup
 from tests.wrist_run import mirrored_setup, wrist_setup
 

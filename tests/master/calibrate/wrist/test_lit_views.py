@@ -1,6 +1,6 @@
 """Views by what lit them, and how what was left out of them is told."""
 
-from master.calibrate.wrist.lit_views import grouped_by_reason
+from master.calibrate.wrist.device import grouped_by_reason
 
 
 def test_each_reason_is_reported_once_with_its_views() -> None:

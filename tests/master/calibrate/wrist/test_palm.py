@@ -11,8 +11,8 @@ from common.geometry.transforms import (
     transform,
 )
 from master.calibrate.cameras.boards import Checkerboard, board_corners
-from master.calibrate.wrist.board_pose import BoardPose, place_corners
-from master.calibrate.wrist.palm_board import BoardOffset, palm_from_board
+from master.calibrate.wrist.device import BoardPose, place_corners
+from master.calibrate.wrist.palm import BoardOffset, palm_from_board
 from tests.master.calibrate.wrist.devices import OPTICS, RIG
 
 BOARD = Checkerboard(7, 4, 0.010)

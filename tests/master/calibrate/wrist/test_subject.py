@@ -15,14 +15,12 @@ from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import rotation_vector_to_matrix, transform
 from common.hand.model import CHAINS, HandModel
-from common.hand.palmar_surface import PalmarSurface
+from common.hand.skin import PalmarSurface
 from common.messages import WristDetections
-from common.recording.npz import write_npz
-from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.guided import FLAT, guided
+from common.recording.recorded_files import write_npz
+from master.calibrate.tree_files import matrix_of, provenance
 from master.calibrate.wrist.subject import Subject, calibrate_subject
-from master.calibrate.wrist.subject_fit import fists_of
+from master.calibrate.wrist.subject_fit import FLAT, fists_of, guided
 from master.calibrate.wrist.subject_model import UNKNOWN, SubjectModel, Unknown, fitted_profile
 from master.rig.wrist import WristSetup
 from tests.cli import calibrate

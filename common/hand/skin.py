@@ -1,0 +1,241 @@
+"""Round cones model the skin of fingers: their gaps and their palmar side.
+
+Distance between the skins of two fingers, modelled as round cones.
+
+The flesh on a bone is nearly a round cone.
+
+A round cone is the union of balls whose middles go along a line and whose radii go evenly from one end to the other. So
+the gap of two is the least, over s and t in 0..1, of
+
+    |(a + s u) - (b + t v)| - (r_a + s d_a) - (r_b + t d_b),
+
+which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` take numbers
+as well as arrays and call nothing of their own, so that kernels may compile them.
+
+Palmar skin of flexed fingers: chains of round cones along the bones.
+
+Computes where rays meet them first.
+
+Where the laser meets a finger depends on its skin, and its bones lie nearer to the back than to the palm. Each finger
+is a chain of spheres joined by cones. A sphere has the radius by which the palmar side is round, and its centre is put
+so that the skin is as far from the bone as it should be.
+
+If the hand file gives `radius_m`, the skin is that far from every joint. If not, it is that of a hand of this size:
+shares of the distance between the knuckles of index and little finger, since the breadth of a hand gives the thickness
+of its fingers (Buchholz, Armstrong, "An ellipsoidal representation of human hand anthropometry", Human Factors 33,
+1991). The shares are those of the generic hand of the WebXR Input Profiles (MIT), cut across at these places while its
+own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and depths by breadth of hand of the scalable
+hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
+bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
+1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion measures of a person
+(`phalanx calibrate wrist subject`) is the file's `palmar_scale`, which multiplies both.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias, get_args
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import Finger
+from common.geometry.tapered_capsules import Capsules, terms
+from common.geometry.tapered_capsules import first_hits as capsule_hits
+from common.hand.model import CHAINS, Chains, HandModel
+
+Foot: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
+
+ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaperedCapsules:
+    """Cones of any leading shape.
+
+    Attributes:
+        start_m, along_m: (..., 3) [m] middle of the first ball, and from there to the last.
+        radius_m, growth_m: (...) [m] radius of the first ball, and by how much that of the last is larger.
+    """
+
+    start_m: Float
+    along_m: Float
+    radius_m: Float
+    growth_m: Float
+
+    @classmethod
+    def of_segments(cls, joints_m: Float, radius_m: Float) -> "TaperedCapsules":
+        """Return the segments (..., 5, 3), thumb ... little, from the root on.
+
+        From joints (..., 26, 3) and radii (26,) [m].
+        """
+        chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
+        return cls(chain[..., :-1, :], np.diff(chain, axis=-2), radius[..., :-1], np.diff(radius, axis=-1))
+
+    def part(self, *at: int | slice | None) -> "TaperedCapsules":
+        """Some of the segments: indices into the two last axes, (finger, segment)."""
+        where, place = (..., *at), (..., *at, slice(None))
+        return TaperedCapsules(
+            self.start_m[place], self.along_m[place], self.radius_m[where], self.growth_m[where]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaps:
+    """Where two sets of cones are nearest.
+
+    Attributes:
+        gap_m: (...) [m] between the skins, negative where they overlap.
+        on_a, on_b: (...) 0..1 how far along each cone the two balls are that are nearest.
+        middle_m: (..., 3) [m] half way between the skins there.
+        a_to_b: (..., 3) unit vector from the one ball to the other.
+    """
+
+    gap_m: Float
+    on_a: Float
+    on_b: Float
+    middle_m: Float
+    a_to_b: Float
+
+
+def gaps_between(a: TaperedCapsules, b: TaperedCapsules) -> Gaps:
+    """The gaps of cones against cones, broadcast against each other."""
+    apart = b.start_m - a.start_m
+    uu, vv = np.vecdot(a.along_m, a.along_m), np.vecdot(b.along_m, b.along_m)
+    uv, au, bv = (
+        np.vecdot(one, two) for one, two in ((a.along_m, b.along_m), (apart, a.along_m), (apart, b.along_m))
+    )
+    square = np.vecdot(apart, apart)
+    on_a = foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, a.growth_m, uu)
+    on_b = foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, b.growth_m, vv)
+    s = t = np.full(apart.shape[:-1], 0.5)
+    for _ in range(ROUNDS):
+        s, before = nearest(on_a, t), t
+        t = nearest(on_b, s)
+        if (t == before).all():  # as where the nearest are ends of bones: more rounds change nothing
+            break
+    from_a = a.start_m + s[..., None] * a.along_m
+    between = b.start_m + t[..., None] * b.along_m - from_a
+    length = np.sqrt(np.vecdot(between, between))
+    way = between / np.maximum(length, 1e-9)[..., None]
+    radius_a, radius_b = a.radius_m + s * a.growth_m, b.radius_m + t * b.growth_m
+    gap = length - radius_a - radius_b
+    middle = from_a + (radius_a + 0.5 * gap)[..., None] * way
+    return Gaps(gap, s, t, middle, way)
+
+
+def foot_of(
+    foot: Float, foot_by: Float, c0: Float, c1: Float, c2: Float, growth_m: Float, square: Float
+) -> Foot:
+    """Return where along a cone the foot of a point on the other's bone is.
+
+    The foot is linear in the point's share, and the square of its distance from the bone, in units of the bone's
+    length, is a quadratic: so a round needs no vectors.
+
+    Args:
+        foot, foot_by: The foot of the other's start, and by how much it goes on; shares of this bone.
+        c0, c1, c2: The square of the distance from this cone's start is c0 + c1 x + c2 x^2 of a share x.
+        growth_m, square: Of this cone: growth [m], and the square of its bone's length [m^2].
+
+    Returns:
+        `foot` and `foot_by`, the three coefficients of the square of the distance from the bone, and by how much the
+        nearest place is beyond the foot, to where the cone is thicker, per distance: the tangent of half its angle.
+    """
+    lean = growth_m / np.sqrt(np.maximum(square - growth_m * growth_m, 1e-12))
+    return foot, foot_by, c0 - foot * foot, c1 - 2.0 * foot * foot_by, c2 - foot_by * foot_by, lean
+
+
+def nearest(on: Foot, share: Float) -> Float:
+    """Return the position along a cone, 0..1, where its skin is nearest to a point.
+
+    The point is given by its share of the other cone's bone.
+    """
+    foot, foot_by, off_2, off_by, off_by_2, lean = on
+    beyond = lean * np.sqrt(np.maximum(off_2 + share * (off_by + share * off_by_2), 0.0))
+    return np.minimum(np.maximum(foot + share * foot_by + beyond, 0.0), 1.0)
+
+
+SPREAD = 0.10  # of the palmar distance, standard deviation
+# Of the spheres of a finger: on which of its three bones, and at what share of it.
+PLACES = ((0, 0.0), (0, 0.3), (0, 0.5), (0, 0.75), (1, 0.0), (1, 0.5), (2, 0.0), (2, 1.0))
+ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
+_BONE = np.array([bone for bone, _ in PLACES])
+_SHARE = np.array([share for _, share in PLACES])
+_JOINTS = (4, 6)  # spheres that sit on a joint, where the skin lies on the bisector
+# Palmar distance of the skin from the bone, and radius [share of the distance of the knuckles], thumb ... little. The
+# pads of the palm reach over the first half of a finger's first bone.
+_PALMAR = np.array(
+    [
+        [0.200, 0.200, 0.200, 0.200, 0.180, 0.173, 0.155, 0.133],
+        [0.250, 0.205, 0.168, 0.163, 0.142, 0.128, 0.102, 0.100],
+        [0.300, 0.245, 0.188, 0.183, 0.163, 0.133, 0.107, 0.105],
+        [0.250, 0.200, 0.166, 0.145, 0.150, 0.133, 0.112, 0.104],
+        [0.230, 0.170, 0.117, 0.114, 0.105, 0.104, 0.089, 0.081],
+    ]
+)
+_RADIUS = np.array(
+    [
+        [0.200, 0.200, 0.200, 0.200, 0.165, 0.155, 0.160, 0.140],
+        [0.153, 0.153, 0.153, 0.142, 0.143, 0.133, 0.132, 0.112],
+        [0.137, 0.137, 0.137, 0.135, 0.133, 0.133, 0.130, 0.119],
+        [0.127, 0.127, 0.127, 0.132, 0.128, 0.120, 0.109, 0.100],
+        [0.135, 0.135, 0.135, 0.125, 0.122, 0.112, 0.110, 0.100],
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PalmarSurface:
+    """The skin of one hand.
+
+    Attributes:
+        palmar_m: (5, 8) distance of the skin from the bone on the palmar side [m], finger by sphere.
+        radius_m: (5, 8) of the spheres [m].
+    """
+
+    palmar_m: Float
+    radius_m: Float
+
+    @classmethod
+    def of(cls, model: HandModel) -> "PalmarSurface":
+        """Return the palmar surface of a hand file, or of a hand of its size.
+
+        As thick as the file's `palmar_scale` states.
+        """
+        thick = np.array([[model.profile.palmar_scale.get(finger, 1.0)] for finger in get_args(Finger)])
+        if model.profile.radius_m is None:
+            knuckles = model.rest_position_m[CHAINS[[1, 4], 0]]
+            size = float(np.linalg.norm(knuckles[1] - knuckles[0]))
+            return cls(thick * size * _PALMAR, thick * size * _RADIUS)
+        near, far = (model.radius_m[CHAINS[:, _BONE + k]] for k in (0, 1))
+        radius = thick * (near + _SHARE * (far - near))
+        return cls(radius, radius)
+
+    def spheres(self, chains: Chains) -> Float:
+        """Centres (..., 5, 8, 3) [m] of the spheres, in the frame of the chains."""
+        bone = chains.position_m[..., 1:, :] - chains.position_m[..., :-1, :]
+        along = bone / np.sqrt(np.vecdot(bone, bone))[..., None]
+        dorsal = chains.rotation[..., :3, :, 1]
+        dorsal = dorsal - np.vecdot(dorsal, along)[..., None] * along
+        dorsal = dorsal / np.sqrt(np.vecdot(dorsal, dorsal))[..., None]
+        back = dorsal[..., _BONE, :]
+        for sphere in _JOINTS:
+            between = dorsal[..., _BONE[sphere] - 1, :] + dorsal[..., _BONE[sphere], :]
+            back[..., sphere, :] = between / np.sqrt(np.vecdot(between, between))[..., None]
+        on_bone = chains.position_m[..., _BONE, :] + _SHARE[:, None] * bone[..., _BONE, :]
+        return on_bone + (self.radius_m - self.palmar_m)[..., None] * back
+
+
+def first_hits(origin: Float, rays: Float, centres: Float, radius: Float) -> Float:
+    """Return the distance along rays at which each cone of a chain is first hit.
+
+    Unit rays (..., R, 3) from `origin` (3,); result (..., R, K - 1); inf: missed.
+
+    Args:
+        origin: Outside of all cones.
+        rays: In the frame of the centres.
+        centres: (..., K, 3) of the spheres of a chain.
+        radius: (K,).
+    """
+    chain = Capsules(centres[..., :-1, :], centres[..., 1:, :], radius[:-1], radius[1:])
+    known = terms(chain, origin, np.float64)[..., None, :]
+    hits: Float = capsule_hits(known, np.moveaxis(rays, -1, 0)[..., None])
+    return hits

@@ -1,0 +1,343 @@
+"""The payload is what goes to a machine: bundle, keys, files and wheels.
+
+Bundle that goes to a machine by the input of ssh.
+
+Installer, keys of that machine, files of the rig, as one zip in memory.
+
+Nothing of it touches a disk there before the installer writes it: a dry run writes nothing, no key is left in a file.
+
+Wheels for another machine, gathered on this one.
+
+What a slave needs, for its Python and processor, and our own.
+
+Downloaded once for each kind of machine, and kept below ~/.cache/phalanx.
+"""
+
+import hashlib
+import io
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from base64 import urlsafe_b64encode
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+from deploy.targets import DeployError, RigFile
+
+ROOT = Path(__file__).resolve().parents[1]
+KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"
+_OWN = ("pem", "key", "secret")
+# Runs on the other machine: the zip is a file in memory, from which Python imports.
+_BOOT = (
+    "import os,sys;f=os.memfd_create('phalanx');"
+    "o=open(f,'wb',closefd=False);o.write(sys.stdin.buffer.read());o.flush();"
+    "p='/proc/self/fd/%d'%f;sys.path.insert(0,p);"
+    "sys.argv=['slave.install']+[a.replace('@BUNDLE@',p) for a in sys.argv[1:]];"
+    "import runpy;runpy.run_module('slave.install',run_name='__main__')"
+)
+BUNDLE = "@BUNDLE@"  # in arguments: where the zip is there
+
+
+def command(arguments: Sequence[str], sudo: bool) -> list[str]:
+    """The command line there, which takes the zip as its input."""
+    return [*(["sudo", "-n"] if sudo else []), "python3", "-c", _BOOT, *arguments]
+
+
+def bundle(keys: Path | None, names: Sequence[str], calibration: Path | None, rig: RigFile | None) -> bytes:
+    """The zip.
+
+    Args:
+        keys: Keys folder, of which only what the machine may have is taken; None: none.
+        names: Cameras and IMUs that it serves.
+        calibration: calib_json tree, of which only what the rig needs is taken; None: none.
+        rig: That rig.
+
+    Raises:
+        DeployError: A file is missing.
+    """
+    files = {path.relative_to(ROOT).as_posix(): path for path in _installer()}
+    if keys is not None:
+        own = ["rig.key", "ca.pem", *(f"devices/{name}.{kind}" for name in names for kind in _OWN)]
+        files |= {KEYS + name: keys / name for name in own}
+    if calibration is not None and rig is not None:
+        files |= {CALIBRATION + name: calibration / name for name in rig.files}
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, path in files.items():
+            try:
+                archive.writestr(name, path.read_bytes())
+            except OSError as error:
+                raise DeployError(f"{path}: {error.strerror}; it has to go to the machine") from error
+    return packed.getvalue()
+
+
+def _installer() -> list[Path]:
+    package = ROOT / "slave" / "install"
+    return [ROOT / "slave" / "__init__.py", *package.glob("*.py"), *(package / "files").glob("*")]
+
+
+NAME = "phalanx-hand"
+PACKAGES = ("slave", "common", "master", "deploy")
+_GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28", "2_31", "2_34", "2_35")  # Bookworm has 2.36
+_WHEN = (1980, 1, 1, 0, 0, 0)  # a wheel of the same content is the same file
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What wheels have to fit to.
+
+    Attributes:
+        machine: aarch64 or x86_64.
+        python: Version, as 3.13.
+        more: Requirements besides ours.
+        extras: Of ours.
+    """
+
+    machine: str
+    python: str
+    more: tuple[str, ...] = ()
+    extras: tuple[str, ...] = ()
+
+
+def cache() -> Path:
+    """Where wheels are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "phalanx"
+
+
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """What a release is made of.
+
+    Attributes:
+        files: Wheels, ours among them.
+        release: Its name: our version and a hash of all of them, so that other content is another release.
+    """
+
+    files: tuple[Path, ...]
+    release: str
+
+    @property
+    def size_mb(self) -> float:
+        """How much has to be sent."""
+        return sum(file.stat().st_size for file in self.files) * 1e-6
+
+
+def wheelhouse(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
+    """The wheels for machines of this kind.
+
+    Args:
+        kind: Of machine.
+        given: Folder that the user made; ours is added if it is missing there. None: they are downloaded.
+        notify: Called when something is downloaded.
+
+    Raises:
+        DeployError: A wheel cannot be had.
+    """
+    try:
+        return _gathered(kind, given, notify)
+    except OSError as error:
+        raise DeployError(f"wheels: {error.filename or cache()}: {error.strerror or error}") from error
+
+
+def _gathered(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
+    with _LOCK:  # the second machine of a kind waits for the first
+        folder = _downloaded(kind, notify) if given is None else given
+        files = sorted(folder.glob("*.whl"))
+        if not files:
+            raise DeployError(f"--wheelhouse {given}: no wheels in it")
+        _check_given(files, kind, given)
+        if not any(file.name.startswith("phalanx_hand-") for file in files):
+            files.append(own_wheel())
+        files.sort(key=lambda file: file.name)  # as the installer there names it, too
+        digest = hashlib.sha256()
+        for file in files:
+            digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
+        versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
+        return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
+
+
+def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
+    """Refuse wheels of another kind of machine here, where it costs nothing.
+
+    Raises:
+        DeployError: Names the first of them.
+    """
+    for file in files if given is not None else ():
+        if not fits(file.name, kind):
+            raise DeployError(
+                f"--wheelhouse {given}: {file.name} is not for {kind.machine} with Python {kind.python}; "
+                f"those that are: phalanx fleet wheels DIR --machine {kind.machine} --python {kind.python}"
+            )
+
+
+def fits(wheel: str, kind: Kind) -> bool:
+    """Check whether a wheel can be installed on such a machine.
+
+    By the tags of its name (PEP 427).
+    """
+    parts = wheel.removesuffix(".whl").split("-")
+    if len(parts) < 5:
+        return False
+    pythons, abis, platforms = parts[-3:]
+    if platforms != "any" and not any(one.endswith(kind.machine) for one in platforms.split(".")):
+        return False
+    own = int(kind.python.replace(".", "", 1))
+    for python in pythons.split("."):
+        number = int(re.sub(r"\D", "", python) or 0)
+        if python.startswith("py") and number in (3, own):
+            return True
+        if python.startswith("cp") and (number == own or ("abi3" in abis and number <= own)):
+            return True
+    return False
+
+
+def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
+    """Put the wheels for machines of this kind into a folder.
+
+    For a machine without a network.
+
+    Raises:
+        DeployError: A wheel cannot be had, or the folder has others already.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise DeployError(f"{folder}: is not empty")
+    wheels = wheelhouse(kind, None, notify)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in wheels.files:
+        shutil.copy2(file, folder)
+    return wheels
+
+
+def own_wheel() -> Path:
+    """Return the wheel of this program as it is, installed or in a source tree.
+
+    It is made without a network or a build.
+
+    Raises:
+        DeployError: It was never installed, so that nobody knows what it needs.
+    """
+    ours = _ours()
+    stem = f"{NAME.replace('-', '_')}-{ours.version}"
+    info = f"{stem}.dist-info"
+    files = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in _sources()}
+    files |= {
+        f"{info}/{name}": (ours.read_text(name) or "").encode() for name in ("METADATA", "entry_points.txt")
+    }
+    files[f"{info}/WHEEL"] = (
+        b"Wheel-Version: 1.0\nGenerator: phalanx\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    )
+    rows = [f"{name},sha256={_digest(content)},{len(content)}" for name, content in files.items()]
+    files[f"{info}/RECORD"] = "\n".join([*rows, f"{info}/RECORD,,", ""]).encode()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _WHEN), content, zipfile.ZIP_DEFLATED)
+    # In a folder of its hash: another program of another state does not change it while it is sent.
+    wheel = cache() / "own" / hashlib.sha256(packed.getvalue()).hexdigest()[:12] / f"{stem}-py3-none-any.whl"
+    if not wheel.is_file():
+        wheel.parent.mkdir(parents=True, exist_ok=True)
+        fresh = wheel.with_name(f".{os.getpid()}.new")
+        fresh.write_bytes(packed.getvalue())
+        fresh.replace(wheel)
+    return wheel
+
+
+def _sources() -> Iterable[Path]:
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                yield path
+
+
+def _ours() -> Distribution:
+    try:
+        return distribution(NAME)
+    except PackageNotFoundError as error:
+        raise DeployError(
+            f"{NAME} is not installed here (pip install .), so what it needs is not known"
+        ) from error
+
+
+def _digest(content: bytes) -> str:
+    return urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+
+
+def _downloaded(kind: Kind, notify: Callable[[str], None]) -> Path:
+    requirements = [*_requirements(kind.extras), *kind.more, "pip"]
+    limits = _limits()
+    key = "\n".join([*requirements, *([] if limits is None else [limits.read_text()])])
+    digest = hashlib.sha256(key.encode()).hexdigest()[:12]
+    folder = cache() / f"{kind.machine}-{kind.python}-{digest}"
+    if not folder.is_dir():
+        notify(f"downloading wheels for {kind.machine}, Python {kind.python}")
+        fresh = folder.with_name(f".{folder.name}.{os.getpid()}")
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir(parents=True)
+        try:
+            _download(kind, requirements, limits, fresh)
+            fresh.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # else another program was quicker
+                raise
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: Path) -> None:
+    platforms = [f"manylinux_{glibc}_{kind.machine}" for glibc in reversed(_GLIBC)] + [
+        f"manylinux2014_{kind.machine}"
+    ]
+    words = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--dest",
+        str(folder),
+    ]
+    words += ["--only-binary=:all:", "--implementation", "cp", "--python-version", kind.python]
+    words += [word for platform in platforms for word in ("--platform", platform)]
+    words += ["-c", str(limits)] if limits is not None else []
+    download_s = 600.0
+    try:
+        done = subprocess.run(
+            [*words, *requirements], capture_output=True, text=True, timeout=download_s, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise DeployError(f"pip download: no end after {download_s:.0f} s; is there a network?") from error
+    if done.returncode != 0:
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
+            done.stderr[-300:].strip()
+        ]
+        raise DeployError(
+            f"pip download: {errors[-1].removeprefix('ERROR: ')}; --wheelhouse DIR takes wheels you have"
+        )
+
+
+def _requirements(extras: tuple[str, ...]) -> list[str]:
+    """What a slave needs, by our own metadata, and by those extras."""
+    found: list[str] = []
+    for line in _ours().requires or []:
+        requirement, _, marker = (part.strip() for part in line.partition(";"))
+        extra = re.search(r"extra == ['\"]([^'\"]+)", marker)
+        if extra is None or extra.group(1) in extras:
+            found.append(requirement)
+    return found
+
+
+def _limits() -> Path | None:
+    """The tested versions, where they are known."""
+    for path in (ROOT / "deploy" / "constraints.txt", ROOT / "constraints.txt"):
+        if path.is_file():
+            return path
+    return None

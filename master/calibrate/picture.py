@@ -1,0 +1,318 @@
+"""A calibration is drawn as a plot: what was seen, and what was fitted to it.
+
+Plots of a wrist device's calibration.
+
+Lines on boards, light of the LEDs, curls of the fingers.
+
+Plot of a guided motion: seen and fitted points.
+
+From above and in the image.
+
+Plot of a measured object: its beads from three sides.
+
+Also the residuals of each over time.
+
+Plot of a registration: the object's path by cameras and by tracker.
+
+Also the residuals over time.
+
+Plot of a mounting: laser points and tips, seen and fitted.
+
+Also how the wrist was flexed meanwhile.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from common.calibration.files import replacing
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.rig import field_at
+from common.errors import RecordingError
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import fit_rigid
+from master.calibrate.extrinsics.extrinsics import Extrinsics
+from master.calibrate.object.measure import Measurement
+from master.calibrate.tracker.registration import Registration
+from master.calibrate.wrist.curl import FingerCurl
+from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
+from master.calibrate.wrist.plane import PlaneFit, ViewLine
+from master.calibrate.wrist.subject import Subject
+
+FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
+BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
+
+
+def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
+    """Draw the laser lines and each view's distance from the plane, as PNG.
+
+    Lines in the image; from above, in the plane.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = figure_of((15.0, 4.6))
+    figure.suptitle(
+        f"laser plane: normal ± {np.degrees(fit.normal_sigma_rad):.3f} deg,"
+        f" offset {1e3 * fit.plane.offset_m:.2f} ± {1e3 * fit.offset_sigma_m:.3f} mm, rms {1e3 * fit.rms_m:.3f} mm"
+    )
+    image, above, bars = figure.subplots(1, 3)
+    framed(image, optics, "lines in the image")
+    normal = np.array(fit.plane.normal)
+    for line, own in zip(lines, fit.used, strict=True):
+        colour = BLUE if own else ORANGE
+        uv = optics.project(line.points_m)
+        image.plot(uv[:, 0], uv[:, 1], ".", markersize=2, color=colour)
+        above.plot(1e3 * line.points_m[:, 0], 1e3 * line.points_m[:, 2], ".", markersize=2, color=colour)
+    above.set(title="lines from above [mm]; camera at 0, 0", xlabel="x", ylabel="z", aspect="equal")
+    above.plot([0.0], [0.0], "^", color=GREY)
+    off = [1e3 * float(np.mean(line.points_m @ normal - fit.plane.offset_m)) for line in lines]
+    bars.bar(range(len(lines)), off, color=[BLUE if own else ORANGE for own in fit.used])
+    bars.axhline(0.0, color=GREY, linewidth=0.8)
+    bars.set(title="views off the plane [mm]; orange: left out", xlabel="view")
+    bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
+    saved(figure, path)
+
+
+def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
+    """Draw the flat field over the image and its residuals, as PNG.
+
+    Shown where white paper was seen.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = figure_of((15.0, 4.2))
+    figure.suptitle(
+        f"flat field: residual {100 * fit.rms:.2f} %, cross-validated {100 * fit.cross_validated_rms:.2f} %"
+    )
+    field, left, law = figure.subplots(1, 3)
+    u, v = np.meshgrid(np.arange(0, optics.width_px, 8.0), np.arange(0, optics.height_px, 8.0))
+    xy = optics.undistort(np.stack([u, v], axis=-1)).reshape(-1, 2)
+    values = field_at(fit.field, xy).reshape(u.shape)
+    framed(field, optics, "flat field, 1 on the axis; dots: samples")
+    drawn = field.contourf(u, v, values, levels=20, cmap="viridis")
+    field.plot(samples.uv[:, 0], samples.uv[:, 1], ".", markersize=1, color="white", alpha=0.5)
+    figure.colorbar(drawn, ax=field)
+    framed(left, optics, "residual [%]")
+    limit = max(300.0 * fit.rms, 1.0)
+    dots = left.scatter(
+        samples.uv[:, 0],
+        samples.uv[:, 1],
+        c=100 * fit.residual,
+        s=6,
+        cmap="coolwarm",
+        vmin=-limit,
+        vmax=limit,
+    )
+    figure.colorbar(dots, ax=left)
+    law.plot(np.linalg.norm(samples.xy, axis=1), 100 * fit.residual, ".", markersize=2, color=BLUE)
+    law.axhline(0.0, color=GREY, linewidth=0.8)
+    law.set(
+        title="residual [%] by distance from the axis", xlabel="tangent of the angle", ylim=(-limit, limit)
+    )
+    saved(figure, path)
+
+
+def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
+    """Draw the fingers' laser points from above, and their lines, as PNG.
+
+    Lines from straight (o) to bent (x).
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = figure_of((8.0, 6.5))
+    axes = figure.subplots()
+    for found, colour in zip(curls, FINGER_COLOURS, strict=True):
+        axes.plot(
+            1e3 * found.points_m[:, 0], 1e3 * found.points_m[:, 2], ".", markersize=3, color=colour, alpha=0.5
+        )
+        if found.line is None:
+            continue
+        origin, way = np.array(found.line.origin_m), np.array(found.line.direction)
+        ends = 1e3 * np.stack([origin + t * way for t in found.line.range_m])
+        axes.plot(
+            ends[:, 0], ends[:, 2], color=colour,
+            label=f"{found.finger}: {1e3 * found.line.range_m[1]:.0f} mm, rms {1e3 * found.line.residual_m:.2f} mm",
+        )  # fmt: skip
+        axes.plot(ends[:1, 0], ends[:1, 2], "o", color=colour)
+        axes.plot(ends[1:, 0], ends[1:, 2], "x", color=colour)
+    axes.set(title="laser points from above [mm]: o straight, x bent", xlabel="x", ylabel="z", aspect="equal")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=3)  # not on the fingers
+    saved(figure, path)
+
+
+def figure_of(size: tuple[float, float]) -> Figure:
+    """An empty figure of a size [inches]."""
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def framed(axes: Axes, optics: CameraModel, title: str) -> None:
+    """Give axes the frame of the camera's image."""
+    axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
+
+
+def saved(figure: Figure, path: Path) -> None:
+    """Write a figure.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    try:
+        with replacing(path) as file:
+            figure.savefig(file, format="png")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write the picture: {error.strerror}") from error
+
+
+def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
+    """Draw laser points, fingertips and knuckles, seen and fitted, as PNG.
+
+    Laser points on their plane, fingertips and knuckles in the image; seen (dots) and fitted (rings).
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    model, fit, seen = found.model, found.fit, found.seen
+    shown = model(fit.x, fit.angles_rad)
+    used = np.isfinite(fit.off[..., 0])
+    figure = figure_of((13.0, 5.6))
+    figure.suptitle(found.report[0] + "; " + found.report[1])
+    above, image = figure.subplots(1, 2)
+    framed(image, optics, "fingertips (dots), as fitted (rings); knuckles, before (+) and after (x)")
+    for f, colour in enumerate(FINGER_COLOURS[1:]):
+        own = used[:, f]
+        above.plot(*(1e3 * seen.laser_m[own, f]).T, ".", color=colour, markersize=4)
+        above.plot(*(1e3 * shown[own, f, :2]).T, "o", color=colour, markerfacecolor="none", markersize=7)
+        image.plot(*seen.tip_uv[own, f].T, ".", color=colour, markersize=5)
+        tips = shown[own & np.isfinite(seen.tip_uv[:, f, 0]), f, 2:]
+        image.plot(*tips.T, "o", color=colour, markerfacecolor="none", markersize=8)
+    image.plot(*optics.project(model.knuckles(model.none)).T, "+", color=GREY, markersize=12)
+    image.plot(*optics.project(model.knuckles(found.unknown)).T, "x", color=BLUE, markersize=10)
+    above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
+    above.set_aspect("equal")
+    saved(figure, path)
+
+
+def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
+    """Draw the beads with every observation, and the residuals over time, as PNG.
+
+    Object frame, from above, ahead and aside; the residuals are distances left over time.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
+    # Where each observation lies in the object: the bead less its residual, turned into its frame.
+    rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
+    left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
+    figure = figure_of((16.0, 8.4))
+    figure.suptitle(f"{profile.name}: {len(bundle.T)} epochs in {found.looks} ways of turning and places")
+    *sides, time = figure.subplots(2, 2).ravel()
+    for axes, (a, b) in zip(sides, ((0, 1), (0, 2), (1, 2)), strict=True):
+        for row, name in enumerate(found.names):
+            colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
+            seen = 1e3 * (own[row] - left[:, row])
+            axes.plot(seen[:, a], seen[:, b], ".", markersize=2, color=colour, alpha=0.5)
+            axes.plot(*1e3 * own[row, [a, b]], "+", markersize=12, color="black")
+            axes.annotate(name, 1e3 * own[row, [a, b]], textcoords="offset points", xytext=(6, 6))
+        axes.set(title=f"object {'xyz'[a]}, {'xyz'[b]} [mm]")
+        axes.set_aspect("equal", adjustable="datalim")
+    for row, name in enumerate(found.names):
+        colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
+        size = 1e3 * np.linalg.norm(bundle.off_m[:, row], axis=1)
+        outlier = bundle.outlier[:, row]
+        time.plot(
+            bundle.seen.t_s, np.where(outlier, np.nan, size), ".", markersize=3, color=colour, label=name
+        )
+        time.plot(bundle.seen.t_s[outlier], size[outlier], "x", markersize=4, color=GREY)
+    time.set(title="from the rigid body [mm]; crosses: outliers", xlabel="time [s]")
+    time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
+    time.legend(fontsize=8, markerscale=3)
+    saved(figure, path)
+
+
+_GREEN = "#2f855a"
+
+
+def draw_registration(path: Path, found: Registration) -> None:
+    """Draw the object's path and the offsets of position and rotation, as PNG.
+
+    From above and from the side (dots: cameras; lines: tracker); offsets over time.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    fit = found.fit
+    figure = figure_of((17.0, 8.4))
+    figure.suptitle("\n".join(found.report[:2]))
+    above, side, place, rotation = figure.subplots(2, 2).ravel()
+    seen = 1e3 * (fit.p_m + fit.off[:, :3])
+    track_mm = 1e3 * fit.p_m.copy()
+    track_mm[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
+    for axes, (a, b), title in (
+        (above, (0, 2), "from above [mm]"),
+        (side, (2, 1), "from the side [mm]"),
+    ):
+        axes.plot(track_mm[:, a], track_mm[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
+        axes.plot(
+            seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
+        )
+        axes.plot(
+            seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="outlier"
+        )
+        axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.legend(fontsize=8)
+    side.invert_yaxis()  # y of the rig points down
+    for axes, columns, unit, title in (
+        (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
+        (rotation, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
+    ):
+        left = unit * np.where(fit.outlier[:, None], np.nan, fit.off[:, columns])
+        for values, colour, name in zip(left.T, (BLUE, ORANGE, _GREEN), "xyz", strict=True):
+            axes.plot(fit.t_s, values, ".", color=colour, markersize=3, label=name)
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        axes.set(title=title, xlabel="time [s]")
+        axes.legend(fontsize=8)
+    saved(figure, path)
+
+
+def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
+    """Draw observed and fitted points of a mounting, and the wrist over time, as PNG.
+
+    Laser points on their plane and fingertips in the image, seen (dots) and fitted (rings).
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    fit, cycles = found.fit, found.cycles
+    seen = fit.shown + fit.off * fit.sigma  # tips as they were when the laser shone
+    figure = figure_of((17.0, 5.4))
+    figure.suptitle(found.report[0] + "; " + found.report[1])
+    above, image, wrist = figure.subplots(1, 3)
+    framed(image, optics, "fingertips (dots), as fitted (rings)")
+    for f, colour in enumerate(FINGER_COLOURS[1:]):
+        lit, tipped = (np.isfinite(fit.off[:, f, k]) for k in (0, 2))
+        above.plot(*(1e3 * seen[lit, f, :2]).T, ".", color=colour, markersize=4)
+        above.plot(*(1e3 * fit.shown[lit, f, :2]).T, "o", color=colour, markerfacecolor="none", markersize=7)
+        image.plot(*seen[tipped, f, 2:].T, ".", color=colour, markersize=5)
+        image.plot(*fit.shown[tipped, f, 2:].T, "o", color=colour, markerfacecolor="none", markersize=8)
+    above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
+    above.set_aspect("equal")
+    for values, colour, name in (
+        (fit.wrist_angles_rad[:, 0], BLUE, "flexion"),
+        (fit.wrist_angles_rad[:, 1], ORANGE, "deviation"),
+        (fit.twist_rad, GREY, "twist, which no wrist has"),
+    ):
+        wrist.plot(cycles.t_s, np.degrees(values), ".", color=colour, label=name)
+    wrist.set(title="the wrist [deg]", xlabel="time [s]")
+    wrist.legend(fontsize=8)
+    saved(figure, path)

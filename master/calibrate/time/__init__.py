@@ -1,1 +1,0 @@
-"""Latency of cameras: tracks of a moving hand enter, delays leave."""

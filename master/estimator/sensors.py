@@ -1,0 +1,552 @@
+"""Cameras and a wrist device measure a hand; here they are flat arrays.
+
+Cameras of a rig as flat arrays, with kernels to project and undistort.
+
+Project also gives derivatives.
+
+Intersections of rays with the laser plane, with their uncertainty.
+
+It also gives coordinates in that plane.
+
+A pixel is the ray r = (x, y, 1) through its undistorted point; it meets the plane n . X = c at X = c r / (n . r)
+(Digits, UIST 2012: triangulation by one camera and a plane of light). The plane is seen at a flat angle, so one pixel
+is many times longer along it than across; the covariance carries that.
+
+A wrist device and its hand as flat arrays for kernels.
+
+Also what the device saw of the five fingers.
+
+To the noise of what is seen comes what the model of the hand does not know: skin whose thickness is not that of this
+person, what calibration leaves of plane and palm, and the part of the line that is not seen. The centroid of a line
+shorter than expected is off across by up to half of what is missing, and by a third of that along, as skin curves away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, hypot, log, sin, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.geometry.camera_model import CameraModel
+from common.geometry.transforms import intersect_plane
+from common.hand.model import Fingertips
+from common.hand.skin import PLACES, SPREAD, PalmarSurface
+from common.kernels import filled, inlined, inner, kernel, record
+from master.rig.wrist import WristSetup
+
+
+class CameraArrays(NamedTuple):
+    """C cameras of the pinhole model with five distortion coefficients.
+
+    Attributes:
+        R: (C, 3, 3) rotations rig -> camera.
+        t: (C, 3) [m], so that a point of the camera's frame is R X + t.
+        centre: (C, 3) [m] optical centres, rig frame.
+        focal: (C, 2) [px] fx, fy.
+        principal: (C, 2) [px] cx, cy.
+        distortion: (C, 5) k1, k2, p1, p2, k3.
+        scale: (C,) [px] of a step of one in the normalised image, the mean of both axes.
+    """
+
+    R: Float
+    t: Float
+    centre: Float
+    focal: Float
+    principal: Float
+    distortion: Float
+    scale: Float
+
+    @classmethod
+    def of(cls, cameras: Sequence[CameraModel]) -> "CameraArrays":
+        """Lay cameras out in their order."""
+        matrix = np.stack([camera.matrix for camera in cameras])
+        focal = np.stack([matrix[:, 0, 0], matrix[:, 1, 1]], axis=1)
+        return cls(
+            np.stack([np.ascontiguousarray(camera.T_camera_rig[:3, :3]) for camera in cameras]),
+            np.stack([np.ascontiguousarray(camera.T_camera_rig[:3, 3]) for camera in cameras]),
+            np.stack([np.ascontiguousarray(camera.centre) for camera in cameras]),
+            np.ascontiguousarray(focal),
+            np.ascontiguousarray(matrix[:, :2, 2]),
+            np.stack([np.ascontiguousarray(camera.distortion, np.float64) for camera in cameras]),
+            np.sqrt(focal[:, 0] * focal[:, 1]),
+        )
+
+
+@inlined
+def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
+    """Write where camera c sees a point, and how that moves with it.
+
+    Args:
+        cameras, c: The camera.
+        point: (3,) [m], rig frame.
+        uv: Written: (2,) [px], distorted image.
+        J: Written: (2, 3) [px/m], by the point.
+
+    Returns:
+        Whether the point is in front of the camera; else nothing is written.
+    """
+    x = cameras.t[c, 0]
+    y = cameras.t[c, 1]
+    z = cameras.t[c, 2]
+    for i in range(3):
+        x += cameras.R[c, 0, i] * point[i]
+        y += cameras.R[c, 1, i] * point[i]
+        z += cameras.R[c, 2, i] * point[i]
+    least_depth_m = 1e-9
+    if not z > least_depth_m:
+        return False
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = (
+        cameras.distortion[c, 0],
+        cameras.distortion[c, 1],
+        cameras.distortion[c, 2],
+        cameras.distortion[c, 3],
+        cameras.distortion[c, 4],
+    )
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # of radial, by r^2, twice
+    fx, fy = cameras.focal[c, 0], cameras.focal[c, 1]
+    uv[0] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cameras.principal[c, 0]
+    uv[1] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cameras.principal[c, 1]
+    a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
+    d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    for i in range(3):
+        by_x = (cameras.R[c, 0, i] - x * cameras.R[c, 2, i]) / z
+        by_y = (cameras.R[c, 1, i] - y * cameras.R[c, 2, i]) / z
+        J[0, i] = fx * (a * by_x + b * by_y)
+        J[1, i] = fy * (b * by_x + d * by_y)
+    return True
+
+
+@inlined
+def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> bool:
+    """Write the normalised image point (x/z, y/z) of a pixel, by Newton's method.
+
+    Args:
+        cameras, c: The camera.
+        u, v: [px], distorted image.
+        out: Written: (2,).
+
+    Returns:
+        Whether it is found; beyond where the lens folds the image over there is none.
+    """
+    k1, k2, p1, p2, k3 = (
+        cameras.distortion[c, 0],
+        cameras.distortion[c, 1],
+        cameras.distortion[c, 2],
+        cameras.distortion[c, 3],
+        cameras.distortion[c, 4],
+    )
+    seen_x = (u - cameras.principal[c, 0]) / cameras.focal[c, 0]
+    seen_y = (v - cameras.principal[c, 1]) / cameras.focal[c, 1]
+    x, y = seen_x, seen_y
+    newton_steps = 12
+    for _ in range(newton_steps):
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+        off_x = seen_x - (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
+        off_y = seen_y - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
+        a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
+        d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        determinant = a * d - b * b
+        step_x = (d * off_x - b * off_y) / determinant
+        step_y = (a * off_y - b * off_x) / determinant
+        x += step_x
+        y += step_y
+        settled = 1e-10  # normalised: the error after a step so small is its square, about
+        if sqrt(step_x * step_x + step_y * step_y) < settled:
+            out[0], out[1] = x, y
+            return determinant > 0.0 and radial > 0.0
+        if not np.isfinite(x + y):
+            break
+    return False
+
+
+_STEP_PX = 0.5  # of the differences that carry a pixel's noise onto the plane
+_AROUND_PX = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserPoints:
+    """Points on the plane.
+
+    Attributes:
+        point_m: (N, 3) [m], camera frame; NaN: not seen, or the ray does not meet the plane in front of the camera.
+        cov_m2: (N, 3, 3) [m^2], of rank two.
+    """
+
+    point_m: Float
+    cov_m2: Float
+
+
+def in_image(setup: WristSetup, uv: Float, sigma_px: Float) -> Bool:
+    """Return which pixels (N, 2) can have been seen (N,).
+
+    They must be in the image, and their standard deviations (N,) not beyond it.
+    """
+    size = np.array([setup.optics.width_px, setup.optics.height_px])
+    return ((uv >= -0.5) & (uv <= size - 0.5)).all(axis=1) & (sigma_px <= size.max())
+
+
+def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:
+    """Return the points on the laser plane behind pixels (N, 2).
+
+    The pixels are of the distorted image, of standard deviations (N,) [px].
+    """
+    rays = setup.optics.ray(uv[:, None] + _AROUND_PX)
+    found = intersect_plane(np.zeros(3), rays, setup.normal, setup.offset_m)
+    by_pixel = (found[:, 1::2] - found[:, 2::2]) * (sigma_px / (2.0 * _STEP_PX))[:, None, None]
+    cov = np.swapaxes(by_pixel, -1, -2) @ by_pixel
+    point = np.where(np.isfinite(cov[:, 0, :1]), found[:, 0], np.nan)
+    return LaserPoints(point, cov)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneAxes:
+    """Two axes in the laser plane, from where its light comes.
+
+    They are across (image right) and along (away from the camera).
+
+    Attributes:
+        origin_m: (3,) [m], camera frame.
+        axes: (2, 3) unit vectors.
+    """
+
+    origin_m: Float
+    axes: Float
+
+    @classmethod
+    def of(cls, setup: WristSetup) -> "PlaneAxes":
+        """Axes of a device."""
+        across = np.array([1.0, 0.0, 0.0]) - setup.normal[0] * setup.normal
+        across /= np.linalg.norm(across)
+        along = np.cross(across, setup.normal)
+        return cls(setup.laser_m, np.stack([across, along * np.sign(along[2])]))
+
+    def flat(self, points_m: Float) -> Float:
+        """Coordinates (..., 2) [m] of points (..., 3)."""
+        return (points_m - self.origin_m) @ self.axes.T
+
+    def space(self, flat_m: Float) -> Float:
+        """Points (..., 3) [m], camera frame, of coordinates (..., 2)."""
+        return self.origin_m + flat_m @ self.axes
+
+    def flat_cov(self, cov_m2: Float) -> Float:
+        """Covariances (..., 2, 2) of covariances (..., 3, 3)."""
+        return self.axes @ cov_m2 @ self.axes.T
+
+
+TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
+NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
+_PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
+
+
+class Device:
+    """Geometry of a wrist device mounted before its hand.
+
+    Lengths are in metres, in the camera frame unless stated otherwise.
+
+    Attributes:
+        palm: (4, 4) that of a straight wrist.
+        laser_m: (3,) where the laser's light comes from, in its plane.
+        plane: (3, 3) unit vectors across and along the plane, and its normal.
+        offset: (1,) the plane is normal . X = offset.
+        focal: (1,) [px].
+        before: (1,) on which side of the plane the wrist lies, 1 or -1.
+        radius: (5, 8) of the spheres of the skin, finger by sphere.
+        deep: (5, 8) how far behind the bone their centres lie, dorsally.
+        local: (5, 8, 3) their centres in the frames of their bones' joints.
+        back: (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint.
+        tip: (5, 3) fingertip in the frame of the last joint but the tip.
+        surface2: (5,) [m^2] variance of the skin's distance from the bone.
+        tip2: (5,) [m^2] variance of where the skin ends.
+    """
+
+    palm: Float
+    laser_m: Float
+    plane: Float
+    offset: Float
+    focal: Float
+    before: Float
+    radius: Float
+    deep: Float
+    local: Float
+    back: Float
+    tip: Float
+    surface2: Float
+    tip2: Float
+
+    @classmethod
+    def of(cls, setup: WristSetup) -> "Device":
+        """Lay out a device."""
+        model, surface, axes = setup.model, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
+        tips = Fingertips.of(model)
+        deep = surface.radius_m - surface.palmar_m
+        back, local = np.zeros((5, 3, 3)), np.zeros((5, len(PLACES), 3))
+        up = np.array([0.0, 1.0, 0.0])
+        for f in range(5):
+            for b in range(3):
+                bone = model.bone_m[f, b] / np.linalg.norm(model.bone_m[f, b])
+                dorsal = up - (up @ bone) * bone
+                back[f, b] = dorsal / np.linalg.norm(dorsal)
+            for k, (b, share) in enumerate(PLACES):
+                local[f, k] = share * model.bone_m[f, b] + deep[f, k] * back[f, b]
+        last = model.bone_m[:, 2]
+        length = np.linalg.norm(last, axis=1)
+        side = np.sign(setup.normal @ setup.T_camera_palm[:3, 3] - setup.offset_m)
+        return filled(
+            cls,
+            {
+                "palm": setup.T_camera_palm,
+                "laser_m": np.asarray(setup.laser_m, np.float64),
+                "plane": np.concatenate([axes.axes, setup.normal[None]]),
+                "offset": np.array([setup.offset_m]),
+                "focal": np.array([setup.optics.matrix[0, 0]]),
+                "before": np.array([side]),
+                "radius": surface.radius_m,
+                "deep": deep,
+                "local": local,
+                "back": back,
+                "tip": last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
+                "surface2": (SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
+                "tip2": (SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
+            },
+        )
+
+    @classmethod
+    def none(cls) -> "Device":
+        """Scratch of the same shape, of a rig without wrist device."""
+        return record(
+            cls,
+            palm=(4, 4),
+            laser_m=3,
+            plane=(3, 3),
+            offset=1,
+            focal=1,
+            before=1,
+            radius=(5, 8),
+            deep=(5, 8),
+            local=(5, 8, 3),
+            back=(5, 3, 3),
+            tip=(5, 3),
+            surface2=5,
+            tip2=5,
+        )
+
+
+class LinesOfSight:
+    """What one strobe cycle shows of five fingers, as rows.
+
+    x, y are those of undistorted rays (x, y, 1).
+
+    Attributes:
+        lit: (5,) 1 where a laser point is a row, and `shown` (5,) where a fingertip is.
+        laser: (5, 2) laser points x, y, and `laser_W` (5, 2, 2) their information.
+        lack: (5, 2) what the ridge lacks there to the exact cut (`master.estimator.finger_surface`), x, y.
+        laser_px: (5,) length of the line [px]; 0: not known.
+        tip: (5, 2) fingertips x, y, and `tip_W` (5, 2, 2) their information.
+        depth: (5,) logarithm of their distance by light, in a unit of its own, and `depth_w2` (5,) how sure; 0: none.
+        teaches: (5,) 1 where a finger constrains how its hinges are rolled.
+        laser_s, tip_s: (1,) how much later than the epoch laser points and fingertips were seen.
+        rows: (1,) whether there is any row.
+    """
+
+    lit: Float
+    shown: Float
+    laser: Float
+    laser_W: Float
+    lack: Float
+    laser_px: Float
+    tip: Float
+    tip_W: Float
+    depth: Float
+    depth_w2: Float
+    teaches: Float
+    laser_s: Float
+    tip_s: Float
+    rows: Float
+
+    @classmethod
+    def empty(cls) -> "LinesOfSight":
+        """Nothing is seen."""
+        return record(
+            cls,
+            lit=5,
+            shown=5,
+            laser=(5, 2),
+            laser_W=(5, 2, 2),
+            lack=(5, 2),
+            laser_px=5,
+            tip=(5, 2),
+            tip_W=(5, 2, 2),
+            depth=5,
+            depth_w2=5,
+            teaches=5,
+            laser_s=1,
+            tip_s=1,
+            rows=1,
+        )
+
+
+@inlined
+def inverse_2(a: float, b: float, c: float, out: Float) -> None:
+    """Write the inverse of (a, b; b, c)."""
+    scale = 1.0 / (a * c - b * b)
+    out[0, 0], out[0, 1], out[1, 0], out[1, 1] = c * scale, -b * scale, -b * scale, a * scale
+
+
+@inner
+def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
+    """Reduce the information (2, 2) of two rows by the uncertainty of wrist flexion.
+
+    Args:
+        W: Changed.
+        J: (5, 7) derivatives of what is seen, with those by the bend last, and `row` the first of the two.
+        cov: (K, K) of the extras.
+    """
+    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+    a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+    for i in range(2):
+        for j in range(2):
+            p = cov[WRIST_ANGLES + i, WRIST_ANGLES + j]
+            a += J[row, 5 + i] * p * J[row, 5 + j]
+            b += J[row, 5 + i] * p * J[row + 1, 5 + j]
+            c += J[row + 1, 5 + i] * p * J[row + 1, 5 + j]
+    inverse_2(a, b, c, W)
+
+
+@inner
+def loosen_short(
+    device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
+) -> bool:
+    """Reduce the information of a laser point on a partly hidden line.
+
+    What the point does not constrain of a line that is hidden in part is removed from its information.
+
+    Args:
+        device, sights: `LinesOfSight.laser_W` is changed.
+        f: Finger.
+        length_px: The line's, were all of it seen.
+        point, A: (3,), (2, 2) room.
+
+    Returns:
+        Whether the line is that short.
+    """
+    seen_px = lines_of_sight.laser_px[f]
+    x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
+    whole = 0.85  # of the line that is expected: a shorter one is hidden in part
+    if seen_px == 0.0 or seen_px > whole * length_px or not on_plane(device, x, y, point, A):
+        return False
+    W = lines_of_sight.laser_W[f]
+    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+    a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+    off = 0.5 * (length_px - seen_px) / device.focal[0]
+    for axis in range(2):
+        curved = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
+        scale = off * (1.0 if axis == 0 else curved) / hypot(A[0, axis], A[1, axis])
+        u, v = scale * A[0, axis], scale * A[1, axis]
+        a, b, c = a + u * u, b + u * v, c + v * v
+    inverse_2(a, b, c, W)
+    return True
+
+
+@inner
+def on_plane(device: Any, x: float, y: float, out: Float, A: Float) -> bool:
+    """Intersect the ray (x, y, 1) with the laser plane.
+
+    Writes the intersection (3,) [m], and the derivatives (2, 2) of x, y by the plane's axes.
+    """
+    n = device.plane[2]
+    towards = n[0] * x + n[1] * y + n[2]
+    far = device.offset[0] / towards
+    if not far > 0.0:
+        return False
+    out[0], out[1], out[2] = far * x, far * y, far
+    for axis in range(2):
+        a = device.plane[axis]
+        A[0, axis], A[1, axis] = (a[0] - x * a[2]) / far, (a[1] - y * a[2]) / far
+    return True
+
+
+@kernel
+def observe_wrist(
+    boxed_device: Any,
+    laser: Float,
+    laser_sigma_px: Float,
+    laser_px: Float,
+    tip: Float,
+    tip_sigma_px: Float,
+    tip_depth: Float,
+    depth_sigma: float,
+    laser_s: float,
+    tip_s: float,
+    boxed_out: Any,
+) -> None:
+    """Write the rows of a strobe cycle.
+
+    Args:
+        boxed_device: (1,) `Device`.
+        laser, tip: (5, 2) x, y of undistorted rays; NaN: not seen.
+        laser_sigma_px, tip_sigma_px: (5,) their standard deviations per axis.
+        laser_px: (5,) lengths of the lines.
+        tip_depth: (5,) distances of the tips by light.
+        depth_sigma: Standard deviation of their logarithms; 0: they are not used.
+        laser_s, tip_s: How much later than the epoch laser points and tips were seen.
+        boxed_out: (1,) `LinesOfSight`, written.
+    """
+    device, out = boxed_device[0], boxed_out[0]
+    point, A = np.zeros(3), np.zeros((2, 2))
+    out.rows[0], out.laser_s[0], out.tip_s[0] = 0.0, laser_s, tip_s
+    for f in range(5):
+        out.lit[f] = out.shown[f] = out.depth_w2[f] = out.laser_px[f] = 0.0
+        out.lack[f, 0] = out.lack[f, 1] = 0.0
+        for i in range(2):
+            for j in range(2):
+                out.laser_W[f, i, j] = out.tip_W[f, i, j] = 1.0 if i == j else 0.0
+        x, y = laser[f, 0], laser[f, 1]
+        if np.isfinite(x + y + laser_sigma_px[f]) and on_plane(device, x, y, point, A):
+            blur_px = 0.5
+            sensed = (laser_sigma_px[f] ** 2 + blur_px**2) / device.focal[0] ** 2
+            across = 0.25 * device.surface2[f] + _PALM_M**2
+            along = device.surface2[f] + _PALM_M**2
+            a = sensed + A[0, 0] ** 2 * across + A[0, 1] ** 2 * along
+            b = A[0, 0] * A[1, 0] * across + A[0, 1] * A[1, 1] * along
+            c = sensed + A[1, 0] ** 2 * across + A[1, 1] ** 2 * along
+            inverse_2(a, b, c, out.laser_W[f])
+            out.laser[f, 0], out.laser[f, 1], out.lit[f], out.rows[0] = x, y, 1.0, 1.0
+            out.laser_px[f] = laser_px[f] if laser_px[f] > 0.0 else 0.0
+        x, y = tip[f, 0], tip[f, 1]
+        if np.isfinite(x + y + tip_sigma_px[f]):
+            away_m = 0.1  # a fingertip of which no laser point measures the distance
+            near = point[2] if out.lit[f] > 0.0 else away_m
+            variance = (tip_sigma_px[f] / device.focal[0]) ** 2 + device.tip2[f] / near**2
+            inverse_2(variance, 0.0, variance, out.tip_W[f])
+            out.tip[f, 0], out.tip[f, 1], out.shown[f], out.rows[0] = x, y, 1.0, 1.0
+            if depth_sigma > 0.0 and tip_depth[f] > 0.0:
+                out.depth[f], out.depth_w2[f] = log(tip_depth[f]), 1.0 / depth_sigma**2
+
+
+@inner
+def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
+    """Write the palm (4, 4) of a flexed wrist.
+
+    Also writes the axes (2, 3) of flexion and deviation.
+
+    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.hand.wrist`).
+    """
+    c, s, cd, sd = cos(flexion), sin(flexion), cos(deviation), sin(deviation)
+    for i in range(3):
+        x, y, z = F[i, 0], F[i, 1], F[i, 2]
+        axes[0, i], axes[1, i] = cd * x - sd * z, y
+        T[i, 0] = cd * x - sd * z
+        T[i, 1] = sd * s * x + c * y + cd * s * z
+        T[i, 2] = sd * c * x - s * y + cd * c * z
+        T[i, 3] = F[i, 3]
+        T[3, i] = 0.0
+    T[3, 3] = 1.0

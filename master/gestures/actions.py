@@ -1,0 +1,512 @@
+"""Pinch, pointing and thumb taps are actions that a hand performs.
+
+A gesture that lasts: its start time and its messages.
+
+The messages are those of its beginning, its course and its end.
+
+Pinches of the thumb and one finger, pad to pad.
+
+They have the distance of the skins and how firmly the fingers close.
+
+A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the others
+are well away from the thumb, or they are at least farther, and then the pads face each other as far as that is known
+(the thumb over a fist lies on the backs of the fingers) and not all others are curled in. Where the others are away
+no bend is asked for: the tips determine it, which are measured however the palm lies.
+
+What decides is how sure the gap is, along the way from skin to skin; a thumb whose depth is doubtful may still be known
+to meet a finger beside it. A gap that is not known neither begins nor ends a pinch: one that has begun goes on at the
+gap that was known last, its confidence falling, until `lost_s` are over.
+
+Pointing: index finger extended, the three after it flexed, and the ray.
+
+The ray goes on where the index finger points.
+
+The ray goes from the knuckle through the tip and begins at the tip. Both ends are what a hand is fitted to best, the
+tip by its own marker and the knuckle by the palm, and they are as far apart as anything that points: the same
+millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is prior more than
+measurement (the DIP follows the PIP). It begins at the tip because there is no hand beyond it.
+
+How sure the ray is follows from what is known of both ends across it. One that may be off by more than a few degrees
+is withheld: before one pair of cameras, a palm that faces them is known by its fingertips alone, and knuckles stand
+anywhere within some centimetres. It must be sure twice in a row when the pointing begins; one that is not for a
+moment later stays as it was last.
+
+Nothing is smoothed here: the markers are already, by the 1 EUR filter with a cut-off that rises with speed, and a
+hand at rest is held still by the hand's own filter. A second filter would only add its lag.
+
+Taps of the thumb on the keys of a hand.
+
+The thumb's tip touches a segment of a finger and leaves it again.
+
+The four fingers side by side are a keypad, held so that the index finger lies on top and the tips at the left: the rows
+are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch is the thumb's that comes from
+well away and leaves again; it is reported when it goes, so that a hand that closes, pinches or rests its thumb reports
+no key. The finger is that of least gap between skins, the segment is given by the planes that halve the bends of
+the finger, which the thumb's tip passes half a segment, a centimetre, from the middle of any key.
+
+Both are judged over the whole touch, from when the thumb is down until it has gone, each epoch by how sure the
+thumb's tip is in it: a finger that it touches hides part of its cap, so that it is known worst while it is down, and
+best as it leaves. Fingers too alike in their gaps decide nothing, nor do gaps that are not known, nor a finger
+whose tip is seen while its bones may be anywhere, as those of a palm that one pair of cameras looks into.
+"""
+
+from dataclasses import dataclass
+from math import erf, isfinite, nan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration.gesture_settings import PinchSettings, PointSettings, TapSettings
+from common.hand.model import CHAINS, FINGERS, TIPS
+from common.kernels import kernel
+from common.messages import Gesture, GestureKind, Phase
+from master.fabrik.linear_algebra import spread
+from master.gestures.features import HandFeatures, ThumbTouch
+
+_NOWHERE = np.full(3, np.nan)
+_NOWHERE.flags.writeable = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldGesture:
+    """One that has begun.
+
+    Attributes:
+        hand: Name of the hand profile.
+        kind, name: As of `Gesture`.
+        began_t_ns: When it began [ns].
+    """
+
+    hand: str
+    kind: GestureKind
+    name: str
+    began_t_ns: int
+
+    def message(
+        self,
+        phase: Phase,
+        t_ns: int,
+        confidence: float,
+        *,
+        distance_m: float = nan,
+        strength: float = nan,
+        angle_rad: float = nan,
+        origin_m: Float = _NOWHERE,
+        direction: Float = _NOWHERE,
+    ) -> Gesture:
+        """Return the message of an epoch."""
+        return Gesture(
+            hand=self.hand,
+            t_ns=t_ns,
+            kind=self.kind,
+            name=self.name,
+            phase=phase,
+            began_t_ns=self.began_t_ns,
+            confidence=min(max(confidence, 0.0), 1.0),
+            distance_m=distance_m,
+            strength=strength,
+            angle_rad=angle_rad,
+            origin_m=origin_m,
+            direction=direction,
+        )
+
+
+def below(value: float, limit: float, sigma: float) -> float:
+    """Return the probability that a measured quantity is below the limit.
+
+    It was measured as `value` with a standard deviation; 0.5 if unknown.
+    """
+    if not isfinite(sigma):
+        return 0.5
+    return 0.5 * (1.0 + erf((limit - value) / (max(sigma, 1e-6) * sqrt(2.0))))
+
+
+class PinchMonitor:
+    """Detector of pinches.
+
+    Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was.
+    """
+
+    def __init__(self, settings: PinchSettings) -> None:
+        self._settings = settings
+        self._pinch: HeldGesture | None = None
+        self._finger, self._known_ns, self._gap_m = 0, 0, 0.0
+        self._last: Gesture | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether one has begun."""
+        return self._pinch is not None
+
+    def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
+        """Return the messages at the epoch of the features.
+
+        A pinch begins only where it may.
+        """
+        if self._pinch is None:
+            finger = self._begins(seen, touch) if may_begin else None
+            if finger is None:
+                return []
+            self._finger, self._known_ns = finger, seen.t_ns
+            self._gap_m = float(touch.gap_m[finger])
+            self._pinch = HeldGesture(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
+            return [self._message(self._pinch, "begin", seen, touch)]
+        if self._known(touch, self._finger):
+            self._known_ns, self._gap_m = seen.t_ns, float(touch.gap_m[self._finger])
+            if self._gap_m > self._settings.end_gap_m:
+                return self._end(self._message(self._pinch, "end", seen, touch))
+        elif (seen.t_ns - self._known_ns) * 1e-9 > self._settings.lost_s:
+            return self._end(self._message(self._pinch, "end", seen, touch))
+        return [self._message(self._pinch, "update", seen, touch)]
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """Return the messages at an epoch at which there is no hand."""
+        last = self._last
+        if self._pinch is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
+            return []
+        return self._end(
+            self._pinch.message("end", t_ns, 0.0, distance_m=last.distance_m, strength=last.strength)
+        )
+
+    def _end(self, message: Gesture) -> list[Gesture]:
+        self._pinch = self._last = None
+        return [message]
+
+    def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
+        own = self._settings
+        gaps: list[float] = touch.gap_m.tolist()
+        gap = min(gaps)
+        finger = gaps.index(gap)
+        if gap > own.begin_gap_m or not self._known(touch, finger):
+            return None
+        others = [k for k in range(4) if k != finger]
+        clear_m = min(gaps[k] for k in others) - gap
+        if clear_m >= own.away_m:
+            return finger
+        opening_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
+        if clear_m < own.clear_m or opening_rad > own.apart_rad:
+            return None
+        return finger if min(float(seen.curl[1 + k]) for k in others) < own.fist_curl else None
+
+    def _known(self, touch: ThumbTouch, finger: int) -> bool:
+        return bool(touch.key_sigma_m[finger, 2] <= self._settings.sigma_most_m)
+
+    def _message(self, pinch: HeldGesture, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
+        own, gap = self._settings, self._gap_m
+        sigma = float(touch.key_sigma_m[self._finger, 2])
+        strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
+        self._last = pinch.message(
+            phase,
+            seen.t_ns,
+            below(gap, own.end_gap_m, sigma),
+            distance_m=gap,
+            strength=min(max(strength, 0.0), 1.0),
+            origin_m=touch.middle_m[self._finger],
+        )
+        return self._last
+
+
+_KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
+
+
+class PointMonitor:
+    """Detector of pointing.
+
+    Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
+    sure.
+    """
+
+    def __init__(self, settings: PointSettings) -> None:
+        self._settings = settings
+        self._point: HeldGesture | None = None
+        self._since_ns: int | None = None  # of the shape before it begins; of its loss after
+        self._sure = False  # whether the ray was
+        self._last: Gesture | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether the finger points."""
+        return self._point is not None
+
+    def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
+        """Return the messages at the epoch of the features.
+
+        Pointing begins only where it may.
+        """
+        own, point = self._settings, self._point
+        shape, before = self._shape(seen), self._sure
+        held = 1.5  # the standard deviation of a ray that is reported already may be larger by this
+        most_rad = own.ray_sigma_rad * (1.0 if point is None else held)
+        self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= most_rad
+        if point is None:
+            if not (shape and may_begin):
+                self._since_ns = None
+                return []
+            if self._since_ns is None:
+                self._since_ns = seen.t_ns
+            if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s or not (self._sure and before):
+                return []
+            self._point, self._since_ns = HeldGesture(seen.hand, "point", "point", self._since_ns), None
+            return [self._message(self._point, "begin", seen)]
+        if shape and self._sure:
+            self._since_ns = None
+        elif self._over(seen.t_ns):
+            return self._end(self._message(point, "end", seen))
+        return [self._message(point, "update", seen)]
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """Return the messages at an epoch at which there is no hand."""
+        last = self._last
+        if self._point is None or last is None or not self._over(t_ns):
+            return []
+        return self._end(
+            self._point.message("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction)
+        )
+
+    def _over(self, t_ns: int) -> bool:
+        """Check whether the shape has been lost for long.
+
+        The time counts from the first call.
+        """
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
+
+    def _end(self, message: Gesture) -> list[Gesture]:
+        self._point, self._since_ns, self._last = None, None, None
+        return [message]
+
+    def _shape(self, seen: HandFeatures) -> bool:
+        """Check whether the index finger is extended and the others are flexed.
+
+        It is checked as far as these are known.
+        """
+        own, going = self._settings, self.active
+        slack = own.slack_rad if going else 0.0
+        sigma: list[float] = seen.sigma_m.tolist()
+        known = [one <= own.sigma_most_m for one in sigma]
+        _, index, *others = _bends(seen)
+        if not known[1] and not going:
+            return False
+        bent = all(
+            bend >= own.bent_rad - slack or (going and not sure)
+            for bend, sure in zip(others, known[2:], strict=True)
+        )
+        return bent and (index <= own.stretched_rad + slack or not known[1])
+
+    def _message(self, point: HeldGesture, phase: Phase, seen: HandFeatures) -> Gesture:
+        tip = seen.joints_m[_TIP]
+        way = tip - seen.joints_m[_KNUCKLE]
+        if not self._sure and self._last is not None:
+            way = self._last.direction
+        middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
+        clear = [min(max((bend - middle) / middle, 0.0), 1.0) for bend in _bends(seen)[2:]]
+        known = 1.0 if seen.sigma_m[1] <= self._settings.sigma_most_m else 0.5
+        self._last = point.message(
+            phase, seen.t_ns, known * sum(clear) / len(clear), origin_m=tip, direction=way / sqrt(way @ way)
+        )
+        return self._last
+
+
+def _bends(seen: HandFeatures) -> list[float]:
+    """How far each finger is bent beyond its knuckle (5,) [rad]."""
+    bends: list[list[float]] = seen.bend_rad.tolist()
+    return [pip + dip for _, pip, dip in bends]
+
+
+@kernel
+def _ray_sigma_rad(joints: Float, cov: Float) -> float:
+    """Return the standard deviation [rad] of the ray, about its worst axis.
+
+    Arguments as of `HandFeatures`. What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
+    """
+    x, y, z = (
+        joints[_TIP, 0] - joints[_KNUCKLE, 0],
+        joints[_TIP, 1] - joints[_KNUCKLE, 1],
+        joints[_TIP, 2] - joints[_KNUCKLE, 2],
+    )
+    length = sqrt(x * x + y * y + z * z)
+    w = x / length, y / length, z / length
+    both, along, total = np.empty((3, 3)), np.zeros(3), 0.0
+    for i in range(3):
+        for k in range(3):
+            both[i, k] = cov[_TIP, i, k] + cov[_KNUCKLE, i, k]
+            along[i] += both[i, k] * w[k]
+        total += w[i] * along[i]
+    for i in range(3):
+        for k in range(3):
+            both[i, k] += w[i] * w[k] * total - w[i] * along[k] - along[i] * w[k]
+    return spread(both)[1] / length
+
+
+KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
+"""Name of the key on each segment, from the knuckle on, of index ... little."""
+
+_NEVER_NS = -(2**61)
+
+
+class _Epoch(NamedTuple):
+    """The thumb at one epoch of a touch.
+
+    Attributes:
+        gap_m: (4,) to index ... little.
+        sigma_m: Of the least of them.
+        thumb_sigma_m: Of the thumb's tip.
+        joints_m: (26, 3), rig frame.
+    """
+
+    gap_m: list[float]
+    sigma_m: float
+    thumb_sigma_m: float
+    joints_m: Float
+
+
+@dataclass(slots=True)
+class _Touch:
+    """A touch in progress.
+
+    Holds since when, the flexion of the fingers before, the least gap, and all epochs of the touch, of which there
+    are no more than `longest_s` has.
+    """
+
+    began_ns: int
+    bend_rad: float
+    least_m: float
+    epochs: list[_Epoch]
+
+
+class ThumbTapMonitor:
+    """Detector of thumb taps.
+
+    Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and the last tap.
+    """
+
+    def __init__(self, settings: TapSettings) -> None:
+        self._settings = settings
+        self._touch: _Touch | None = None
+        self._clear_ns = self._tapped_ns = _NEVER_NS
+        self._clear_rad = 0.0  # how the fingers were bent then
+
+    @property
+    def active(self) -> bool:
+        """Whether the thumb touches a key, which may yet become a tap."""
+        return self._touch is not None
+
+    def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
+        """Return the messages at the epoch of the features.
+
+        A touch begins only where it may.
+        """
+        own = self._settings
+        keys: list[list[float]] = touch.key_gap_m.tolist()
+        gaps = [min(one) for one in keys]
+        gap = min(gaps)
+        finger = gaps.index(gap)
+        segment = keys[finger].index(gap)
+        sigma = float(touch.key_sigma_m[finger, segment])
+        # Of the finger its PIP must be known, too, along its worst axis.
+        known = sigma <= own.sigma_most_m and _worst_m(seen, CHAINS[finger + 1, 1]) <= own.place_sigma_m
+        now = _Epoch(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
+        if self._touch is not None:
+            return self._go_on(self._touch, seen, now, known=known)
+        if not known:
+            return []
+        if gap >= own.leave_gap_m:
+            self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
+        # cosine: a thumb that lies on the back of a segment touches no key
+        palmar = bool(touch.key_palmar[finger, segment] > (-0.3))
+        if gap <= own.touch_gap_m and may_begin and palmar and self._begins(seen):
+            self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
+        return []
+
+    def drop(self) -> None:
+        """Forget the touch: the hand is gone, or does something else."""
+        self._touch, self._clear_ns = None, _NEVER_NS
+
+    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Epoch, *, known: bool) -> list[Gesture]:
+        """A touch goes on, ends as a tap, or was none."""
+        own, gap = self._settings, min(now.gap_m)
+        lasted = (seen.t_ns - going.began_ns) * 1e-9
+        closes = abs(_bend_rad(seen) - going.bend_rad) > own.quiet_rad
+        if lasted > own.longest_s or closes or (known and gap < -own.pressed_m) or not is_pad(seen, own):
+            self.drop()
+            return []
+        if not known:
+            return []
+        going.epochs.append(now)
+        going.least_m = min(going.least_m, gap)
+        if gap < min(own.leave_gap_m, max(going.least_m + own.rise_m, own.touch_gap_m)):
+            return []
+        self._touch, self._clear_ns, self._clear_rad = None, seen.t_ns, _bend_rad(seen)
+        if lasted < own.shortest_s or going.least_m > own.down_gap_m:
+            return []
+        return self._tapped(going, seen)
+
+    def _begins(self, seen: HandFeatures) -> bool:
+        own = self._settings
+        apart = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
+        return apart and (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s and is_pad(seen, own)
+
+    def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
+        """Return the tap of a touch that is over.
+
+        It is nothing where two fingers may have been touched.
+        """
+        least = [min(one.gap_m) for one in gone.epochs]
+        down_m = 0.001  # a thumb whose gap is larger than the least by less is down
+        down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + down_m)
+        flight, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
+        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in flight])
+        weight = weight / weight.sum()
+        gap = weight @ np.array([one.gap_m for one in flight])
+        finger = int(gap.argmin())
+        nearer_m = float(np.delete(gap, finger).min() - gap[finger])
+        if nearer_m < self._settings.nearer_m:
+            return []
+        beyond = weight @ _beyond_m(np.array([one.joints_m for one in flight]), finger)
+        segment = 2 if beyond[1] > 0.0 else int(beyond[0] > 0.0)
+        sigma = nearest.sigma_m
+        sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
+        sure *= below(0.0, float(np.abs(beyond).min()), sigma)
+        self._tapped_ns = seen.t_ns
+        tap = HeldGesture(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
+        ends = CHAINS[finger + 1, segment : segment + 2]
+        middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
+        return [tap.message("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
+
+
+def is_pad(seen: HandFeatures, settings: TapSettings) -> bool:
+    """Whether the four fingers lie side by side, bent alike, and are no fist."""
+    bend, curl = _finger_bends(seen), seen.curl.tolist()
+    return max(bend) - min(bend) <= settings.level_rad and max(curl[1:]) <= settings.curl_most
+
+
+def _finger_bends(seen: HandFeatures) -> list[float]:
+    """How far each of the four fingers is bent [rad], MCP and PIP together."""
+    bends: list[list[float]] = seen.bend_rad.tolist()
+    return [mcp + pip for mcp, pip, _ in bends[1:]]
+
+
+def _bend_rad(seen: HandFeatures) -> float:
+    """How far the four fingers are bent together [rad]."""
+    return sum(_finger_bends(seen)) / 4.0
+
+
+def _worst_m(seen: HandFeatures, joint: int) -> float:
+    """Standard deviation [m] of a joint along its worst axis."""
+    return spread(seen.joints_cov_m2[joint])[1]
+
+
+def _beyond_m(joints_m: Float, finger: int) -> Float:
+    """How far (N, 2) [m] the thumb's tip is beyond PIP and DIP of a finger.
+
+    Beyond the planes that halve its bends there.
+
+    Of hands (N, 26, 3) [m] and a finger 0 ... 3.
+    """
+    chain = joints_m[:, CHAINS[finger + 1]]
+    bone = np.diff(chain, axis=1)
+    bone = bone / np.linalg.norm(bone, axis=2, keepdims=True)
+    tip = joints_m[:, TIPS[0], None]
+    return np.vecdot(tip - chain[:, 1:3], bone[:, :-1] + bone[:, 1:]) * 0.5

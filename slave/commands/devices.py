@@ -1,0 +1,362 @@
+"""Open the device that an option names: camera, IMU, tracker or lights.
+
+Open the device that an option names: camera, IMU, tracker or lights.
+
+None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error that
+lists what there is. A driver is imported where it is opened, so other commands start without its library. What
+simulates or replays a device is opened by its command, which knows the scene.
+"""
+
+import argparse
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from common.calibration import CameraCalibration, ImuCalibration, RigCalibration, load
+from common.calibration.object_profile import ObjectProfile
+from common.calibration.strobe import StrobeCalibration
+from common.clock import Clock
+from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError, TrackerError
+from common.imu.fusion import OrientationFilter
+from slave.cameras.grey import Pixels
+from slave.cameras.picamera2 import Picamera2Camera
+from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
+from slave.drivers import IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
+from slave.lights.interlock import Interlock
+from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
+from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
+from slave.sources import FrameSource, ImuSource, TrackerSource
+
+SYNTHETIC = "synthetic"
+REAL_CAMERAS = ("picamera2", "v4l2")
+
+
+def driver_of(option: str, value: str, forms: str, error: type[PhalanxError]) -> tuple[str, str]:
+    """Name and place of the driver that the value of an option names.
+
+    Args:
+        option: With its dashes, for the text of the error.
+        value: NAME or NAME:PLACE.
+        forms: What there is, as in `slave.drivers`: NAME, NAME:PLACE or NAME[:PLACE].
+        error: What to raise.
+
+    Raises:
+        PhalanxError: There is no such driver, or it needs a place, or takes none.
+    """
+    name, colon, place = value.partition(":")
+    for form in forms.split(" | "):
+        known, optional, _ = form.partition("[:")
+        if optional and name == known:
+            return name, place
+        known, needs, _ = form.partition(":")
+        if name == known and needs == colon and bool(place) == bool(needs):
+            return name, place
+    raise error(f"{option} {value}: no such driver; there are {forms}")
+
+
+def open_camera(
+    driver: str,
+    options: argparse.Namespace,
+    camera: CameraCalibration,
+    clock: Clock,
+    stop: threading.Event | None,
+    *,
+    wrist: bool = False,
+    connection_lost: ConnectionLost = nobody,
+) -> FrameSource | None:
+    """Open the real camera that `--camera` names.
+
+    Args:
+        driver: The value of `--camera`.
+        options: Of the command: luma, sync, sync_timeout, control, allow_missing.
+        camera: The camera file.
+        clock: The slave's clock.
+        stop: Set when the slave is to end; until then a camera that was lost is opened again. None: losing it is an
+            error.
+        wrist: Whether it is the camera of a wrist device, whose frames are grey.
+        connection_lost: Called when it takes time to open it, now or again.
+
+    Returns:
+        The camera, or None if the driver is none of a real camera.
+
+    Raises:
+        CameraError: An option is of another driver or makes no sense, or the camera cannot be opened.
+    """
+    kind, _, place = driver.partition(":")
+    pixels = _pixels(kind, options.luma, wrist)
+    # Option -> its driver, and the value that means "not given".
+    owners: dict[str, tuple[str, object]] = {
+        "sync": ("picamera2", "off"),
+        "sync_timeout": ("picamera2", 60.0),
+        "control": ("v4l2", []),
+        "allow_missing": ("v4l2", []),
+    }
+    for name, (owner, not_given) in owners.items():
+        if owner != kind and getattr(options, name) != not_given:
+            flag = "--" + name.replace("_", "-")
+            raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
+    opener: Callable[[CameraCalibration], FrameSource]
+    if kind == "picamera2":
+        if place and not place.isdecimal():
+            raise CameraError(
+                f"--camera {driver}: the part behind the colon is a number, 0 for the first camera"
+            )
+        pi = Picamera2Options(int(place or "0"), options.sync, options.sync_timeout, pixels=pixels)
+        if options.sync != "off":  # the others may have to be started first
+            connection_lost = partial(connection_lost, patience_s=LOST_PATIENCE_S + options.sync_timeout)
+            connection_lost("opens the camera, in step with others")
+        opener = lambda file: Picamera2Camera(file, pi, clock, stop)  # noqa: E731
+    elif kind == "v4l2":
+        codes = _codes(options.control)
+        usb = V4l2Options(device_path(place), codes, tuple(options.allow_missing), pixels)
+        opener = lambda file: V4l2Camera(file, usb, clock)  # noqa: E731
+    else:
+        return None
+    return reconnecting_camera(opener, camera, clock, stop, connection_lost)
+
+
+def reconnecting_camera(
+    opener: Callable[[CameraCalibration], FrameSource],
+    camera: CameraCalibration,
+    clock: Clock,
+    stop: threading.Event | None,
+    connection_lost: ConnectionLost,
+) -> FrameSource:
+    """Open a camera that is opened again whenever it is lost.
+
+    That lasts until `stop` is set; None: losing it is an error.
+
+    Raises:
+        CameraError: It cannot be opened the first time.
+    """
+    if stop is None:
+        return opener(camera)
+    return ReconnectingCamera(opener, camera, clock, stop, connection_lost)
+
+
+def open_imu(
+    name: str,
+    driver: str,
+    rate_hz: float,
+    clock: Clock,
+    stop: threading.Event,
+    connection_lost: ConnectionLost = nobody,
+) -> ImuSource:
+    """Open the IMU that `--imu` names.
+
+    Until `stop` is set, it is opened again when it was lost.
+
+    Args:
+        name: The rig's IMU.
+        driver: The value of `--imu`.
+        rate_hz: Samples per second that the rig needs.
+        clock: The slave's clock.
+        stop: Set when the slave is to end.
+        connection_lost: Called when it is lost.
+
+    Raises:
+        ImuError: There is no such driver, or the IMU cannot be opened.
+    """
+    kind, place = driver_of("--imu", driver, IMUS, ImuError)
+    opener: Callable[[], ImuSource]
+    if kind == "ximu3":
+        from slave.imu import ximu3
+
+        port = ximu3.SerialPlace.of(place)
+        true_hz = ximu3.SAMPLE_RATE_HZ / ximu3.divisor(rate_hz)
+        opener = lambda: ximu3.Ximu3Imu(name, port, rate_hz, clock, stop)  # noqa: E731
+    elif kind == "lsm6dsox":
+        from slave.imu import lsm6dsox
+
+        wires = lsm6dsox.I2cPlace.of(place)
+        true_hz = lsm6dsox.rate_of(rate_hz).rate_hz
+        opener = lambda: lsm6dsox.Lsm6dsoxImu(name, wires, rate_hz, clock, stop)  # noqa: E731
+    else:
+        raise ImuError(f"--imu {driver}: is no real IMU; there are {REAL_IMUS}")
+    return ReconnectingDriver("IMU", opener, clock, stop, connection_lost, rate_hz=true_hz)
+
+
+def imu_places() -> str:
+    """Where an IMU may be: serial ports and I2C buses, as text for people."""
+    from slave.imu import lsm6dsox, ximu3
+
+    ports = [f"  ximu3:{line}" for line in ximu3.ports()] or ["  none"]
+    buses = [f"  lsm6dsox:{bus}" for bus in lsm6dsox.buses()] or ["  none (on a Pi: dtparam=i2c_arm=on)"]
+    return "\n".join(["serial ports:", *ports, "I2C buses:", *buses])
+
+
+def orientation_of(imu: ImuCalibration) -> OrientationFilter:
+    """The filter that adds the orientation to samples.
+
+    Raises:
+        CalibrationError: The rig trusts a heading that nobody knows.
+    """
+    if imu.heading_sigma_rad is not None:
+        raise CalibrationError(
+            f"imu.heading_sigma_rad: {imu.heading_sigma_rad:g}, but an orientation from rates and forces has no "
+            "heading that means anything in the rig: set it to null, then tilt alone is used"
+        )
+    return OrientationFilter(imu.rate_hz)
+
+
+def open_tracker(
+    name: str,
+    device: str,
+    serial: str | None,
+    program: str,
+    clock: Clock,
+    stop: threading.Event,
+    connection_lost: ConnectionLost = nobody,
+) -> TrackerSource:
+    """Open the tracker that `--tracker` names.
+
+    One that is no recording is opened again when it was lost.
+
+    Args:
+        name: Of the device in our messages.
+        device: The value of `--tracker`.
+        serial: Which device, if there are several.
+        program: survive-cli.
+        clock: The slave's clock.
+        stop: Set when the slave is to end.
+        connection_lost: Called when it is lost.
+
+    Raises:
+        TrackerError: There is no such driver, or it cannot be opened.
+    """
+    kind, path = driver_of("--tracker", device, TRACKERS, TrackerError)
+    opener: Callable[[], TrackerSource]
+    if kind == "survive" and path:
+        from slave.objects.survive import SurviveFile
+
+        return SurviveFile(name, serial, Path(path), clock, stop)
+    if kind == "survive":
+        from slave.objects.survive import SurviveTracker
+
+        opener = lambda: SurviveTracker(name, serial, clock, stop, program)  # noqa: E731
+    elif kind == "openvr":
+        from slave.objects.openvr_tracker import OpenVrTracker
+
+        opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
+    else:
+        raise TrackerError(f"--tracker {device}: is no real tracker; there are {REAL_TRACKERS}")
+    return ReconnectingTracker(name, opener, clock, stop, connection_lost)
+
+
+def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProfile:
+    """The object of a rig on which the tracker `name` sits.
+
+    Raises:
+        CalibrationError: There is none; a file is missing or broken.
+    """
+    profiles = [load(calibration / "objects" / f"{one}.json", ObjectProfile) for one in rig.objects]
+    for profile in profiles:
+        if profile.tracker == name:
+            return profile
+    there = ", ".join(f"{one.tracker!r} on {one.name}" for one in profiles if one.tracker is not None)
+    raise CalibrationError(
+        f"rig {rig.name!r}: no object has the tracker {name!r}; there is {there or 'none'}: name it under `tracker` of "
+        "calib_json/objects/OBJECT.json, and the object under `objects` of the rig"
+    )
+
+
+def choose_lights(lights: str | None, rig: RigCalibration, camera: str) -> str | None:
+    """What lights the frames of a camera.
+
+    Args:
+        lights: The value of `--lights`; None: not given.
+        rig: Whose camera it is.
+        camera: The value of `--camera`.
+
+    Returns:
+        The choice; None where the slave switches nothing, as the camera or another controller does.
+
+    Raises:
+        LightsError: Not given where it must be, given where there is nothing to light, or unknown.
+    """
+    kind = camera.partition(":")[0]
+    if rig.kind != "wrist" or kind == "replay":
+        if lights is not None:
+            what = "a recording is lit already" if kind == "replay" else f"rig {rig.name!r} sees markers"
+            raise LightsError(f"--lights {lights}: {what}; only the camera of a wrist device has lights")
+        return None
+    if lights is None:
+        if kind == SYNTHETIC:
+            return SYNTHETIC
+        raise LightsError(
+            f"rig {rig.name!r} is a wrist device: say who switches its laser and LEDs, --lights {LIGHTS};"
+            " the last two: the camera's own strobe output, or another controller, within limits of its own"
+        )
+    if lights in ("camera", "external"):
+        return None
+    if lights == SYNTHETIC and kind != SYNTHETIC:
+        raise LightsError(f"--lights synthetic: lights nothing before --camera {camera}; there are {LIGHTS}")
+    if lights != SYNTHETIC:
+        if kind == SYNTHETIC:
+            raise LightsError(f"--lights {lights}: a simulated hand is lit by synthetic, or by camera")
+        driver_of("--lights", lights, LIGHTS, LightsError)
+    return lights
+
+
+def light_limits(lights: str, rig: RigCalibration) -> StrobeCalibration:
+    """The limits within which lights are switched.
+
+    Raises:
+        LightsError: The rig file has none.
+    """
+    if rig.strobe is None:
+        raise LightsError(
+            f"--lights {lights}: rig {rig.name!r}: strobe: missing; laser and LEDs are only switched within limits:"
+            " power, pulse, duty (docs/safety.md); --lights camera where others switch them"
+        )
+    return rig.strobe
+
+
+def open_lights(lights: str, rig: RigCalibration) -> Interlock:
+    """Open real lights, dark, within the limits of the rig file.
+
+    Raises:
+        LightsError: They cannot be opened, or the rig file has no limits for them.
+    """
+    strobe = light_limits(lights, rig)
+    kind, place = driver_of("--lights", lights, LIGHTS, LightsError)
+    if kind == "gpio":
+        from slave.lights.gpio import GpioLights
+
+        return Interlock(GpioLights(place, strobe.max_pulse_us * 1e-6), strobe)
+    if kind == "i2c":
+        from slave.lights.i2c_led import FlashDriverLights
+
+        return Interlock(FlashDriverLights(place, strobe), strobe)
+    raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED_LIGHTS}")
+
+
+def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
+    if as_luma and kind not in REAL_CAMERAS:
+        raise CameraError(
+            f"--luma is an option of --camera {' and '.join(REAL_CAMERAS)}, not of {kind}: leave it away"
+        )
+    if as_luma and not wrist:
+        raise CameraError(
+            "--luma: makes grey frames for a wrist device; this rig looks for painted markers, by colour"
+        )
+    if wrist:
+        return Pixels.LUMA if as_luma else Pixels.GREY
+    return Pixels.COLOUR
+
+
+def _codes(texts: list[str]) -> dict[str, int]:
+    """Control -> code of `--control NAME=NUMBER`."""
+    found: dict[str, int] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            number = int(value)
+        except ValueError as error:
+            raise CameraError(f"--control {text}: write NAME=NUMBER, for example gain=32") from error
+        if name in found:
+            raise CameraError(f"--control {name} is given twice")
+        found[name] = number
+    return found

@@ -1,0 +1,397 @@
+"""Detect in whole recordings, and calibrate marker colours from them.
+
+Offline detection of a whole recording, into one file per camera.
+
+Deterministic, without clock or network.
+
+`phalanx-slave run -o`: detections of a recorded camera.
+
+The output has the same bytes on every run.
+
+`phalanx-slave colours`: marker colours of a camera from a recording.
+"""
+
+import argparse
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import cv2
+import msgspec
+import numpy as np
+
+from common.arrays import Float, Int
+from common.calibration import CameraCalibration, HandProfile, load, save
+from common.command_line import UsageError, echo, remark
+from common.errors import CalibrationError, RecordingError
+from common.recording.frame_recording import FrameRecording, open_recording
+from common.recording.pictures import FramePictures
+from common.recording.recorded_files import write_npz
+from slave.markers.autocolour import by_clicks, by_hand, by_hues, calibrate_moving, checked, frames_for
+from slave.markers.autocolour_things import spread
+from slave.markers.colours import ColourRow, calibrate
+from slave.markers.reloadable import detector_for, plain_of
+from slave.markers.white_balance import Inline
+from slave.wrist.offline import RecordedWristDetections
+
+if TYPE_CHECKING:
+    from slave.tags.offline import RecordedTags, TagCollector
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedDetections:
+    """Content of detections_<camera>.npz: T frames, M markers, NaN = not seen.
+
+    Attributes:
+        t_ns: (T,) middle of the exposure of row 0 [ns].
+        seq: (T,) frame counters.
+        uv: (T, M, 2) centroids [px], distorted image.
+        area_px2: (T, M) visible areas [px^2].
+        quality: (T, M) 0..1, the probability that it is the marker.
+        sigma_px: (T, M) standard deviation of the centroids per axis [px].
+        alt_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
+    """
+
+    t_ns: Int
+    seq: Int
+    uv: Float
+    area_px2: Float
+    quality: Float
+    sigma_px: Float
+    alt_uv: Float
+
+
+def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
+    """Return the camera of a recording.
+
+    Geometry and timing are from the recording, colours from `calibration` if given.
+
+    Raises:
+        RecordingError: The recording has no such camera.
+        CalibrationError: DIR/cameras/NAME.json is broken, or there are no marker colours anywhere.
+    """
+    recording.frames_of(camera)  # refuses an unknown name
+    own = recording.manifest.cameras[camera]
+    if calibration is not None:
+        path = calibration / "cameras" / f"{camera}.json"
+        markers = load(path, CameraCalibration).markers
+        if markers is None:
+            raise CalibrationError(
+                f"{path}: markers: missing; make them: phalanx-slave colours {recording.folder} --camera {camera}"
+                f" {_clicks(recording)} -o {path}  (U,V: a pixel on each marker in the camera's first picture)"
+            )
+    else:
+        markers = own.markers
+        if markers is None:
+            raise CalibrationError(
+                f"{recording.folder}/recording.json: cameras.{camera}.markers: missing; give --calibration DIR with "
+                f"DIR/cameras/{camera}.json (make it with `phalanx-slave colours`)"
+            )
+    return msgspec.structs.replace(own, markers=markers)
+
+
+def _clicks(recording: FrameRecording) -> str:
+    """The options of `colours` that name a pixel of each marker."""
+    return " ".join(f"--click {name}=U,V" for name in recording.manifest.marker_rig().markers)
+
+
+def detect_recording(
+    folder: Path,
+    camera: str,
+    calibration: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    tags: "TagCollector | None" = None,
+    *,
+    windows_only: bool = False,
+) -> RecordedDetections:
+    """Detect the markers in every frame of one camera.
+
+    The colours follow the light where the camera has references.
+
+    Args:
+        folder: Recording.
+        camera: Camera name.
+        calibration: calib_json tree whose cameras/<camera>.json holds the marker colours.
+        progress: Called with frames done and frames in all.
+        tags: Is given every frame, too.
+        windows_only: Scan windows where markers are expected, as `MarkerDetector`.
+
+    Raises:
+        RecordingError: The recording or a frame is broken, or it has no such camera or no frame of it.
+        CalibrationError: No marker colours.
+    """
+    recording = open_recording(folder)
+    rows = recording.frames_of(camera)
+    if not rows:
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    model = camera_of(recording, camera, calibration)
+    rig = recording.manifest.marker_rig()
+    names, clicks = rig.markers, recording.manifest.clicks.get(camera)
+    detector = detector_for(model, names, Inline(), clicks, free=rig.free_markers)
+    if (plain := plain_of(detector)) is not None:
+        plain.windows_only = windows_only
+    shape = (len(rows), len(names))
+    uv, alt_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
+    area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    pictures = FramePictures(folder, (model.width_px, model.height_px))
+    for i, row in enumerate(rows):
+        if i > 0 and not recording.manifest.continuous:
+            detector = detector.fresh()
+        image = pictures.read(row.file)
+        found = detector.push(image, row.t_ns)
+        if tags is not None:
+            tags.push(image, row)
+        uv[i], area[i], quality[i] = found.uv, found.area, found.quality
+        sigma_px[i], alt_uv[i] = found.sigma_px, found.alt_uv
+        progress(i + 1, len(rows))
+    t_ns = np.array([row.t_ns for row in rows], np.int64)
+    seq = np.array([row.seq for row in rows], np.int64)
+    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, alt_uv)
+
+
+def calibrate_colours(
+    folder: Path,
+    camera: str,
+    output: Path,
+    *,
+    clicks: Mapping[str, tuple[float, float]] | None = None,
+    auto: bool = False,
+    like: Path | None = None,
+    hand: Path | None = None,
+    notify: Callable[[str], None] = lambda _text: None,
+) -> list[ColourRow]:
+    """Make the colour ranges of one camera from a recording.
+
+    Writes its camera file.
+
+    With clicks, from the clicked colours of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
+    from what moves with the hand in all frames.
+
+    Args:
+        folder: Recording. Its `clicks` name one pixel per marker in the camera's first frame, or none.
+        camera: Camera name.
+        output: Camera file to write: the recording's, with `markers` filled.
+        clicks: Marker -> (u, v) [px] in the camera's first frame, before those of the recording.
+        auto: Use all frames though there are clicks; these then only name the marker colours.
+        like: Camera file whose hues name the marker colours; the shape of the hand checks them where it can.
+        hand: Hand profile whose shape names the marker colours, or checks their names; by default
+            calib_json/hands/<hand of the rig>.json.
+        notify: Receives lines of progress.
+
+    Raises:
+        RecordingError: The recording is broken, has no frame of the camera, or clicks for some markers only.
+        FitError: A click is not on a marker colour, two look the same, or the frames do not determine the colours or
+            their names for certain; the message states what to do.
+        CalibrationError: A file cannot be read or written.
+    """
+    recording = open_recording(folder)
+    rows = recording.frames_of(camera)
+    if not rows:
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    rig = recording.manifest.marker_rig()
+    if unknown := sorted((clicks or {}).keys() - set(rig.markers)):
+        raise RecordingError(
+            f"--click: rig {rig.name!r} has no marker {unknown[0]!r}; it has {', '.join(rig.markers)}"
+        )
+    clicks = {**recording.manifest.clicks.get(camera, {}), **(clicks or {})}
+    missing = [name for name in rig.markers if name not in clicks]
+    moving = auto or like is not None or hand is not None or not clicks
+    if missing and not moving:
+        raise RecordingError(
+            f"{folder}/recording.json: clicks.{camera}: nothing for {', '.join(missing)}; give one pixel [u, v] on "
+            f"each marker in the first frame (--click NAME=U,V), or --auto"
+        )
+    own = recording.manifest.cameras[camera]
+    pictures = FramePictures(folder, (own.width_px, own.height_px))
+    if not moving:
+        image = pictures.read(rows[0].file)
+        table = calibrate(image, {name: clicks[name] for name in rig.markers})
+    else:
+        profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
+        if like is not None:
+            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), notify)
+            if hand is not None or profile.exists():
+                shape = load(profile, HandProfile)
+                if hand is not None or shape.markers.keys() >= set(rig.markers):
+                    namer = checked(namer, by_hand(shape, rig.markers, notify), notify)
+        elif hand is None and not missing:
+            namer = by_clicks(clicks, rig.markers, own.width_px)
+        else:
+            namer = by_hand(load(profile, HandProfile), rig.markers, notify)
+        chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
+        notify(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
+        images = [pictures.read(rows[k].file) for k in chosen]
+        table = calibrate_moving(images, rig.markers, namer, notify)
+    make_folder(output.parent)
+    save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
+    return table
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder a result goes to.
+
+    A new calibration tree begins with its first file.
+
+    Raises:
+        RecordingError: It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot make the folder: {error.strerror}") from error
+
+
+def tag_collector(folder: Path, camera: str, calibration: Path | None) -> "TagCollector | None":
+    """What finds the tags of a recording's objects; None: none of them has any.
+
+    Raises:
+        RecordingError: The recording is broken or has no such camera.
+        CalibrationError: An object's file is broken or missing.
+    """
+    recording = open_recording(folder)
+    manifest = recording.manifest
+    recording.frames_of(camera)  # refuses an unknown name
+    rig = manifest.marker_rig()
+    if not rig.objects:
+        return None
+    from slave.tags.offline import TagCollector, tagged_objects
+
+    objects = tagged_objects(manifest.objects, rig, calibration)
+    return TagCollector(manifest.cameras[camera], objects, manifest.continuous) if objects else None
+
+
+def save_detections(path: Path, found: "RecordedDetections | RecordedWristDetections | RecordedTags") -> None:
+    """Write detections_<camera>.npz, or tags_<camera>.npz.
+
+    Equal content gives equal bytes.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    make_folder(path.parent)
+    try:
+        write_npz(path, {name: getattr(found, name) for name in found.__slots__})
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def detect(options: argparse.Namespace) -> int:
+    """Detect markers, or fingers before a wrist device, in every frame.
+
+    Raises:
+        PhalanxError: The recording or a file of calib_json is missing or broken, or an option makes no sense for it.
+    """
+    from common.recording.frame_recording import load_manifest
+    from slave.cameras.replay import is_grey
+
+    camera, recording = _source(options)
+
+    def progress(done: int, total: int) -> None:
+        every = 500  # frames, between two lines that report the progress
+        if done % every == 0 or done == total:
+            remark(f"{camera}: {done} of {total} frames")
+
+    if is_grey(load_manifest(recording), camera):
+        if options.scan == "windows":
+            raise CalibrationError(f"--scan: camera {camera!r} sees no markers")
+        _detect_fingers(options, recording, progress)
+        return 0
+    if options.hand is not None:
+        raise CalibrationError(f"--hand: camera {camera!r} sees markers; only a wrist camera knows a hand")
+    _detect_markers(options, recording, progress)
+    return 0
+
+
+def _source(options: argparse.Namespace) -> tuple[str, Path]:
+    """Camera and recording.
+
+    Raises:
+        UsageError: They are not named.
+    """
+    kind, _, folder = str(options.camera).partition(":")
+    if kind != "replay" or not folder:
+        raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
+    return str(options.name), Path(folder)
+
+
+def _detect_markers(
+    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
+) -> None:
+    pass
+
+    tags = tag_collector(recording, options.name, options.calibration)
+    windows = options.scan == "windows"
+    found = detect_recording(
+        recording, options.name, options.calibration, progress, tags, windows_only=windows
+    )
+    save_detections(options.output, found)
+    if tags is not None:
+        save_detections(options.output.parent / f"tags_{options.name}.npz", tags.all())
+
+
+def _detect_fingers(
+    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
+) -> None:
+    from slave.wrist.offline import detect_wrist_recording
+
+    done = detect_wrist_recording(recording, options.name, options.calibration, options.hand, progress)
+    remark(f"{options.name}: {done.summary()}")
+    save_detections(options.output, done.detections)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Find the colours, write the camera file and print which colours collide.
+
+    Raises:
+        PhalanxError: The recording or a file is missing or broken, or the colours cannot be distinguished.
+    """
+    from slave.markers.colours import report
+
+    cv2.setNumThreads(1)
+    with _recording(options) as folder:
+        table = calibrate_colours(
+            folder,
+            options.camera,
+            options.output,
+            clicks=dict(options.click),
+            auto=options.auto,
+            like=options.like,
+            hand=options.hand,
+            notify=remark,
+        )
+    echo(report(table))
+    return 0
+
+
+@contextmanager
+def _recording(options: argparse.Namespace) -> Generator[Path]:
+    """The recording; of a video or pictures one that lasts as long as it is needed.
+
+    Raises:
+        PhalanxError: They cannot be read, or are not those of the camera.
+    """
+    from common.errors import RecordingError
+    from common.recording.frame_recording import MANIFEST
+    from slave.foreign.importing import Wish, import_pictures
+
+    if (options.recording / MANIFEST).is_file():
+        if options.calibration is not None or options.rig is not None:
+            raise RecordingError(
+                f"--calibration, --rig: {options.recording} is a recording, which has its own"
+            )
+        yield options.recording
+        return
+    if options.calibration is None:
+        raise RecordingError(
+            f"{options.recording}: no {MANIFEST} in it; of a video or pictures give --calibration DIR, whose"
+            f" cameras/{options.camera}.json they are of"
+        )
+    with TemporaryDirectory() as folder:
+        wish = Wish(
+            named={options.camera: options.recording}, calibration=options.calibration, rig=options.rig
+        )
+        import_pictures(wish, Path(folder) / "recording", remark)
+        yield Path(folder) / "recording"

@@ -1,0 +1,225 @@
+"""Measure relative depth and fingertip outlines in the LED image.
+
+Estimate relative depth from the fall-off of the LED light.
+
+Kim et al. 2012 take sqrt(I) for distance; docs/theory/sources.md#nearness-and-distance has the correction.
+
+Light from beside the lens falls with the square of the distance and comes back once: the root of the intensity is
+*nearness*, not distance. With alpha the angle of the ray off the optical axis,
+
+    depth = c cos(alpha) / sqrt(I / F),        F the flat field, what the LEDs make of a white surface
+
+along the optical axis; c is the surface's whiteness, the LEDs' power and the camera's gain in one, and is not known. So
+depth is *relative*: monotone, and right up to one factor where the surface is of one kind and faces the camera. Where
+it is inclined by theta it looks farther away by 1 / sqrt(cos theta).
+
+A pixel as dark as the noise of the difference has no depth (NaN); a saturated one is at most as far as it looks.
+
+Outline of fingertips at full resolution.
+
+Circles are fitted to the edges of light around where they should be.
+
+Along rays from the predicted middle the edge is where light falls off most steeply in proportion; that is the contour
+before the dark, and the foot of the shadow before what is lit behind. Middle and radius are then those of the circle
+that fits the edges best, given what was predicted: least squares, in which edges that lie off count less.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias, cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Bool, Float, Image, Int
+from common.calibration.rig import flat_of
+from slave.wrist.view import WristView
+
+Float32: TypeAlias = npt.NDArray[np.float32]
+
+SHRINK = 4  # the LED image is read at a quarter of its resolution
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LedOptics:
+    """What each pixel of the shrunken image is multiplied with.
+
+    Attributes:
+        cosine: (h, w) float32 of the angle off the optical axis.
+        level: (h, w) float32 1 / sqrt(F).
+        ray: (h, w, 3) float32 ray of depth 1 along the optical axis.
+    """
+
+    cosine: Float32
+    level: Float32
+    ray: Float32
+
+
+def shrink(led: Image) -> Float32:
+    """Return the difference of LED and ambient frame at a quarter of its resolution.
+
+    In grey levels (h, w).
+    """
+    height, width = led.shape
+    half = cv2.resize(led, (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # in halves it is fast
+    size = (width // SHRINK, height // SHRINK)
+    return cast(Float32, cv2.resize(half.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+
+def nearness(grey: Float32, optics: LedOptics) -> Float32:
+    """Return the nearness sqrt(I / F) (h, w) of grey levels >= 0.
+
+    NaN where the levels are NaN; h rows from the top of the image.
+    """
+    return np.sqrt(grey) * optics.level[: len(grey)]
+
+
+def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:
+    """Return the relative depth of what is nearest about a pixel of the image.
+
+    Within a radius [px], of nearness (h, w).
+
+    The nearest faces the camera, so it is the least inclined. NaN: too dark to measure.
+    """
+    row, column, reach = round(v / SHRINK), round(u / SHRINK), max(round(radius_px / SHRINK), 1)
+    about = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
+    dark = 4.0  # grey levels: what the noise of a difference of two frames leaves
+    lit = near[about] > np.sqrt(dark) * optics.level[: len(near)][about]
+    depth = optics.cosine[: len(near)][about][lit] / near[about][lit]
+    return float(depth.min()) if len(depth) else float("nan")
+
+
+def image_rows(view: WristView) -> Float:
+    """Rows of the image [px] at the centres of the shrunken image's rows."""
+    return _centres(view.optics.height_px)
+
+
+def _centres(size_px: int) -> Float:
+    return np.arange(size_px // SHRINK, dtype=np.float64) * SHRINK + 0.5 * (SHRINK - 1)
+
+
+@lru_cache(maxsize=8)
+def led_optics(view: WristView) -> LedOptics:
+    """The maps of one wrist rig; made once."""
+    v = image_rows(view)
+    u = _centres(view.optics.width_px)
+    xy = view.optics.undistort(np.stack(np.meshgrid(u, v), axis=-1))
+    ray = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
+    flat = np.ones(xy.shape[:2]) if view.flat_field is None else flat_of(view.flat_field, xy)
+    return LedOptics(
+        (1.0 / np.linalg.norm(ray, axis=-1)).astype(np.float32),
+        (1.0 / np.sqrt(flat)).astype(np.float32),
+        ray.astype(np.float32),
+    )
+
+
+class OutlineSettings(NamedTuple):
+    """Numbers of the fit of a fingertip's outline."""
+
+    directions: int = 16
+    steps: int = 24
+    # of the radius: where an edge is sought
+    first: float = 0.45
+    last: float = 1.75
+    expected: float = 0.35  # of the radius: how far off edges are, standard deviation
+    least_drop: float = 0.12  # of the logarithm of light over an edge: none
+    firm_drop: float = 0.4  # so much more is a sure one
+    tiny: float = 1e-6
+    rim: float = 0.05  # of the radius: how far light falls off within the outline
+    width: int = 3  # steps of an edge
+    # of the radius: how well the middle and the radius are predicted
+    middle_sigma: float = 0.6
+    radius_sigma: float = 0.12
+    edge_sigma: float = 0.08  # of the radius: how far skin is off a circle
+
+
+SETTINGS = OutlineSettings()
+LOG = np.log(np.arange(256, dtype=np.float32) + 6.0).astype(np.float32)  # of grey levels and what is dark
+WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
+_ANGLES = np.arange(SETTINGS.directions) * (2.0 * np.pi / SETTINGS.directions)
+WAY: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_DESIGN = np.concatenate([WAY, np.ones((SETTINGS.directions, 1))], axis=1)
+_PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(SETTINGS.directions, 9)
+_PRIOR_NORMAL = np.diag(
+    SETTINGS.edge_sigma**2
+    / np.array([SETTINGS.middle_sigma, SETTINGS.middle_sigma, SETTINGS.radius_sigma]) ** 2
+)
+SHARE = np.linspace(SETTINGS.first, SETTINGS.last, SETTINGS.steps).astype(np.float32)
+MIDDLES = 0.5 * (SHARE[SETTINGS.width :] + SHARE[: -SETTINGS.width])
+WEIGHT = np.exp(-0.5 * ((MIDDLES - 1.0) / SETTINGS.expected) ** 2).astype(np.float32)
+STEP = float(SHARE[1] - SHARE[0])
+
+
+class Circles(NamedTuple):
+    """Outlines of N fingertips.
+
+    Attributes:
+        middle, radius: (N, 2), (N,) [px].
+        sigma_px: (N,) standard deviation of the middle per axis.
+        shown: (N,) which share of the edges that should be seen is seen where the circle has it.
+    """
+
+    middle: Float
+    radius: Float
+    sigma_px: Float
+    shown: Float
+
+
+def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: Float | Float32) -> Circles:
+    """Circles nearest to the outlines of N fingertips.
+
+    Args:
+        led: (H, W) difference of LED and ambient frame.
+        middle: (N, 2) where they are expected [px].
+        radius: (N,) [px].
+        open_: (N, DIRECTIONS) 1: an edge is to be seen in that direction, 0: the finger goes on.
+    """
+    middle, radius = middle.astype(np.float64), radius.astype(np.float64)
+    off, strength, inside = _edges(led, middle, radius)
+    wanted: Float = np.asarray(open_, np.float64) * inside
+    firm = wanted * np.minimum(
+        np.maximum((strength - SETTINGS.least_drop) * (1.0 / SETTINGS.firm_drop), 0.0), 1.0
+    )
+    weight: Float = firm
+    solution, rest, normal = np.zeros((len(radius), 3)), off, np.broadcast_to(np.eye(3), (len(radius), 3, 3))
+    for width in WIDTHS:
+        normal = (weight @ _PRODUCTS).reshape(-1, 3, 3) + _PRIOR_NORMAL
+        solution = np.asarray(
+            np.linalg.solve(normal, ((weight * off) @ _DESIGN)[..., None])[..., 0], np.float64
+        )
+        rest = (off - solution @ _DESIGN.T) * (1.0 / width)
+        weight = firm / (1.0 + rest * rest) ** 2
+    shown = (firm * (np.abs(rest) < 1.0)).sum(axis=1) / np.maximum(wanted.sum(axis=1), SETTINGS.tiny)
+    variance = np.linalg.inv(normal)[:, (0, 1), (0, 1)].sum(axis=1) * (0.5 * SETTINGS.edge_sigma**2)
+    solution *= radius[:, None]
+    return Circles(middle + solution[:, :2], radius + solution[:, 2], radius * np.sqrt(variance), shown)
+
+
+def _edges(led: Image, middle: Float, radius: Float) -> tuple[Float, Float, Bool]:
+    """Find the edges of light around N circles in each direction.
+
+    Returns how far beyond the circle the edge is (N, DIRECTIONS), in radii; by how much the logarithm of light falls
+    there; and whether the image shows that far.
+    """
+    reach = radius[:, None, None].astype(np.float32) * SHARE
+    x, y = (
+        middle[:, k, None, None].astype(np.float32) + reach * WAY[:, k, None].astype(np.float32)
+        for k in (0, 1)
+    )
+    height, width = led.shape
+    inside: Bool = (x[..., -1] > 0) & (y[..., -1] > 0) & (x[..., -1] < width - 1) & (y[..., -1] < height - 1)
+    along = x.reshape(-1, SETTINGS.steps), y.reshape(-1, SETTINGS.steps)
+    light = cv2.remap(led, *along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    log: Float32 = LOG[np.asarray(light, np.uint8)]
+    drop = log[:, : -SETTINGS.width] - log[:, SETTINGS.width :]
+    best: Int = (drop * WEIGHT).argmax(axis=1)
+    steps, flat = drop.shape[1], drop.ravel()
+    at = best + np.arange(len(best), dtype=np.int64) * steps
+    # The parabola through the steepest step and its neighbours.
+    before, here, behind = flat[at - (best > 0)], flat[at], flat[at + (best < steps - 1)]
+    part = 0.5 * (behind - before) / np.maximum(2.0 * here - before - behind, SETTINGS.tiny)
+    off: Float = (
+        SETTINGS.rim - 1.0 + MIDDLES[best] + STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
+    )
+    return off.reshape(inside.shape), here.reshape(inside.shape).astype(np.float64), inside
