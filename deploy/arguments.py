@@ -13,8 +13,8 @@ import re
 from argparse import ArgumentParser
 from pathlib import Path
 
-from deploy.sender_check import WAIT_SENDERS_S
-from deploy.targets import DeployError, RigFile
+from deploy.deployment import WAIT_SENDERS_S
+from deploy.remote import DeployError, RigFile
 
 _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before options
 

@@ -25,10 +25,9 @@ from pathlib import Path
 
 from deploy.arguments import check_reach, check_wish
 from deploy.demo import DemoError, DemoSettings, best_rigs, run_demo, stop_on_signals
-from deploy.deployment import Lines, Reached, Wish, deploy, make_keys, reach_of, roll_back, uninstall
+from deploy.deployment import Ears, Lines, Reached, Wish, deploy, make_keys, reach_of, roll_back, uninstall
 from deploy.payload import Kind, export
-from deploy.sender_check import Ears
-from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
+from deploy.remote import DeployError, RigFile, Target, read_rig, targets_of
 
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 

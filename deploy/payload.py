@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
-from deploy.targets import DeployError, RigFile
+from deploy.remote import DeployError, RigFile
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"

@@ -2,7 +2,7 @@
 
 It runs from the first beacon to data, as a push machine.
 
-`common.link.session.RULES` defines what follows from each event; this file classifies datagrams as events.
+`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
 - While the master of the session is received, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
@@ -33,7 +33,7 @@ from common.link.datagram import (
     Sealer,
     parse,
 )
-from common.link.session import (
+from common.link.handshake import (
     NONCE_BYTES,
     RULES,
     WELL_NS,

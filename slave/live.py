@@ -45,7 +45,7 @@ from slave.raw import RawFrames, RawSettings
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, Sender, WristPipeline
 from slave.sources import Frame, FrameSource, Reporting
-from slave.tags.live import LiveTags, finder_of
+from slave.tags.offline import LiveTags, finder_of
 from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
 from slave.wrist.detector import NullWristDetector, WristDetector, view_of, wrist_changes
 from slave.wrist.engine import Engine as WristEngine

@@ -16,9 +16,8 @@ from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock
 from common.errors import BusError
-from common.link.datagram import Address, LinkKey
-from common.link.session import Random
-from common.link.udp import READ_TIMEOUT_S, UdpSocket
+from common.link.datagram import READ_TIMEOUT_S, Address, LinkKey, UdpSocket
+from common.link.handshake import Random
 from common.messages import Message
 from slave.link import SlaveLink
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from bench.rigs.faults import FaultRig
 from bench.rigs.poses import Judged
 from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
-from common.link.session import RigKeys
+from common.link.handshake import RigKeys
 from common.messages import WIRE_VERSION
 from common.messages.streams import MASTER
 

@@ -12,7 +12,7 @@ from common.calibration.gesture_settings import GestureSettings
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.output_settings import OutputSettings
 from common.errors import MessageError
-from common.link.session import state_pages
+from common.link.handshake import state_pages
 from common.messages import AnyMessage, HandPose, Health, decode, encode
 from common.messages.schema import bounds_table, bus_schema
 from common.messages.state import METRICS, is_known, metrics_page

@@ -32,7 +32,7 @@ from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
 MACHINE_CODE = ("numba", "numba-windows", "wrist-numba")  # cases

@@ -14,7 +14,7 @@ from slave.markers.reloadable import detector_for
 from slave.markers.white_balance import Inline
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 
 
 def watched(both: Both, seconds: float) -> Shown:

@@ -32,7 +32,7 @@ from common.messages import Gesture, HandPose
 from common.sim.gestures import Gestures
 from common.sim.motion import HandMotion
 from common.sim.scenes import scene_by_name
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 from master.rig.setup import RigSetup, load_setup
 
 RATE_HZ = 60.0

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Struct, inspect
 
 from bench.rigs.fuzz_values import dtype_of, hostile, nested
-from common.link.session import EchoAnswer, Hello, Started
+from common.link.handshake import EchoAnswer, Hello, Started
 from common.messages import AnyMessage, Message
 
 Fields: TypeAlias = dict[str, object]

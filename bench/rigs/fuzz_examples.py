@@ -10,7 +10,7 @@ from msgspec import Struct
 from bench.rigs.fuzz import Attack, Fields, wire
 from bench.rigs.rooms import detections
 from common.arrays import Float
-from common.link.session import EchoAnswer, Hello, Started
+from common.link.handshake import EchoAnswer, Hello, Started
 from common.messages import (
     Backlog,
     CheckItem,

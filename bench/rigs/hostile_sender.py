@@ -26,7 +26,7 @@ from common.bus.keys import rig_key
 from common.bus.settings import settings
 from common.clock import SystemClock
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
-from common.link.session import EchoAnswer, Hello, RigKeys, Started
+from common.link.handshake import EchoAnswer, Hello, RigKeys, Started
 from common.messages import Health, Preview, Still
 from common.messages.streams import key_of
 from master.rig.setup import RigSetup, load_setup

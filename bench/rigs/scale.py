@@ -29,7 +29,7 @@ from bench.rigs.local import UP_S, Rig, RigError, cpu_s, losses, until
 from bench.rigs.rooms import DESK, ROOM, detections, in_order, room, slower
 from bench.rigs.scale_page import into_page
 from common.link.datagram import OVERHEAD
-from common.link.session import MAX_CAMERAS
+from common.link.handshake import MAX_CAMERAS
 from common.messages import HandPose, encode
 from common.messages.streams import MASTER
 from master.rig.setup import load_setup, load_setups

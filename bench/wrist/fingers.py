@@ -27,8 +27,8 @@ from common.sim.wrist.scene import AMBIENTS, WristScene
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig.wrist import WristSetup
 from slave.wrist.detector import find
+from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle
-from slave.wrist.view import WristView
 
 _POSES, _SEEDS = 24, (301, 302, 303)
 _MESHES, _TRIPLES, _MESH_SEED = ("random", "left_random"), 30, 303

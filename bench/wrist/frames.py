@@ -18,8 +18,8 @@ from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
+from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle, lit
-from slave.wrist.view import WristView
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
 _ROTATION_RAD, _SHIFT_M = np.radians(3.0), 3e-3

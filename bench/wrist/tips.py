@@ -15,11 +15,10 @@ from bench.wrist.frames import RECORDINGS, differences, drawn, other_palm, recor
 from common.arrays import Bool, Float
 from common.hand.profiles import generated_profile
 from common.sim.wrist.scene import AMBIENTS, WristScene
-from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
-from slave.wrist.laser import laser_lines
+from slave.wrist.laser import laser_lines, separate
+from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle
-from slave.wrist.view import WristView
 
 _MOTIONS = ("standard", "curl", "poses", "spread", "random")
 _LENGTHS_M = (0.17, 0.185, 0.2)  # of hands, one for each seed

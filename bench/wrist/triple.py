@@ -29,11 +29,10 @@ from master.run.app import StageTimes
 from slave.sources import Frame
 from slave.wrist.detector import WristFound, find
 from slave.wrist.engine import NUMPY, Engine, engine_named
-from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
-from slave.wrist.laser import laser_lines
+from slave.wrist.laser import laser_lines, separate
+from slave.wrist.led_image import WristView
 from slave.wrist.strobe import Strobe, StrobeCycle
-from slave.wrist.view import WristView
 
 _TRIPLES, _REPEATS = 25, 60
 _BRIGHT = 24  # levels: the baseline's threshold

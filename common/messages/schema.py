@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Ids
-from common.link.session import Handshake
+from common.link.handshake import Handshake
 from common.messages import WIRE_VERSION, AnyMessage, Backlog, Message
 from common.messages.parts import MAX_COUNT, MAX_NUMBER, MAX_PICTURE, MAX_TIME_NS, array_type, bounds_of
 from common.messages.streams import ALIVE_KEY, STREAMS, Path

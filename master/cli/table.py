@@ -69,7 +69,7 @@ TABLE: tuple[Command | Family, ...] = (
         _LOOK,
         "what of a running rig is not as it should be",
         "master.cli.rig:check",
-        "master.checklist.command:check",
+        "master.checklist.files:check",
     ),
     Command(
         "info",
@@ -275,7 +275,7 @@ TABLE: tuple[Command | Family, ...] = (
         "keys and sites",
         "several masters, seen from one place",
         "master.cli.rig:relay",
-        "master.commands.relay:relay",
+        "master.commands.keys:relay",
     ),
 )
 # The calibrations by their last word, which is theirs alone.

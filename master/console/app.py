@@ -22,9 +22,8 @@ from nicegui import ui
 
 from common.errors import PhalanxError
 from master.console.login import LOGOUT, LoginRequired, PasswordHash, kept_password, password_from
-from master.console.neighbours import same_user
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
-from master.console.serving import OwnPagesOnly, console_server, names_of
+from master.console.serving import OwnPagesOnly, console_server, names_of, same_user
 from master.console.setup import page as setup_page
 from master.console.sockets import serve_sockets
 from master.console.state import ConsoleSettings, ConsoleState

@@ -1,18 +1,31 @@
-"""Recording on the page: start, stop and progress.
+"""Panels start, stop and play recordings.
+
+Recording on the page: start, stop and progress.
 
 The recorder is a process of its own; files lie in one folder.
+
+Playback controls on the page.
+
+Begin a recording in place of a master; pause, seek and set the speed of whichever player runs.
 """
 
 import asyncio
+import json
 import re
 import sys
+import time
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
+from typing import cast
 
 from nicegui import ui
+from nicegui.events import GenericEventArguments
 
 from common.errors import PhalanxError
-from common.messages import Health
+from common.messages import Command, Health
+from common.messages.streams import MASTER
+from master.console.controls import CommandQueue
 from master.console.state import ConsoleState
 
 PROCESS = "record"
@@ -112,3 +125,170 @@ def recording_panel(state: ConsoleState) -> None:
 
 def _new_name() -> str:
     return datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+
+
+PLAYBACK = "play"
+_SPEEDS = {0.25: "¼ ×", 0.5: "½ ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×", 0.0: "as fast as it goes"}
+_JUMP_S = 5.0
+
+
+def recordings(state: ConsoleState) -> list[str]:
+    """Names of the recordings in the page's folder, newest first."""
+    folder = recordings_folder(state)
+    if not folder.is_dir():
+        return []
+    files = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
+    most_files = 200
+    return [path.stem for path in files[:most_files]]
+
+
+def start_playing(state: ConsoleState, name: str) -> None:
+    """Play a recording of the page's folder to the bus, in place of a master.
+
+    Raises:
+        PhalanxError: There is none of that name, or a master runs already.
+    """
+    if name not in recordings(state):
+        raise PhalanxError("choose a recording")
+    if MASTER in state.alive and PLAYBACK not in state.local.running():
+        raise PhalanxError(
+            "a master runs: end it on the Set-up page first, a recording is played in its place"
+        )
+    file = recordings_folder(state) / f"{name}.mcap"
+    state.local.start(
+        PLAYBACK, [sys.executable, "-m", "master", "play", str(file), "--bus", state.settings.bus], {}
+    )
+
+
+class Controls:
+    """Pause, position and speed of whichever player is on the bus.
+
+    It holds what the page shows of the player.
+    """
+
+    def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
+        """Build the controls in the present slot.
+
+        `notify` receives the reason why a command was refused, or nothing.
+        """
+        self._state, self._notify = state, notify
+        self._answer: Health | None = None
+        self._at, self._speed, self._paused = 0.0, 1.0, False
+        self._wanted_s: float | None = None
+        self._until_s = 0.0
+        with ui.column().classes("w-full gap-1") as self._all:
+            with ui.row().classes("items-center gap-2 w-full no-wrap"):
+                self._pause = ui.button(icon="pause").props('flat round aria-label="Pause"')
+                self._slider = ui.slider(min=0, max=1, step=0.1, value=0)
+                self._slider.props('aria-label="Position in seconds"')
+                self._words = ui.label("").classes("mono play-at")
+            self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
+            self._speeds.classes("known-poses")
+        self._command_queue = CommandQueue(self._send, self._on_answer, notify)
+        self._pause.on_click(lambda: self._command_queue.change("resume" if self._paused else "pause", None))
+        self._slider.on_value_change(self._dragged)
+        self._slider.on("change", self._sought)  # when it is let go, or its key
+        self._speeds.on_value_change(self._sped)
+
+    def update(self) -> None:
+        """Show the player's last reported state."""
+        now = self._newest()
+        position = None if now is None else now.metrics.get("play.position_s")
+        self._all.set_visibility(position is not None)
+        if now is None or position is None or self._command_queue.busy:
+            return
+        if self._wanted_s is not None:
+            # A jump may take so long; so near to where it went it has arrived; so long a hand rests between two steps.
+            near_s, rest_s = 2.0, 1.5
+            there = abs(position - self._wanted_s) < near_s
+            left_s = self._until_s - time.monotonic()
+            if left_s > (_JUMP_S - rest_s if there else 0.0):
+                return  # still being moved by hand, or on its way
+            self._wanted_s = None
+        length = now.metrics.get("play.length_s", 0.0)
+        self._paused, self._at = bool(now.metrics.get("play.paused")), round(position, 1)
+        self._speed = now.metrics.get("play.speed", 1.0)
+        self._slider.props(f"max={max(length, 0.1):.1f}")
+        self._slider.set_value(self._at)
+        self._words.set_text(f"{position:.1f} of {length:.1f} s")
+        self._pause.set_icon("play_arrow" if self._paused else "pause")
+        self._pause.props(f'aria-label="{"Resume" if self._paused else "Pause"}"')
+        if self._speed in _SPEEDS:
+            self._speeds.set_value(self._speed)
+
+    def _newest(self) -> Health | None:
+        """The report of the master, or what it answered since."""
+        report, answer = self._state.health.get(MASTER), self._answer
+        if report is None or answer is None or answer.session != report.session:
+            return report
+        return max(report, answer, key=lambda one: one.t_ns)
+
+    def _send(self, change: Mapping[str, object]) -> Health | None:
+        answer: Health | None = None
+        for verb, body in change.items():
+            answer = self._state.link.ask(Command(MASTER, verb, "" if body is None else json.dumps(body)))
+        return answer
+
+    def _on_answer(self, answer: Health | None) -> None:
+        self._answer = answer
+        self._notify("")
+
+    def _dragged(self) -> None:
+        value = self._slider.value
+        if value is not None and value != self._at:
+            self._wanted_s, self._until_s = float(value), time.monotonic() + _JUMP_S
+            self._words.set_text(f"to {value:.1f} s")
+
+    def _sought(self, event: GenericEventArguments) -> None:
+        """The event has the value: `value` follows a moment later while a hand is quick."""
+        self._wanted_s, self._until_s = float(cast(float, event.args)), time.monotonic() + _JUMP_S
+        self._command_queue.change("seek", {"t_s": round(self._wanted_s, 1)})
+
+    def _sped(self) -> None:
+        factor = float(self._speeds.value or 0.0)
+        if factor != self._speed:
+            self._speed = factor
+            self._command_queue.change("speed", {"factor": factor})
+
+
+def play_panel(state: ConsoleState) -> None:
+    """Build the panel."""
+    with ui.element("section").classes("panel").props('aria-label="Playing"'):
+        ui.label("Playing").classes("panel-title")
+        with ui.row().classes("items-center gap-3"):
+            which = ui.select(recordings(state), label="Recording").props("dense outlined")
+            which.classes("known-poses")
+            play = ui.button("Play", icon="play_circle").props("unelevated")
+        error = ui.label("").classes("problem").props('role="alert"')
+        controls = Controls(state, error.set_text)
+        log = ui.label("").classes("mono").props('role="log" aria-label="Messages of the player"')
+
+    async def toggle() -> None:
+        error.set_text("")
+        play.disable()
+        try:
+            if PLAYBACK in state.local.running():
+                await asyncio.to_thread(state.local.stop, PLAYBACK)
+            else:
+                await asyncio.to_thread(start_playing, state, str(which.value or ""))
+        except PhalanxError as problem:
+            error.set_text(str(problem))
+        finally:
+            play.enable()
+
+    play.on_click(toggle)
+
+    def update() -> None:
+        running = PLAYBACK in state.local.running()
+        play.set_text("Stop" if running else "Play")
+        play.set_icon("stop" if running else "play_circle")
+        names = recordings(state)
+        if which.options != names:
+            which.set_options(names, value=which.value if which.value in names else None)
+        controls.update()
+        process = state.local.get(PLAYBACK)
+        log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
+
+    update()
+    update_s = 0.5
+    ui.timer(update_s, update)

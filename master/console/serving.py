@@ -1,5 +1,7 @@
 """Web server limits connections and refuses requests of other sites.
 
+Web server limits connections and refuses requests of other sites.
+
 Web server of the console: uvicorn with limits on connections.
 
 The limits apply to whoever connects and does not, or not yet, send requests like a browser.
@@ -14,14 +16,21 @@ Only pages that it served itself, under the name it is reached by, may do so.
 A page of another site, open in the same browser, could otherwise open a web socket to this one (browsers send those
 across origins), show it in a frame and steal a click, or reach it under a name of its own that it lets point here (DNS
 rebinding). Where there is no login, another user of the same machine is refused as well: `same_user`.
+
+Local user at the other end of a connection that never left this machine.
+
+Linux reports it in /proc/net.
 """
 
 import asyncio
 import functools
+import os
 import socket
 import ssl
+import sys
 from collections.abc import Callable, Collection, MutableMapping
-from ipaddress import ip_address
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
 
@@ -257,3 +266,47 @@ def _peer(scope: MutableMapping[str, Any], side: str) -> Peer:
 def _header(scope: MutableMapping[str, Any], name: bytes) -> str | None:
     found = [value for key, value in scope["headers"] if key == name]
     return found[0].decode("latin-1") if found else None
+
+
+_TABLES = ("tcp", "tcp6")
+_WORD = 8  # hexadecimal digits of 32 bits, which the kernel writes in the machine's own byte order
+
+
+def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool:
+    """Return whether the client belongs to this process's user, or to root.
+
+    True where the system does not report it.
+
+    Args:
+        client, server: Address and port of both ends, as the server sees them.
+        net: Folder with the kernel's tables of sockets.
+    """
+    tables = [path for name in _TABLES if (path := net / name).exists()]
+    if not tables:
+        return True  # no Linux
+    wanted = (_plain(client), _plain(server))
+    ports = f":{client[1]:04X} ", f":{server[1]:04X} "  # thousands of lines are looked at quickly by these
+    for path in tables:
+        for line in path.read_text(encoding="ascii").splitlines()[1:]:
+            if ports[0] not in line or ports[1] not in line:
+                continue
+            fields = line.split()
+            if (_socket(fields[1]), _socket(fields[2])) == wanted:
+                root = 0
+                return int(fields[7]) in (os.getuid(), root)
+    return False
+
+
+def _plain(peer: Peer) -> Peer:
+    address = ip_address(peer[0].split("%", 1)[0])
+    if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+        address = address.ipv4_mapped
+    return str(address), peer[1]
+
+
+def _socket(text: str) -> Peer:
+    """ADDRESS:PORT as the kernel writes it."""
+    digits, _, port = text.partition(":")
+    words = (digits[k : k + _WORD] for k in range(0, len(digits), _WORD))
+    packed = b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)
+    return _plain((str(ip_address(packed)), int(port, 16)))

@@ -39,9 +39,9 @@ from common.messages import (
 )
 from common.messages.streams import MASTER
 from master.commands.options import HERE_BEACON, HERE_BIND, HERE_BUS
+from master.console.controls import Tuner
 from master.console.link import Link, PictureSizes, PreviewLeases
 from master.console.local import LocalProcesses
-from master.console.tuner import Tuner
 from master.run.process import join_bus
 
 SPAN_S = 60.0

@@ -23,7 +23,7 @@ from common.errors import CalibrationError, FitError, PhalanxError
 from common.hand.model import HandModel
 from common.messages import Gesture, HandPose
 from master.calibrate.tree_files import provenance
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 from master.gestures.templates import Example, PoseTemplate, held, learn, template_session, what_lacks
 from master.outputs.poses import Poses, load_poses
 from master.run.process import join_bus

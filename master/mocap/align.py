@@ -26,7 +26,7 @@ from scipy import signal
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
 from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix
-from master.mocap.joint_motion import Track, known
+from master.mocap.bvh_file import Track, known
 
 HALF_NS = 20_000_000
 """Half of the time over which a speed is a difference."""

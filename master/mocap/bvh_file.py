@@ -1,4 +1,19 @@
-"""Reader of BVH files.
+"""Read and write hands as joint rotations of BVH.
+
+Joint motion and tracks hold what a motion-capture file contains.
+
+Contents of a motion-capture file.
+
+Joints and markers of one hand over time, in metres.
+
+Readers of single formats give a `PointTable`, every point of the file in the file's own names and unit; `read_motion`
+(master/mocap/read.py) makes a `JointMotion` of it.
+
+Points over time that two programs both report.
+
+They are resampled, and their speeds computed.
+
+Reader of BVH files.
 
 A tree of joints with offsets, and the rotations of every frame, become positions of all joints.
 
@@ -11,12 +26,153 @@ none. BVH has no unit, and no word for what was not seen.
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
-from master.mocap.joint_motion import MAX_BYTES, PointTable
+from common.hand.model import JOINTS
+
+Unit = Literal["m", "dm", "cm", "mm", "in"]
+Side = Literal["left", "right"]
+METRES: dict[Unit, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+MARKERS = ("thumb", "index", "middle", "ring", "little", "back", "back2", "back3")
+POINTS = (*JOINTS, *MARKERS)
+MAX_BYTES = 1 << 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTable:
+    """All points of a file, as they stand in it.
+
+    Attributes:
+        names: (N,) as the file spells them.
+        t_s: (T,) [s], rising.
+        position: (T, N, 3) in `unit`; NaN: not seen.
+        unit: Of length; None: the file does not state it.
+        ends: Those of `names` that are end sites, the end of a bone and no joint.
+    """
+
+    names: tuple[str, ...]
+    t_s: Float
+    position: Float
+    unit: Unit | None
+    ends: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointMotion:
+    """Joints and markers of one hand.
+
+    Attributes:
+        t_ns: (T,) [ns], rising, on the clock of the file.
+        names: (J,) each a WebXR joint, `palm`, or a marker of ours (`MARKERS`).
+        position_m: (T, J, 3) [m], frame of the file; NaN: not seen.
+        side: That the names state; None: they do not.
+        source: The file.
+        remarks: What was assumed, for a person.
+    """
+
+    t_ns: Int
+    names: tuple[str, ...]
+    position_m: Float
+    side: Side | None
+    source: str
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def of(self, name: str) -> Float:
+        """Return the positions (T, 3) [m] of a joint or marker.
+
+        NaN throughout where the file has none of it.
+        """
+        if name not in self.names:
+            return np.full((len(self), 3), np.nan)
+        return self.position_m[:, self.names.index(name)]
+
+
+def checked_times(t_s: Float, where: str) -> Int:
+    """Times [ns] of rows at (T,) [s].
+
+    Raises:
+        RecordingError: They are not finite, do not rise, or are none of seconds.
+    """
+    if not len(t_s):
+        raise RecordingError(f"{where}: has no frame")
+    max_s = 9e9  # beyond it no integer of nanoseconds has room
+    if not np.isfinite(t_s).all() or np.abs(t_s).max() > max_s:
+        row = int(np.argmax(~np.isfinite(t_s) | (np.abs(t_s) > max_s)))
+        raise RecordingError(f"{where}: time of frame {row + 1} is {t_s[row]}: no seconds")
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    steps = np.diff(t_ns)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0))
+        raise RecordingError(
+            f"{where}: time goes from {t_s[row]:.9g} s at frame {row + 1} to {t_s[row + 1]:.9g} s: it must rise"
+        )
+    if len(steps) and float(np.median(steps)) > 0.5e9:
+        raise RecordingError(
+            f"{where}: frames are {np.median(steps) * 1e-9:.3g} s apart: are times not in seconds? name the column"
+            " t_ms, t_us or t_ns"
+        )
+    return t_ns
+
+
+"""Between two frames that are farther apart nothing is known: 25 ms, or 1.5 frames of a slow file, at most 100 ms."""
+
+
+def known(position_m: Float) -> Bool:
+    """Whether points (..., 3) are known, (...)."""
+    return np.asarray(np.isfinite(position_m).all(axis=-1), np.bool_)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Positions of J named points at T times.
+
+    Attributes:
+        t_ns: (T,) [ns], rising.
+        position_m: (T, J, 3) [m]; NaN: not known.
+    """
+
+    t_ns: Int
+    position_m: Float
+
+    @property
+    def gap_ns(self) -> int:
+        """Frames that are farther apart have nothing between them."""
+        typical = float(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0.0
+        # gap ns
+        most_gap_ns, gap_frames = 100_000_000, 1.5
+        return int(min(max(25_000_000, gap_frames * typical), most_gap_ns))
+
+    def at(self, t_ns: Int) -> Float:
+        """Interpolate positions (N, J, 3) [m] at times (N,).
+
+        Between two frames the interpolation is linear.
+
+        NaN before the first frame, after the last, in a gap, and where one of the two frames does not know the point.
+        """
+        if len(self.t_ns) < 2:
+            return np.full((len(t_ns), *self.position_m.shape[1:]), np.nan)
+        after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
+        before = after - 1
+        span = self.t_ns[after] - self.t_ns[before]
+        share = (t_ns - self.t_ns[before]) / span
+        between = (share >= 0.0) & (share <= 1.0) & (span <= self.gap_ns)
+        share = np.where(between, share, np.nan)[:, None, None]
+        first, second = self.position_m[before], self.position_m[after]
+        # On a frame itself the other one does not matter.
+        middle = first + share * (second - first)
+        return np.where(share == 0.0, first, np.where(share == 1.0, second, middle))
+
+    def velocity(self, t_ns: Int, half_ns: int) -> Float:
+        """Velocities (N, J, 3) [m/s] by the difference over twice `half_ns`."""
+        return (self.at(t_ns + half_ns) - self.at(t_ns - half_ns)) / (2e-9 * half_ns)
+
 
 _CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 

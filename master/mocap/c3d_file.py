@@ -12,7 +12,7 @@ import c3d
 import numpy as np
 
 from common.errors import RecordingError
-from master.mocap.joint_motion import MAX_BYTES, PointTable, Unit
+from master.mocap.bvh_file import MAX_BYTES, PointTable, Unit
 
 _UNITS: dict[str, Unit] = {"m": "m", "cm": "cm", "mm": "mm", "in": "in"}
 _BROKEN = (

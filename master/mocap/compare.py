@@ -24,7 +24,7 @@ from common.arrays import Bool, Float, Int
 from common.geometry.transforms import matrix_to_rotation_vector
 from common.hand.model import FINGER_JOINTS, FINGERS, JOINTS, WRIST
 from master.mocap.align import Alignment
-from master.mocap.joint_motion import JointMotion, Track, known
+from master.mocap.bvh_file import JointMotion, Track, known
 from master.outputs.poses import Poses
 
 """Quantiles of a chi-square of 3 degrees of freedom."""

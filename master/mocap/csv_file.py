@@ -33,7 +33,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import RecordingError
-from master.mocap.joint_motion import MAX_BYTES, PointTable, Unit
+from master.mocap.bvh_file import MAX_BYTES, PointTable, Unit
 
 
 def read_rows(path: Path) -> list[list[str]]:

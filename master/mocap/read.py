@@ -26,10 +26,7 @@ from common.arrays import Float
 from common.calibration.files import read_json
 from common.errors import RecordingError
 from common.hand.model import FINGER_JOINTS, JOINTS
-from master.mocap.bvh_file import read_bvh
-from master.mocap.c3d_file import read_c3d
-from master.mocap.csv_file import read_csv
-from master.mocap.joint_motion import (
+from master.mocap.bvh_file import (
     METRES,
     POINTS,
     JointMotion,
@@ -38,7 +35,10 @@ from master.mocap.joint_motion import (
     Unit,
     checked_times,
     known,
+    read_bvh,
 )
+from master.mocap.c3d_file import read_c3d
+from master.mocap.csv_file import read_csv
 
 _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _SIDES: dict[str, Side] = {"left": "left", "l": "left", "right": "right", "r": "right"}

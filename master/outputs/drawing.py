@@ -1,4 +1,6 @@
-"""Viewer and picture share these colours, states and wrist geometry.
+"""Draw hands, points and panels into pictures.
+
+Viewer and picture share these colours, states and wrist geometry.
 
 Colours of a hand, the same in the viewer and in the picture.
 
@@ -19,21 +21,34 @@ The device is on the forearm, which the solved palm and the wrist's flexion plac
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
 with `T_camera_palm` of a straight wrist (`common.hand.wrist`). A bend that is not measured counts as none.
+
+Shaded image of a hand.
+
+Spheres swept along the bones and the palm, drawn into a depth buffer.
+
+Orthographic view; the view frame is OpenCV's (x right, y down, z away from the eye), pixels follow it.
+
+Plots beside the hand in the picture of a run.
+
+Angles, latency or marker noise, error or what was seen.
 """
 
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from common.arrays import Float
 from common.calibration import RigCalibration
 from common.geometry.transforms import invert, quaternion_to_matrix
-from common.hand.model import WRIST, HandModel
+from common.hand.model import FINGER_JOINTS, FINGERS, WRIST, HandModel
 from common.hand.wrist import forearm_palm
 from common.messages import ObjectPose, Source
-from master.outputs.poses import Poses
+from master.outputs.poses import Poses, PosesTruth, distance_m, mean_known
 from master.rig.wrist import WristSetup
 
 Rgb = tuple[int, int, int]
@@ -209,3 +224,224 @@ class DevicePlace:
         wrist_angles = self.wrist_angles_rad[:, None] + sigmas * self.sigma_rad[:, None] * around
         forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(wrist_angles), 2, 3)
         return self.wrist_m[:, None] + length_m * (forearm @ _ELBOW)
+
+
+Pixels = npt.NDArray[np.float32]
+
+_LIGHT = np.array([-0.45, -0.6, -0.66], np.float32)
+_WEBS = ((1, 2), (2, 3), (3, 4))  # neighbouring fingers whose metacarpals the palm spans
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Where the eye stands.
+
+    Attributes:
+        rotation: Rig frame -> view frame (3, 3).
+        centre_m: Point of the rig frame (3,) [m] that is drawn at the centre of the image.
+        scale_px_m: Pixels per metre.
+        width_px, height_px: Image size.
+    """
+
+    rotation: Float
+    centre_m: Float
+    scale_px_m: float
+    width_px: int
+    height_px: int
+
+    def project(self, points_m: Float) -> Float:
+        """Project points (..., 3) [m] of the rig frame to pixels and depth [px].
+
+        Returns (..., 3) [px]; NaN stays NaN.
+        """
+        view = (points_m - self.centre_m) @ self.rotation.T * self.scale_px_m
+        return view + np.array([self.width_px / 2, self.height_px / 2, 0.0])
+
+
+def render_hand(view: View, position_m: Float, radius_m: Float) -> tuple[Pixels, Pixels]:
+    """Draw one hand.
+
+    Args:
+        view: The eye.
+        position_m: Joints (26, 3) [m], rig frame. A bone with a NaN end is not drawn.
+        radius_m: (26,) [m].
+
+    Returns:
+        Brightness (H, W) in 0..1, and coverage (H, W): 1 on the hand, 0 elsewhere.
+    """
+    depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
+    normal = np.zeros((view.height_px, view.width_px, 3), np.float32)
+    for sphere in _spheres(position_m, radius_m):
+        _draw_sphere(depth, normal, view.project(sphere[:3]), float(sphere[3]) * view.scale_px_m)
+    covered = np.isfinite(depth)
+    lambert = np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
+    facing = np.clip(-normal[..., 2], 0.0, 1.0)
+    brightness = 0.30 + 0.58 * lambert + 0.16 * facing**2
+    return np.where(covered, brightness, 0.0).astype(np.float32), covered.astype(np.float32)
+
+
+def _spheres(position_m: Float, radius_m: Float) -> Float:
+    """Centres and radii (N, 4) [m] that fill the hand."""
+    joints = np.column_stack([position_m, radius_m])
+    wrist_share = 0.75  # a wrist is flat: half its width would make a ball of it
+    joints[WRIST, 3] *= wrist_share
+    segments = [(joints[a], joints[b]) for chain in FINGER_JOINTS for a, b in pairwise(chain)]
+    web_steps = 28
+    for left, right in _WEBS:
+        a, b = joints[list(FINGER_JOINTS[left][:2])], joints[list(FINGER_JOINTS[right][:2])]
+        segments += [tuple((1 - t) * a + t * b) for t in np.linspace(0.0, 1.0, web_steps)[1:-1]]
+    # The ball of the thumb spans from the lower part of the thumb's metacarpal to that of the index finger's.
+    thumb, index = joints[list(FINGER_JOINTS[0][:2])], joints[list(FINGER_JOINTS[1][:2])]
+    thumb, root = (np.stack([bone[0], 0.45 * bone[0] + 0.55 * bone[1]]) for bone in (thumb, index))
+    segments += [tuple((1 - t) * thumb + t * root) for t in np.linspace(0.0, 1.0, web_steps)[1:-1]]
+    segments += [(joints[WRIST], joints[chain[0]]) for chain in FINGER_JOINTS]
+    swept = [_sweep(a, b) for a, b in segments if np.isfinite(a + b).all()]
+    return np.concatenate(swept) if swept else np.empty((0, 4))
+
+
+def _sweep(a: Float, b: Float) -> Float:
+    """Spheres (N, 4) from `a` to `b`, radius changing evenly."""
+    length = float(np.linalg.norm(b[:3] - a[:3]))
+    step = 0.12  # of a radius, between swept spheres: ripples stay far below a pixel
+    count = 2 + int(length / (step * max(min(a[3], b[3]), 1e-3)))
+    t = np.linspace(0.0, 1.0, count)[:, None]
+    return (1 - t) * a + t * b
+
+
+def _draw_sphere(depth: Pixels, normal: Pixels, centre: Float, radius_px: float) -> None:
+    """Put one sphere into depth and normal buffers; parts outside the image are cut."""
+    height, width = depth.shape
+    u0, u1 = max(int(centre[0] - radius_px), 0), min(int(centre[0] + radius_px) + 2, width)
+    v0, v1 = max(int(centre[1] - radius_px), 0), min(int(centre[1] + radius_px) + 2, height)
+    if u0 >= u1 or v0 >= v1:
+        return
+    x = ((np.arange(u0, u1) - centre[0]) / radius_px).astype(np.float32)
+    y = ((np.arange(v0, v1) - centre[1]) / radius_px).astype(np.float32)
+    towards = 1.0 - x[None, :] ** 2 - y[:, None] ** 2
+    z = np.sqrt(np.maximum(towards, 0.0))
+    front = np.float32(centre[2]) - z * np.float32(radius_px)
+    window = depth[v0:v1, u0:u1]
+    nearer = (towards >= 0.0) & (front < window)
+    window[nearer] = front[nearer]
+    rows, columns = np.nonzero(nearer)
+    normal[v0 + rows, u0 + columns] = np.column_stack([x[columns], y[rows], -z[nearer]])
+
+
+Colour = tuple[float, float, float]
+
+PAPER: Colour = (0.075, 0.09, 0.115)
+INK: Colour = (0.90, 0.92, 0.94)
+_PANEL: Colour = (0.105, 0.125, 0.155)
+_BOTTOMS = (0.63, 0.345, 0.06)
+
+
+def unit(rgb: Rgb) -> Colour:
+    """A colour with parts in 0..1, as matplotlib takes it."""
+    return (rgb[0] / 255, rgb[1] / 255, rgb[2] / 255)
+
+
+def style(axes: Axes, title: str) -> None:
+    """Dark panel with a title; all panels look alike."""
+    axes.set_facecolor(_PANEL)
+    axes.set_title(title, color=INK, size=12, loc="left", pad=6)
+    axes.tick_params(colors=INK, labelsize=10, length=3)
+    axes.grid(visible=True, color=INK, alpha=0.10, lw=0.8)
+    for spine in axes.spines.values():
+        spine.set_color(INK)
+        spine.set_alpha(0.25)
+
+
+def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
+    """Draw three panels down the right side.
+
+    A thin line marks the row that is shown as a hand.
+    """
+    left, width, height = 0.655, 0.33, 0.205
+    boxes = [figure.add_axes((left, bottom, width, height)) for bottom in _BOTTOMS]
+    seconds = (poses.t_ns - poses.t_ns[0]).astype(np.float64) * 1e-9
+    _angles(boxes[0], poses, seconds, model)
+    if truth is not None:
+        _errors(boxes[1], poses, seconds, truth)
+    else:
+        _seen(boxes[1], poses, seconds)
+    for axes in boxes[:2]:
+        axes.axvline(float(seconds[row]), color=INK, lw=1.0, alpha=0.7)
+        axes.set_xlim(0.0, float(seconds[-1]) if len(seconds) > 1 else 1.0)
+        axes.set_xlabel("time [s]", color=INK, size=10, labelpad=1)
+    if poses.latency_ns.any():
+        _histogram(boxes[2], poses.latency_ns.astype(np.float64) * 1e-6, "Latency of a pose", "ms")
+    else:
+        step = distance_m(poses.markers_raw_m, poses.markers_m).ravel() * 1e3
+        _histogram(boxes[2], step[~np.isnan(step)], "Marker: raw to filtered", "mm")
+
+
+def _angles(axes: Axes, poses: Poses, seconds: Float, model: HandModel) -> None:
+    style(axes, "PIP angle [deg]")
+    pip = 2
+    degrees = np.rad2deg(poses.angles_rad[:, :, pip])
+    for finger, name in enumerate(FINGERS):
+        axes.plot(seconds, degrees[:, finger], color=unit(series_rgb(finger)), lw=1.5, label=name)
+    top = float(np.rad2deg(model.limits_rad[1, pip, 1]))
+    axes.set_ylim(-15.0, top + 22.0)
+    axes.axhline(top, color=INK, lw=0.9, ls=":", alpha=0.7)
+    axes.text(0.995, top + 1.5, "limit", color=INK, size=9, ha="right", va="bottom", alpha=0.8,
+              transform=axes.get_yaxis_transform())  # fmt: skip
+    _legend_above(axes)
+
+
+def _errors(axes: Axes, poses: Poses, seconds: Float, truth: PosesTruth) -> None:
+    style(axes, "Mean error to the truth [mm]")
+    errors = {name: mean_known(error) * 1e3 for name, error in truth.errors_m(poses).items()}
+    for (name, error), (colour, width) in zip(errors.items(), ((1, 1.5), (0, 1.2)), strict=True):
+        label = "markers, unfiltered" if name == "markers" else name
+        axes.plot(seconds, error, color=unit(series_rgb(colour)), lw=width, label=label)
+    known = np.concatenate(list(errors.values()))
+    known = known[~np.isnan(known)]
+    # One gap in tracking must not flatten the rest of the curve.
+    top = float(np.percentile(known, 99)) * 1.25 if len(known) else 1.0
+    axes.set_ylim(0.0, max(top, 0.5))
+    _legend_above(axes)
+
+
+def _seen(axes: Axes, poses: Poses, seconds: Float) -> None:
+    style(axes, "What was seen")
+    name, points = ("markers", poses.markers_raw_m) if poses.marker_count else ("laser points", poses.laser_m)
+    seen = (~np.isnan(points).any(axis=-1)).sum(axis=1)
+    axes.plot(seconds, seen, color=unit(series_rgb(0)), lw=1.3, drawstyle="steps-mid", label=name)
+    tracked = poses.tracked.sum(axis=1)
+    axes.plot(
+        seconds, tracked, color=unit(series_rgb(2)), lw=1.3, drawstyle="steps-mid", label="joints tracked"
+    )
+    axes.set_ylim(0.0, 27.0)
+    _legend_above(axes)
+
+
+def _histogram(axes: Axes, values: Float, title: str, what: str) -> None:
+    style(axes, title)
+    axes.set_xlabel(what, color=INK, size=10, labelpad=1)
+    axes.set_ylabel("poses" if what == "ms" else "count", color=INK, size=10)
+    if not len(values):
+        axes.text(0.5, 0.5, "nothing measured", color=INK, ha="center", va="center", transform=axes.transAxes)
+        return
+    middle, tail = np.percentile(values, [50, 99])
+    top = max(float(tail) * 1.35, 1e-3)
+    bins = int(np.clip(2 * np.sqrt(len(values)), 12, 60))
+    shown = np.minimum(values, top)  # the rare rest stands in the last bar
+    heights = axes.hist(shown, bins=bins, range=(0.0, top), color=unit(series_rgb(1)), alpha=0.85)[0]
+    axes.set_ylim(0.0, 1.2 * float(np.max(heights)))
+    axes.set_xlim(0.0, top)
+    label_width = 0.22  # of a panel
+    # Near the axis there is no room on the left; on the right the two would meet, so one stands lower.
+    side, height = ("right", 0.97) if middle > label_width * top else ("left", 0.86)
+    for value, name, ha, y in ((middle, "p50", side, height), (tail, "p99", "left", 0.97)):
+        axes.axvline(float(value), color=unit(series_rgb(0)), lw=1.4)
+        gap = 4 if ha == "left" else -4
+        axes.annotate(f"{name} {value:.1f} {what}", (float(value), y), (gap, 0), xycoords=axes.get_xaxis_transform(),
+                      textcoords="offset points", color=INK, size=10, ha=ha, va="top")  # fmt: skip
+
+
+def _legend_above(axes: Axes) -> None:
+    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.01, 0.98), ncols=5, frameon=False, fontsize=9.5,
+                         handlelength=1.2, columnspacing=1.0, borderpad=0.2)  # fmt: skip
+    for text in legend.get_texts():
+        text.set_color(INK)

@@ -31,10 +31,23 @@ from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation
 from common.hand.model import FINGER_JOINTS, TIPS, WRIST, HandModel
 from common.messages import Source
-from master.outputs.drawing import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
-from master.outputs.hand_render import View, render_hand
+from master.outputs.drawing import (
+    INK,
+    PAPER,
+    RAY_RGB,
+    SOURCE_MEANING,
+    SOURCE_RGB,
+    TRUTH_RGB,
+    Colour,
+    Rgb,
+    View,
+    draw_panels,
+    render_hand,
+    series_rgb,
+    style,
+    unit,
+)
 from master.outputs.picture_overlays import ResultPicture, WristPicture
-from master.outputs.picture_panels import INK, PAPER, Colour, draw_panels, style, unit
 from master.outputs.poses import Poses, PosesTruth
 from master.rig.merge import edges
 

@@ -29,18 +29,21 @@ from common.hand.model import FINGER_JOINTS, FINGERS
 from common.messages import FINGER_COUNT, Gesture, Source
 from master.outputs.drawing import (
     GESTURE_RGB,
+    INK,
     LASER_RGB,
     OBJECT_RGB,
+    PAPER,
     SOURCE_RGB,
     TRUTH_RGB,
     DevicePlace,
     ObjectAppearance,
+    View,
     fan,
     fan_rays,
     series_rgb,
+    style,
+    unit,
 )
-from master.outputs.hand_render import View
-from master.outputs.picture_panels import INK, PAPER, style, unit
 from master.outputs.poses import Poses, PosesTruth
 from master.outputs.result_files import Contacts, ObjectPoses
 from master.rig.setup import RigSetup

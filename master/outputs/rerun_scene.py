@@ -1,4 +1,25 @@
-"""The scene logs hands, rig and camera pictures to one Rerun recording.
+"""Log hands, cameras, objects and the wrist device as a 3D scene of Rerun.
+
+Wrist device in the viewer's scene.
+
+The fan of its laser, where that meets each finger, and what the device saw.
+
+world                                a device alone: all of it, turned as the forearm is held, up is up; where an IMU
+                                     measures it
+world/laser/fan                      the laser's light, as far as the rig specifies where it goes
+world/laser/points                   where it meets each finger, in the finger's colour
+world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
+world/cameras/CAM/laser              the same points as this camera should see them
+world/cameras/CAM/detections/...     laser, tips: as it saw them, where that is known
+
+Beside marker cameras the same entities stand in the rig frame: `world/laser`, `world/rays/CAM` and `world/cameras/CAM`
+move with the device, which the solved palm and the wrist's bend place (`device_place`). Added are
+
+world/hand/HAND/forearm              from the wrist towards the elbow
+world/hand/HAND/forearm_uncertainty        a ring: where its far end is at 2 sigma of the bend
+plots/wrist_angles_deg/...             flexion and deviation
+
+The scene logs hands, rig and camera pictures to one Rerun recording.
 
 Camera pictures in the viewer.
 
@@ -42,17 +63,177 @@ from common.arrays import Bool, Float, Image, Int
 from common.calibration import Volume
 from common.errors import PictureError
 from common.geometry.camera_model import CameraModel
-from common.geometry.transforms import matrix_to_quaternion
+from common.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
 from common.hand.model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
 from common.hand.profiles import FLEXION
-from common.messages import Detections, Health, MarkerDetections, ResultMessage, Source, WristDetections
-from common.recording.picture_size import Size, jpeg_size
-from master.outputs.drawing import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, fan_rays, pack, series_rgb
+from common.messages import (
+    FINGER_COUNT,
+    Detections,
+    Health,
+    MarkerDetections,
+    ResultMessage,
+    Source,
+    WristDetections,
+)
+from common.recording.pictures import Size, jpeg_size
+from master.outputs.drawing import (
+    LASER_RGB,
+    LIMIT_RGB,
+    RAY_RGB,
+    SOURCE_RGB,
+    TRUTH_RGB,
+    DevicePlace,
+    dim,
+    fan,
+    fan_rays,
+    pack,
+    series_rgb,
+)
 from master.outputs.poses import Poses, PosesTruth, distance_m, mean_known
 from master.outputs.rerun_blueprint import PIXEL_CENTRE, TIMELINE, WORLD, Columns, camera_path, legend, seen
 from master.outputs.rerun_results import ResultLayer
-from master.outputs.rerun_wrist import WristLayer
 from master.rig.setup import RigSetup
+from master.rig.wrist import WristSetup
+
+_FAN_LINE_M = 0.0003
+_WRIST_ANGLES = ("flexion", "deviation")
+_FINGER_RGB = [series_rgb(finger) for finger in range(FINGER_COUNT)]
+
+
+class WristLayer:
+    """Logger of one wrist device to a recording that belongs to the caller.
+
+    Holds the viewing direction of the first pose.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        camera: str,
+        setup: WristSetup,
+        spread: Float,
+        group: str = "",
+        *,
+        in_rig: bool,
+    ) -> None:
+        """Log what never changes.
+
+        Args:
+            recording: Where it goes.
+            camera: The device's camera.
+            setup: The device.
+            spread: Directions (K, 3) of its light, see `fan_rays`.
+            group: What stands behind the paths of laser and plots, see `RerunScene`.
+            in_rig: Poses are in the frame of a rig of markers, not of its camera.
+        """
+        self._rows, self._setup, self._in_rig = Columns(recording), setup, in_rig
+        self._laser, self._group = f"{WORLD}/laser{group}", group
+        self._level_world: Float | None = None
+        self._camera, self._model = camera, setup.optics
+        for i, name in enumerate(_WRIST_ANGLES if in_rig else ()):
+            self._rows.name(f"plots/wrist_angles_deg{group}/{name}", name, series_rgb(i))
+        lines = fan(setup.laser_m, spread)
+        recording.log(
+            f"{self._laser}/fan",
+            rr.LineStrips3D(lines, colors=[(*LASER_RGB, 90)], radii=_FAN_LINE_M),
+            static=True,
+        )
+
+    def log_poses(self, poses: Poses) -> None:
+        """Log laser points, sights and how the forearm is held, of a batch of poses."""
+        t, points, tips = poses.t_ns, poses.laser_m, poses.position_m[:, TIPS]
+        if self._in_rig:
+            place = DevicePlace.of(poses, self._setup.model)
+            T = place.cameras(self._setup.T_camera_palm)
+            self._log_placed(poses, place, T)
+            points = np.where(np.isfinite(T[:, :1, 3:]), points, np.nan)  # of a lost hand nobody knows where
+            tips = (tips - T[:, None, :3, 3]) @ T[:, :3, :3]
+        else:
+            self._log_held(poses)
+        colours = np.broadcast_to(pack(_FINGER_RGB), points.shape[:2])
+        point_m = 0.0025
+        self._rows.points(f"{self._laser}/points", t, points, seen(points), colours, point_m)
+        rays, centre = rr.new_entity_path([WORLD, "rays", self._camera]), self._model.centre
+        self._rows.rays(f"{rays}/laser", t, centre, points, int(pack([RAY_RGB], alpha=150)[0]))
+        tips = np.where(poses.tracked[:, TIPS, None], tips, np.nan)
+        self._rows.rays(f"{rays}/tips", t, centre, tips, int(pack([TRUTH_RGB], alpha=90)[0]))
+        point_px = 3.0
+        self._rows.pixels(
+            f"{camera_path(self._camera)}/laser", t, self._model.project(points), colours, point_px
+        )
+        self._rows.scalars(
+            f"plots/seen{self._group}/laser_points", t, seen(points).sum(axis=1).astype(np.float64)
+        )
+
+    def _log_placed(self, poses: Poses, place: DevicePlace, T_rig_camera: Float) -> None:
+        """Move the device to where the forearm is, and draw that."""
+        known = np.flatnonzero(np.isfinite(T_rig_camera).all(axis=(1, 2)))
+        if len(known):
+            xyzw = np.roll(matrix_to_quaternion(T_rig_camera[known, :3, :3]), -1, axis=-1)
+            for path in (
+                camera_path(self._camera),
+                self._laser,
+                rr.new_entity_path([WORLD, "rays", self._camera]),
+            ):
+                columns = rr.Transform3D.columns(translation=T_rig_camera[known, :3, 3], quaternion=xyzw)
+                self._rows.send(path, poses.t_ns[known], columns, None)
+        root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
+        colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
+        bone_m = 0.0025
+        forearm_m = 0.16  # of it, as long as a hand
+        self._rows.lines(f"{root}/forearm", t, place.arm_m(forearm_m), colour, bone_m)
+        self._rows.lines(
+            f"{root}/forearm_uncertainty", t, place.uncertainty_m(forearm_m), colour, _FAN_LINE_M
+        )
+        for i, name in enumerate(_WRIST_ANGLES):
+            self._rows.scalars(
+                f"plots/wrist_angles_deg{self._group}/{name}", t, np.degrees(place.wrist_angles_rad[:, i])
+            )
+
+    def _log_held(self, poses: Poses) -> None:
+        """Rotate the scene so that y points down along gravity.
+
+        What the camera first looked along, z, stays ahead.
+        """
+        known = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
+        if not len(known):
+            return
+        world_camera = (
+            quaternion_to_matrix(poses.palm_world_wxyz[known]) @ self._setup.T_camera_palm[:3, :3].T
+        )
+        if self._level_world is None:
+            self._level_world = _level(world_camera[0])
+        orientation = matrix_to_quaternion(self._level_world @ world_camera)
+        columns = rr.Transform3D.columns(quaternion=orientation[:, [1, 2, 3, 0]])
+        self._rows.send(WORLD, poses.t_ns[known], columns, None)
+
+    def log_detections(self, frames: Sequence[WristDetections]) -> None:
+        """Log the laser and fingertips that the camera saw, in its image.
+
+        Frames in the order of time.
+        """
+        t = np.array([frame.t_ns for frame in frames], np.int64)
+        colours = np.broadcast_to(pack(_FINGER_RGB), (len(frames), FINGER_COUNT))
+        path = f"{camera_path(self._camera)}/detections"
+        for name, uv in (
+            ("laser", np.array([frame.laser_uv for frame in frames])),
+            ("tips", np.array([frame.tip_uv for frame in frames])),
+        ):
+            detected_px = 4.0
+            self._rows.pixels(f"{path}/{name}", t, uv, colours, detected_px)
+
+
+def _level(world_camera: Float) -> Float:
+    """Return the rotation from the IMU's world to x right, y down, z ahead.
+
+    Ahead is where the camera looks, or its image's top where it looks up.
+    """
+    up = np.array([0.0, 0.0, 1.0])
+    upright = 0.98  # cosine of 11 degrees off the vertical
+    along = world_camera[:, 2] if abs(world_camera[2, 2]) < upright else -world_camera[:, 1]
+    ahead = along - (along @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(ahead, up), -up, ahead])
 
 
 class CameraImages:

@@ -40,7 +40,7 @@ from common.messages import (
     WristDetections,
 )
 from master.estimator.pipeline import SolvedPose, Stage
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine, SolvedObject
 from master.objects.tracker import TrackerLine, registered

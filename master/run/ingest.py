@@ -27,9 +27,8 @@ from typing import NamedTuple
 from common.clock import Clock
 from common.errors import BusError
 from common.link.clock_offset import ClockEstimate
-from common.link.datagram import Address, LinkKey
-from common.link.session import Random
-from common.link.udp import UdpSocket
+from common.link.datagram import Address, LinkKey, UdpSocket
+from common.link.handshake import Random
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.messages.streams import sender_of
 from common.supervisor import until

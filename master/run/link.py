@@ -2,7 +2,7 @@
 
 It has the sessions of all slaves, as a push machine without a socket.
 
-`common.link.session.RULES` defines what follows from each event; this file classifies datagrams as events.
+`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
 - A hello counts only with the proof that its sender has the secret of its name: a stolen device of the rig begins no
@@ -30,7 +30,7 @@ from common.clock import Clock
 from common.errors import BoundsError, MessageError
 from common.link.clock_offset import ClockEstimate
 from common.link.datagram import Address, Header, Kind, LinkKey, Opened, Opener, Refusal, parse
-from common.link.session import (
+from common.link.handshake import (
     MAX_CAMERAS,
     NONCE_BYTES,
     RULES,

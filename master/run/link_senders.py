@@ -40,7 +40,7 @@ from common.arrays import Float
 from common.clock import TokenBucket
 from common.link.clock_offset import ClockEstimate, OffsetEstimator
 from common.link.datagram import HEADER, MAGIC, Address, Header, Kind, Opener, Refusal, Sealer
-from common.link.session import Hello, RigKeys
+from common.link.handshake import Hello, RigKeys
 from common.messages import (
     Detections,
     ImuSample,

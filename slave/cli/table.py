@@ -31,14 +31,14 @@ PROGRAM = Program(
             "colours",
             "set up",
             "colours of the markers of a camera, from a recording",
-            "slave.cli.setup:colours",
+            "slave.cli.options:colours",
             "slave.commands.offline:run",
         ),
         Command(
             "doctor",
             "set up",
             "what of this device is well, and what is not; test of its lights",
-            "slave.cli.setup:doctor",
+            "slave.cli.options:doctor",
             "slave.doctor.command:run",
         ),
         Command(

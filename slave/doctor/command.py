@@ -28,8 +28,20 @@ from slave.cli.table import PROGRAM
 from slave.commands.devices import open_lights
 from slave.commands.options import camera_path, rig_of
 from slave.doctor.devices import cameras_of, check_camera, check_devices, check_groups
-from slave.doctor.finding import Finding, System, as_json, as_text, exit_code, fail, pairs, unseen
-from slave.doctor.host import check_clock, check_host, check_programs, check_unit
+from slave.doctor.host import (
+    Finding,
+    System,
+    as_json,
+    as_text,
+    check_clock,
+    check_host,
+    check_programs,
+    check_unit,
+    exit_code,
+    fail,
+    pairs,
+    unseen,
+)
 from slave.doctor.master import check_keys, check_master, folder_of
 from slave.drivers import SWITCHED_LIGHTS
 from slave.lights.controller import CYCLE

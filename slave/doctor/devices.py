@@ -26,7 +26,7 @@ from slave.cameras.v4l2 import device_path
 from slave.cameras.v4l2_abi import KernelDevice
 from slave.cameras.v4l2_controls import AUTOMATICS, read_back, read_controls
 from slave.commands import devices
-from slave.doctor.finding import Finding, System, fail, ok, unseen
+from slave.doctor.host import Finding, System, fail, ok, unseen
 
 GROUPS = ("video", "dialout", "i2c", "gpio")  # SupplementaryGroups of the unit; a test compares them
 DMA_HEAP = "/dev/dma_heap"

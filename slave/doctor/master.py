@@ -23,8 +23,8 @@ from cryptography.hazmat.primitives import serialization
 from common.bus.keys import CLOCK_FIX, RIG_KEY, access_of, link_key, rig_key, secret_of, shown
 from common.clock import SystemClock
 from common.errors import PhalanxError
-from common.link.udp import UdpSocket
-from slave.doctor.finding import Finding, System, fail, ok, unseen, warn
+from common.link.datagram import UdpSocket
+from slave.doctor.host import Finding, System, fail, ok, unseen, warn
 from slave.link import SlaveLink
 
 NOT_RECEIVED = (

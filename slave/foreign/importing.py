@@ -21,8 +21,7 @@ from common.calibration.object_profile import ObjectProfile
 from common.errors import PictureError, RecordingError
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
 from common.recording.frame_writing import RecordingWriter, refuse_occupied
-from common.recording.picture_size import size_of
-from common.recording.pictures import VideoFrames, decode, frame_name, read_picture
+from common.recording.pictures import VideoFrames, decode, frame_name, read_picture, size_of
 from slave.foreign.sources import (
     Source,
     Timed,

@@ -1,4 +1,10 @@
-"""`phalanx-slave install`, and what the PC runs on a machine by ssh.
+"""Install, update or remove the service on this machine.
+
+Sources of keys and calibration.
+
+Folders of this machine, or the archive that the PC sent with the installer.
+
+`phalanx-slave install`, and what the PC runs on a machine by ssh.
 
 Both use the same installer, its options and its messages.
 """
@@ -10,19 +16,80 @@ import contextlib
 import json
 import os
 import shutil
+import stat
 import sys
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from slave.install import bundle, steps
+from slave.install import steps
 from slave.install.arguments import READY_S, SETTLE_S, InstallError, add_install, plan_of
 from slave.install.probe import judge, probe
 from slave.install.release import Source
 from slave.install.steps import packages, uninstall
 from slave.install.systemd import Systemd
 from slave.install.wanted import ETC
+
+KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"
+_SHARED = stat.S_IRWXG | stat.S_IRWXO
+
+
+def from_archive(archive: Path) -> tuple[dict[str, bytes], dict[str, bytes]]:
+    """Keys and calibration of an archive: path -> content each.
+
+    Raises:
+        InstallError: It is none.
+    """
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            names = [name for name in opened.namelist() if not name.endswith("/")]
+            keys = {n.removeprefix(KEYS): opened.read(n) for n in names if n.startswith(KEYS)}
+            calibration = {
+                n.removeprefix(CALIBRATION): opened.read(n) for n in names if n.startswith(CALIBRATION)
+            }
+    except (OSError, zipfile.BadZipFile) as error:
+        raise InstallError(f"{archive}: not what the PC sends ({error})") from error
+    return keys, calibration
+
+
+def calibration_of(folder: Path) -> dict[str, bytes]:
+    """All JSON files of a calib_json tree.
+
+    Raises:
+        InstallError: There is none.
+    """
+    if not (folder / "rigs").is_dir():
+        raise InstallError(f"{folder}: no calib_json tree (no rigs/ in it); give --calibration DIR")
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.glob("*/*.json"))
+    }
+
+
+def keys_of(folder: Path | None) -> dict[str, bytes]:
+    """The files of a keys folder that a device may have; empty without a folder.
+
+    Raises:
+        InstallError: It is not there, or others can read it.
+    """
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise InstallError(
+            f"{folder}: no such folder of keys; make one on the PC: phalanx fleet keys {folder} --make"
+        )
+    found: dict[str, bytes] = {}
+    for path in sorted([*folder.glob("*"), *folder.glob("devices/*")]):
+        name = path.relative_to(folder).as_posix()
+        if name in ("rig.key", "ca.pem") or name.startswith(("devices/", "device-", "device.")):
+            if not path.is_file():
+                continue
+            if path.suffix in (".key", ".secret") and stat.S_IMODE(path.stat().st_mode) & _SHARED:
+                raise InstallError(f"{path}: others can read this key; run: chmod 600 {path}")
+            found[name] = path.read_bytes()
+    return found
+
 
 Notify = Callable[[str], None]
 
@@ -74,9 +141,9 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
     if options.rollback:
         return {"text": steps.roll_back(machine, options.dry_run)}
     if options.bundle is not None:
-        keys, calibration = bundle.from_archive(options.bundle)
+        keys, calibration = from_archive(options.bundle)
     else:
-        keys, calibration = bundle.keys_of(options.keys), bundle.calibration_of(options.calibration)
+        keys, calibration = keys_of(options.keys), calibration_of(options.calibration)
     plan = plan_of(options, calibration, keys)
     source = Source.here() if options.wheelhouse is None else Source(options.wheelhouse)
     if options.bundle is None:

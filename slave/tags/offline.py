@@ -1,11 +1,19 @@
-"""Tags of a whole recording, into one file per camera.
+"""Find tags of objects in live or recorded frames.
+
+Detect the tags of frames once their markers are sent, as time allows.
+
+Nothing of it is loaded where no object has tags.
+
+Tags of a whole recording, into one file per camera.
 
 Beside the markers of its frames; deterministic.
 """
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +21,131 @@ from common.arrays import Float, Ids, Image, Int
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError
+from common.messages import TagDetections
 from common.recording.frame_recording import FrameRow
+from slave.sources import Frame
 from slave.tags.finder import FoundTags, TagFinder
+
+if TYPE_CHECKING:
+    from slave.tags.finder import TagFinder
+
+SHARE = 0.8  # of the time between two frames that markers and tags together may take
+
+
+class Pace:
+    """Grants searches out of the time that frames leave.
+
+    Holds what is left [ns], what a search takes [ns], and the
+    times of the last frame and the last search.
+
+    What a frame leaves of its share of the time since the frame before is saved until a search fits into it, and no
+    more than one search is saved up: so a machine that is too slow for tags in every frame looks at every second or
+    fifth. One whose markers take all the time there is looks four times a second all the same.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        """For a camera of this rate."""
+        self._period_ns = 1e9 / rate_hz
+        self._left_ns = 0.0
+        self._takes_ns = 0.0
+        self._frame_ns: int | None = None
+        self._sought_ns: int | None = None
+
+    @property
+    def takes_ns(self) -> float:
+        """What a search takes of late [ns]."""
+        return self._takes_ns
+
+    def grants(self, t_ns: int, spent_ns: int) -> bool:
+        """Whether tags may be searched in a frame whose markers took `spent_ns`."""
+        since_ns = (
+            self._period_ns if self._frame_ns is None else max(float(t_ns - self._frame_ns), self._period_ns)
+        )
+        self._frame_ns = t_ns
+        most = max(self._takes_ns, SHARE * self._period_ns)
+        self._left_ns = min(max(self._left_ns + SHARE * since_ns - spent_ns, -most), most)
+        longest_ns = 250_000_000  # without a search: half of what an object is held for without its tags
+        late = self._sought_ns is None or t_ns - self._sought_ns >= longest_ns
+        granted = late or self._left_ns >= self._takes_ns
+        if granted:
+            self._sought_ns = t_ns
+        return granted
+
+    def took(self, spent_ns: int) -> None:
+        """A search took so long."""
+        self._left_ns -= spent_ns
+        known = self._takes_ns > 0.0
+        learning = 0.2  # weight of the newest search in what one is expected to take
+        self._takes_ns += (spent_ns - self._takes_ns) * (learning if known else 1.0)
+
+
+class LiveTags:
+    """Finds the tags of frames. Holds the finder in use, if any, its pace and counts."""
+
+    def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
+        """Seek the tags of `objects`, of which none may have any.
+
+        Raises:
+            CalibrationError: As of `TagFinder`.
+        """
+        self._camera = camera.name
+        self._pace = Pace(camera.frame_rate_hz)
+        self._finder = finder_of(camera, objects)
+        self._searched = self._skipped = self._found = 0
+
+    def push(self, frame: Frame, session: int, spent_ns: int) -> TagDetections | None:
+        """Tags of a frame whose markers took `spent_ns`; None: not searched."""
+        finder = self._finder
+        if finder is None:
+            return None
+        if not self._pace.grants(frame.t_ns, spent_ns):
+            self._skipped += 1
+            return None
+        began_ns = time.perf_counter_ns()
+        found = finder.push(frame.image, frame.t_ns)
+        message = TagDetections(
+            self._camera,
+            session,
+            frame.seq,
+            frame.t_ns,
+            frame.ready_t_ns,
+            found.ids,
+            found.uv,
+            found.sigma_px,
+            frame.t_sigma_ns,
+        )
+        self._pace.took(time.perf_counter_ns() - began_ns)
+        self._searched += 1
+        self._found += len(found.ids)
+        return message
+
+    def replace(self, finder: "TagFinder | None") -> None:
+        """Go on with another finder; None: no object has tags any more."""
+        self._finder = finder
+
+    def counts(self) -> dict[str, int]:
+        """`tags.searched`, `tags.skipped` frames, `tags.found`; none without tags."""
+        if self._finder is None and not self._searched:
+            return {}
+        return {
+            "tags.searched": self._searched,
+            "tags.skipped": self._skipped,
+            "tags.found": self._found,
+            "tags.search_us": round(self._pace.takes_ns * 1e-3),
+        }
+
+
+def finder_of(camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> "TagFinder | None":
+    """A finder of the tags of `objects`; None: none has any.
+
+    Raises:
+        CalibrationError: As of `TagFinder`.
+    """
+    if all(profile.tags is None for profile in objects):
+        return None
+    from slave.tags.finder import TagFinder
+
+    return TagFinder(camera, objects)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

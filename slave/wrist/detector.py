@@ -28,14 +28,13 @@ from common.messages import WristDetections
 from slave.sources import Frame
 from slave.tuning import CameraFiles, Prepare
 from slave.wrist.engine import NUMPY, Engine
-from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
-from slave.wrist.laser import LaserLines, laser_lines
+from slave.wrist.laser import LaserLines, laser_lines, separate
+from slave.wrist.led_image import WristView
 from slave.wrist.palm_pose import prepare
 from slave.wrist.postures import postures_of
 from slave.wrist.seams import search_bands_of
 from slave.wrist.strobe import Strobe, StrobeCycle, lit, lit_line
-from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 
 

@@ -14,9 +14,8 @@ from common.arrays import Float, Image, Int
 from slave.markers.fast_compile import compiled
 from slave.wrist import fingertips, led_image, postures
 from slave.wrist.fingertips import Candidates, Ends, LedImage, light_scale, on_plane, reported
-from slave.wrist.led_image import SHRINK, Circles, Float32
+from slave.wrist.led_image import SHRINK, Circles, Float32, WristView
 from slave.wrist.postures import Postures, postures_of
-from slave.wrist.view import WristView
 
 _COLUMNS = 11  # of what is found of a finger
 

@@ -17,7 +17,17 @@ import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
 from slave.wrist.led_image import SETTINGS as OUTLINE
-from slave.wrist.led_image import SHRINK, Circles, Float32, depth_about, fitted, led_optics, nearness, shrink
+from slave.wrist.led_image import (
+    SHRINK,
+    Circles,
+    Float32,
+    WristView,
+    depth_about,
+    fitted,
+    led_optics,
+    nearness,
+    shrink,
+)
 from slave.wrist.postures import (
     ABOVE,
     APEX,
@@ -29,7 +39,6 @@ from slave.wrist.postures import (
     plane_axes,
     postures_of,
 )
-from slave.wrist.view import WristView
 
 LEAST_NEAR = np.float32(1.5)  # roots of grey levels: noise
 

@@ -21,8 +21,8 @@ from common.recording.frame_recording import FrameRecording, Illumination, open_
 from slave.cameras.replay import read_png
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
+from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle
-from slave.wrist.view import WristView
 
 _LOG = logging.getLogger(__name__)
 

@@ -22,8 +22,7 @@ from common.arrays import Bool, Float, Image, Int
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, METACARPALS
 from common.hand.wrist import STRAIGHT, forearm_palm
-from slave.wrist.led_image import SHRINK, Float32, shrink
-from slave.wrist.view import NEAREST_M, WristView, in_image
+from slave.wrist.led_image import NEAREST_M, SHRINK, Float32, WristView, in_image, shrink
 
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees

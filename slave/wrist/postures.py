@@ -22,8 +22,7 @@ from common.errors import CalibrationError
 from common.geometry.tapered_capsules import Capsules, first_hits, terms
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import CHAINS, FINGER_JOINTS, Fingertips
-from slave.wrist.led_image import Float32
-from slave.wrist.view import NEAREST_M, WristView, thumb_postures
+from slave.wrist.led_image import NEAREST_M, Float32, WristView, thumb_postures
 
 MCP_RAD = np.radians(np.arange(-10.0, 111.0, 6.0))
 PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))

@@ -33,7 +33,7 @@ from common.arrays import Float, Image, Int
 from common.errors import CalibrationError
 from common.hand.model import CHAINS, METACARPALS
 from common.hand.profiles import ABDUCTION
-from slave.wrist.view import (
+from slave.wrist.led_image import (
     NEAREST_M,
     PER_BONE,
     WristView,

@@ -17,8 +17,7 @@ from common.arrays import Bool, Float, Image, Int
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import intersect_plane
 from common.hand.model import CHAINS
-from slave.wrist.palm_pose import PalmPose
-from slave.wrist.view import (
+from slave.wrist.led_image import (
     NEAREST_M,
     PER_BONE,
     WristView,
@@ -27,6 +26,7 @@ from slave.wrist.view import (
     radius_along,
     thumb_postures,
 )
+from slave.wrist.palm_pose import PalmPose
 
 Float32 = npt.NDArray[np.float32]
 

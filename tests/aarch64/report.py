@@ -23,13 +23,13 @@ from bench.aarch64.guest import Digest, arrays_of
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import PhalanxError
 from common.link.datagram import Kind, Opener, Sealer, parse
-from common.link.session import RigKeys
+from common.link.handshake import RigKeys
 from common.messages import Health, ImuSample, MarkerDetections, Message, WristDetections, decode, encode
 from common.recording.frame_recording import Illumination
 from slave.markers.detector import MarkerDetector
 from slave.sources import Frame
 from slave.wrist.detector import WristDetector
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 KEY = bytes(range(32))

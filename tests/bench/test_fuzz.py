@@ -14,7 +14,7 @@ from bench.rigs.fuzz_examples import Speaker, examples
 from common.arrays import Float
 from common.errors import MessageError
 from common.link.datagram import Kind
-from common.link.session import EchoAnswer, Hello, Started, read
+from common.link.handshake import EchoAnswer, Hello, Started, read
 from common.messages import Message, TrackerPose, decode, encode
 from common.messages.parts import Count, within
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.bus.keys import ENVIRONMENT, new_key, rig_key
 from common.errors import PhalanxError
 from common.link.datagram import Header, Kind, LinkKey, Refusal, device_secret, parse
-from common.link.session import (
+from common.link.handshake import (
     Beacon,
     EchoAnswer,
     EchoAsk,

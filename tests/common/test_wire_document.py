@@ -6,9 +6,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from common.link import datagram, session
+from common.link import datagram, handshake
 from common.link.datagram import HEADER, MAX_DATAGRAM, OVERHEAD, WINDOW, Kind, Refusal
-from common.link.session import (
+from common.link.handshake import (
     Beacon,
     EchoAnswer,
     EchoAsk,
@@ -56,7 +56,7 @@ def test_numbers_and_keys_agree() -> None:
     assert f"the {HEADER.size} header bytes" in TEXT
     assert f"more than {WINDOW} counters old" in TEXT
     assert f"M ≤ {MAX_MARKERS} markers" in TEXT
-    assert f"map name → int, ≤ {session.MAX_CAMERAS}" in TEXT
+    assert f"map name → int, ≤ {handshake.MAX_CAMERAS}" in TEXT
     assert f"{datagram.KEY_BYTES} random bytes" in TEXT
     for key in (ALIVE_KEY, *(row.key for row in STREAMS.values() if row.key is not None)):
         assert f"`{key.split('{')[0]}<" in TEXT

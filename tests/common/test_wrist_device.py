@@ -13,7 +13,7 @@ from common.errors import CalibrationError
 from common.hand.model import HandModel
 from common.hand.wrist import WristDevice
 from master.rig.wrist import WristSetup
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 
 ROOT = Path(__file__).parents[2] / "calib_json"
 RIG = load(ROOT / "rigs/wrist.json", RigCalibration)

@@ -13,14 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from deploy import deployment, sender_check
+from deploy import deployment
 from deploy import payload as wheels_module
 from deploy.commands import prepared_keys
-from deploy.deployment import Host, Wish, make_keys
+from deploy.deployment import Ears, Host, Received, Wish, make_keys
 from deploy.payload import BUNDLE, bundle, command, own_wheel, wheelhouse
-from deploy.remote import Deadline, Remote
-from deploy.sender_check import Ears, Received
-from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
+from deploy.remote import Deadline, DeployError, Remote, RigFile, Target, read_rig, targets_of
 from master.cli.table import program
 from master.commands.fleet import Device, table
 from master.commands.keys import make
@@ -251,12 +249,12 @@ def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pyte
     assert "streams: right 30/s" in output
 
 
-def _before(monkeypatch: pytest.MonkeyPatch, received: Received) -> sender_check.Before:
+def _before(monkeypatch: pytest.MonkeyPatch, received: Received) -> deployment.Before:
     def answer(_names: object, _ears: object, _ended: object) -> Received:
         return received
 
-    monkeypatch.setattr(sender_check, "received_of", answer)
-    return sender_check.Before(["left", "right"], Ears((), Path("keys"), 12.0))
+    monkeypatch.setattr(deployment, "received_of", answer)
+    return deployment.Before(["left", "right"], Ears((), Path("keys"), 12.0))
 
 
 def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
@@ -264,7 +262,7 @@ def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
 ) -> None:
     streamed = _before(monkeypatch, Received({"left": 30.0, "right": 30.0}, None, True))
     assert streamed.at_master
-    assert streamed.ears(1.0).seconds == sender_check.LEAST_S
+    assert streamed.ears(1.0).seconds == deployment.LEAST_S
     assert streamed.ears(3.5).seconds == pytest.approx(7.0)
     assert streamed.ears(60.0).seconds == pytest.approx(12.0)
     assert streamed.ears(None).seconds == pytest.approx(12.0), "it did not run: nobody knows"

@@ -14,7 +14,7 @@ import pytest
 
 from common.clock import SkewedClock
 from common.link.datagram import Address, Header, Kind, LinkKey, Refusal, Sealer, parse
-from common.link.session import Hello, RigKeys, seal
+from common.link.handshake import Hello, RigKeys, seal
 from common.messages import (
     Command,
     Detections,

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from bench.rigs.hostile import ROOT, STOLEN, HostileRig, Limits, all_attacked, row
 from bench.rigs.rooms import ROOM
-from common.link.session import EchoAnswer
+from common.link.handshake import EchoAnswer
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from tests.hostile_rigs import (
     BOUNDS,

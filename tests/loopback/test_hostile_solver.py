@@ -17,7 +17,7 @@ from bench.rigs.fuzz_examples import Speaker, own_kinds
 from bench.rigs.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
 from bench.rigs.rooms import ROOM, detections
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
-from common.link.session import EchoAnswer, Started
+from common.link.handshake import EchoAnswer, Started
 from common.messages import HandPose, decode, encode
 from master.rig.setup import RigSetup, load_setup, load_setups
 from master.run.app import result_at

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Kind, Refusal
-from common.link.session import RigKeys
+from common.link.handshake import RigKeys
 from common.messages import WIRE_VERSION, encode
 from master.run.link import MasterLink
 from slave.link import SlaveLink

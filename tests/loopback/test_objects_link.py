@@ -10,7 +10,7 @@ import pytest
 
 from common.clock import SkewedClock, SystemClock
 from common.link.datagram import Kind, Refusal, Sealer
-from common.link.session import RigKeys
+from common.link.handshake import RigKeys
 from common.messages import MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
 from master.run.ingest import CAPACITY, Ingest
 from master.run.link import MasterLink

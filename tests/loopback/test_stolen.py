@@ -4,7 +4,7 @@ import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from common.link.datagram import Address, Header, Kind, LinkKey, Refusal, Sealer, device_secret, parse, unseal
-from common.link.session import (
+from common.link.handshake import (
     NONCE_BYTES,
     Beacon,
     EchoAnswer,

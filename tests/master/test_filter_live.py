@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Float
 from common.hand.model import HandJoints
 from common.messages import HandPose
-from master.console.tuner import try_filter
+from master.console.controls import try_filter
 from tests.hand_helpers import RIGHT, palm
 from tests.master.test_tuning import Master, master
 from tests.network_helpers import PATIENCE_S

@@ -17,8 +17,7 @@ from common.hand.model import TIPS, WRIST, HandModel
 from common.hand.profiles import generated_profile
 from common.messages import HandPose, Source
 from master.outputs import picture
-from master.outputs.drawing import SOURCE_RGB
-from master.outputs.hand_render import View, render_hand
+from master.outputs.drawing import SOURCE_RGB, View, render_hand
 from master.outputs.picture import best_row, draw_summary, fit_view
 from master.outputs.poses import Poses, PosesTruth
 

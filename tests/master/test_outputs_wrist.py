@@ -13,7 +13,7 @@ from common.arrays import Float, Image
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristTruth
-from master.evaluation.wrist_report import lit_view
+from master.evaluation.report import lit_view
 from master.outputs.drawing import fan, fan_rays
 from master.outputs.picture import draw_summary
 from master.outputs.picture_overlays import WristPicture

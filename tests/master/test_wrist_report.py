@@ -11,8 +11,7 @@ from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quat
 from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from master.evaluation.report import Played, report_scene
-from master.evaluation.wrist_report import forearm_tilt, laser_scores, lit_view
+from master.evaluation.report import Played, forearm_tilt, laser_scores, lit_view, report_scene
 from master.outputs.poses import save_poses
 from master.rig.setup import RigSetup, load_setups
 from tests.master.test_outputs_rerun import rows_of

@@ -350,7 +350,7 @@ def _named(picture: Path | None, camera: str) -> Path | None:
 def _draw(picture: Path | None, fit: CamerasFit) -> None:
     if picture is None:
         return
-    from master.calibrate.cameras.picture import draw_views  # matplotlib takes a second to import
+    from master.calibrate.cameras.coverage import draw_views
 
     draw_views(picture, fit)
     echo(f"drew {picture}")

@@ -198,7 +198,7 @@ def depth(options: Namespace) -> None:
             options.json_file, report_json(report) | {"written": None if written is None else str(written)}
         )
     if options.picture is not None:
-        from master.calibrate.depth.picture import draw_errors
+        from master.calibrate.depth.verify import draw_errors
 
         draw_errors(options.picture, measured.about, sweep.distance_m, report.errors, used=report.used)
 
@@ -298,7 +298,7 @@ def verify_command(options: Namespace) -> None:
             raise CalibrationError(
                 "--picture: there are no measured errors to draw; give a recording or a .csv"
             )
-        from master.calibrate.depth.picture import draw_errors
+        from master.calibrate.depth.verify import draw_errors
 
         errors = {name: found.relative(name) for name in found.error_m}
         title = f"Depth of rig {pair.rig.name if pair.rig is not None else ''!r}"

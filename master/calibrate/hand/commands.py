@@ -88,7 +88,7 @@ def hand_command(options: Namespace) -> None:
         data = "live" if options.poses is None else options.poses.name
         profile, report = measured_profile(found, options.name, data, options.dip_per_pip), report_json(found)
         if options.picture is not None:
-            from master.calibrate.hand.picture import draw_hand
+            from master.calibrate.hand.session import draw_hand
 
             draw_hand(options.picture, found)
     _finish(options.out, profile, report, options.json_file)

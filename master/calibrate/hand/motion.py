@@ -45,8 +45,8 @@ from common.hand.model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandM
 from common.hand.profiles import generated_profile, joint_frame, preset_couplings
 from master.calibrate.hand.measure import TOOL, hand_length_of
 from master.calibrate.tree_files import provenance
+from master.mocap.bvh_file import JointMotion, Side, known
 from master.mocap.compare import joint_track
-from master.mocap.joint_motion import JointMotion, Side, known
 from master.mocap.read import require
 
 _MOVES_RAD_S = np.radians(10.0)

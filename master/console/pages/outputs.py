@@ -25,13 +25,12 @@ from common.calibration import parse, save
 from common.calibration.output_settings import OutputPart, OutputSettings
 from common.errors import PhalanxError
 from common.messages import Health
-from master.console.play_panel import play_panel
-from master.console.recording_panel import recording_panel
+from master.console.recording_panel import play_panel, recording_panel
 from master.console.state import ConsoleState
 from master.outputs.network.outputs import OUTPUTS, switched_on
 from master.outputs.network.sender import NAME, settings_of
 
-PROCESS = "send"
+SENDING = "send"
 
 
 def outputs_path(state: ConsoleState) -> Path:
@@ -78,12 +77,12 @@ def follow(state: ConsoleState, settings: OutputSettings) -> None:
         PhalanxError: It cannot be started.
     """
     wanted = any(switched_on(settings).values())
-    ours = PROCESS in state.local.running()
+    ours = SENDING in state.local.running()
     if wanted and not ours and not _of_others(state):
         tree = ["--calibration", str(state.settings.calibration), "--bus", state.settings.bus]
-        state.local.start(PROCESS, [sys.executable, "-m", "master", "send", *tree], {})
+        state.local.start(SENDING, [sys.executable, "-m", "master", "send", *tree], {})
     elif not wanted and ours:
-        state.local.stop(PROCESS)
+        state.local.stop(SENDING)
 
 
 def _of_others(state: ConsoleState) -> bool:
@@ -92,7 +91,7 @@ def _of_others(state: ConsoleState) -> bool:
     Our own process that has just ended stays visible a moment longer, so this waits until it is gone.
     """
     gone_s = 3.0  # so long one that has ended is still seen on the bus
-    until = time.monotonic() + (gone_s if state.local.get(PROCESS) is not None else 0.0)
+    until = time.monotonic() + (gone_s if state.local.get(SENDING) is not None else 0.0)
     while NAME in state.alive and time.monotonic() < until:
         time.sleep(0.1)
     return NAME in state.alive
@@ -151,13 +150,13 @@ def output_panel(state: ConsoleState) -> None:
 
     def update() -> None:
         report = state.health.get(NAME)
-        running = PROCESS in state.local.running()
+        running = SENDING in state.local.running()
         for name, (switch, label) in rows.items():
             words = status_words(name, report)
             label.set_text(words or (waiting_words(state, running, report) if switch.value else ""))
         idle = any(switch.value for switch, _ in rows.values()) and not running and NAME not in state.alive
         start.set_visibility(idle)
-        process = state.local.get(PROCESS)
+        process = state.local.get(SENDING)
         if process is not None:
             log.set_text("\n".join(process.tail(4)))
 

@@ -29,18 +29,21 @@ from nicegui.client import Client
 from common.calibration import FilterCalibration
 from common.calibration.camera_settings import ROI_LEAST, ROI_MOST
 from common.errors import CalibrationError, PhalanxError
-from master.console.controls import CameraView, CommandQueue, Setting, full_frame_uv
-from master.console.state import ConsoleState
-from master.console.tuner import (
+from master.console.controls import (
     GAINS,
+    CameraView,
+    CommandQueue,
     InUse,
     Range,
+    Setting,
     colour_body,
+    full_frame_uv,
     save_filter,
     saved_filter,
     try_filter,
     update_copy,
 )
+from master.console.state import ConsoleState
 
 HUES = 180  # OpenCV's
 

@@ -9,27 +9,19 @@ from functools import partial
 from nicegui import ui
 
 from common.errors import PhalanxError
-from master.console.setup import (
-    panel_cameras,
-    panel_colours,
-    panel_lens,
-    panel_more,
-    panel_rig,
-    panel_start,
-    panel_track,
-)
+from master.console.setup import panel_cameras, panel_colours, panel_lens, panel_start
 from master.console.setup.parts import CSS, Desk
 from master.console.setup.session import Done, Session, Step, session_of, wizard_named
 from master.console.state import ConsoleState
 
 PANELS: dict[str, Callable[[Desk], None]] = {
-    "cameras": panel_cameras.build,
-    "rig": panel_rig.build,
-    "start": panel_start.build,
-    "lens": panel_lens.build,
-    "colours": panel_colours.build,
-    "track": panel_track.build,
-    "more": panel_more.build,
+    "cameras": panel_cameras.panel_cameras,
+    "rig": panel_cameras.panel_rig,
+    "start": panel_start.panel_start,
+    "lens": panel_lens.panel_lens,
+    "colours": panel_colours.panel_colours,
+    "track": panel_start.panel_track,
+    "more": panel_lens.panel_more,
 }
 _ICONS = {Done.DONE: "check_circle", Done.TO_DO: "radio_button_unchecked", Done.STALE: "warning"}
 _COLOURS = {Done.DONE: "positive", Done.TO_DO: "grey", Done.STALE: "warning"}
@@ -82,7 +74,7 @@ class _Steps:
         self._panel.clear()
         with self._panel:
             if key.startswith("wizard/"):
-                panel_more.build_wizard(self._desk, wizard_named(key.removeprefix("wizard/")))
+                panel_lens.panel_more_wizard(self._desk, wizard_named(key.removeprefix("wizard/")))
             else:
                 PANELS[key](self._desk)
         self.update()

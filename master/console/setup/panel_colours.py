@@ -20,7 +20,7 @@ from nicegui import events, ui
 from common.calibration import CameraCalibration, HsvRange, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Command, Health, Preview
-from common.recording.picture_size import jpeg_size
+from common.recording.pictures import jpeg_size
 from master.console.setup.files import keep_old
 from master.console.setup.parts import Desk, heading, jpeg_url
 
@@ -89,7 +89,7 @@ class _Choice:
     size: tuple[int, int] | None = None
 
 
-def build(desk: Desk) -> None:
+def panel_colours(desk: Desk) -> None:
     """Fill the panel."""
     session = desk.session
     heading(

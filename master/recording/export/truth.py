@@ -13,8 +13,8 @@ from common.calibration import RigCalibration, load
 from common.errors import PhalanxError, RecordingError
 from common.hand.model import JOINTS
 from master.mocap.align import Alignment, align
+from master.mocap.bvh_file import MARKERS, JointMotion, Track, known
 from master.mocap.compare import alignment_json, alignment_lines, compare, figures, table_lines
-from master.mocap.joint_motion import MARKERS, JointMotion, Track, known
 from master.mocap.read import Reading, read_motion
 from master.outputs.poses import Poses
 from master.recording.export.take import Take, Window, open_take

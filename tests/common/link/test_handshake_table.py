@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from common.link.datagram import Address, Kind, Refusal, Sealer, parse
-from common.link.session import (
+from common.link.handshake import (
     RULES,
     Beacon,
     EchoAnswer,

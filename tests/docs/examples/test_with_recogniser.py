@@ -16,7 +16,7 @@ from common.sim.gesture_postures import pinch_posture
 from common.sim.gestures import Gestures
 from common.sim.motion import REST, HandState, angles_of, smooth_step
 from common.sim.scene import view_centre
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 from master.outputs.bus import BusSink
 from master.rig.setup import RigSetup, load_setup
 from tests.docs.examples.loading import example

@@ -11,14 +11,20 @@ from common.calibration import CameraCalibration, RigCalibration, load, save
 from common.calibration.output_settings import OutputSettings
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Gesture, Health
-from master.console.controls import full_frame_uv, hand_line
+from master.console.controls import (
+    Range,
+    Tuner,
+    full_frame_uv,
+    hand_line,
+    save_filter,
+    try_filter,
+    update_copy,
+)
 from master.console.link import PreviewLeases
 from master.console.pages.outputs import change_output
-from master.console.play_panel import start_playing
-from master.console.recording_panel import recording_path
+from master.console.recording_panel import recording_path, start_playing
 from master.console.serving import names_of, refusal
 from master.console.state import KEPT, ConsoleSettings, ConsoleState, History, Newest, ReceivedGestures
-from master.console.tuner import Range, Tuner, save_filter, try_filter, update_copy
 from tests.master.console.fakes import FakeSlave, pose, tree
 from tests.network_helpers import until
 

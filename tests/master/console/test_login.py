@@ -29,7 +29,7 @@ from master.console.login import (
     new_password,
     password_from,
 )
-from master.console.neighbours import same_user
+from master.console.serving import same_user
 from master.console.state import ConsoleSettings, ConsoleState
 
 PASSWORD = "correct horse battery"

@@ -9,7 +9,7 @@ import pytest
 
 from common.errors import CalibrationError, FitError, PhalanxError, RecordingError
 from common.hand.model import JOINTS
-from master.mocap.joint_motion import MARKERS
+from master.mocap.bvh_file import MARKERS
 from tests.cli import invoke
 from tests.master.export.test_export_command import recording_of
 from tests.master.export.test_export_tables import run_of

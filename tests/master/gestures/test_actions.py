@@ -23,7 +23,7 @@ from common.hand.model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, REST, angles_of, smooth_step
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 
 ROOT = Path(__file__).parents[3]
 STILL = np.zeros((5, 4))

@@ -17,7 +17,7 @@ from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step
 from master.gestures.dial import GripHistory
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 
 STILL, FRAME_NS = np.zeros((5, 4)), 16_666_667
 MODEL = HandModel.of(load(Path(__file__).parents[3] / "calib_json/hands/default-right.json", HandProfile))

@@ -20,7 +20,7 @@ from common.sim.motion import POSES, angles_of
 from master.fabrik.linear_algebra import diagonalise, spread
 from master.gestures.features import FeatureExtractor, thumb_touch
 from master.gestures.grip import Tips, rotation_between
-from master.gestures.recogniser import GestureRecogniser
+from master.gestures.poses import GestureRecogniser
 from tests.hand_helpers import RIGHT, any_rotation
 from tests.master.gestures.shown_hands import FRAME_NS, shown
 

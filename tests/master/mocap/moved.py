@@ -9,7 +9,7 @@ from common.geometry.transforms import matrix_to_quaternion, rotation_vector_to_
 from common.hand.model import JOINTS, HandJoints, HandModel
 from common.hand.profiles import generated_profile
 from common.messages import HandPose, Source
-from master.mocap.joint_motion import JointMotion, Side, Track
+from master.mocap.bvh_file import JointMotion, Side, Track
 
 RIGHT = HandModel.of(generated_profile("moved-right", "right"))
 LEFT = HandModel.of(generated_profile("moved-left", "left"))

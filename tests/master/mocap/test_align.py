@@ -7,7 +7,7 @@ from common.arrays import Float
 from common.errors import FitError
 from common.geometry.transforms import matrix_to_rotation_vector, rigid
 from master.mocap.align import align
-from master.mocap.joint_motion import Track
+from master.mocap.bvh_file import Track
 from tests.master.mocap.moved import ROTATION, SHIFT, hand_at, ns, track_of
 
 OURS_S = np.arange(900) / 60.0

@@ -8,8 +8,8 @@ import pytest
 
 from common.hand.model import JOINTS
 from master.mocap.align import Alignment
+from master.mocap.bvh_file import MARKERS, JointMotion
 from master.mocap.compare import compare, figures
-from master.mocap.joint_motion import MARKERS, JointMotion
 from master.outputs.poses import Poses
 from tests.master.mocap.moved import RIGHT, hand_at, motion_of, ns, poses_of
 

@@ -4,7 +4,7 @@ import pytest
 
 from common.errors import RecordingError
 from common.hand.model import JOINTS
-from master.mocap.joint_motion import Side
+from master.mocap.bvh_file import Side
 from master.mocap.read import choose_names
 
 PARTS = ("metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")

@@ -7,7 +7,7 @@ import pytest
 
 from common.arrays import Float
 from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
-from master.objects.carried import Carried
+from master.objects.contact import Carried
 
 STEP_NS = 16_666_667
 PALM_M = np.array([0.01, 0.03, -0.02])  # object frame

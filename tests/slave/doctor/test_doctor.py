@@ -19,13 +19,17 @@ from slave.__main__ import main
 from slave.cli.table import PROGRAM
 from slave.doctor.command import examine
 from slave.doctor.devices import check_devices, check_groups
-from slave.doctor.finding import (
+from slave.doctor.host import (
     Finding,
     Ran,
     System,
     Verdict,
     as_json,
     as_text,
+    check_clock,
+    check_host,
+    check_programs,
+    check_unit,
     exit_code,
     fail,
     ok,
@@ -33,7 +37,6 @@ from slave.doctor.finding import (
     unseen,
     warn,
 )
-from slave.doctor.host import check_clock, check_host, check_programs, check_unit
 from slave.doctor.master import check_keys, check_master
 
 CALIBRATION = Path(__file__).resolve().parents[3] / "calib_json"

@@ -13,7 +13,7 @@ import pytest
 from master.commands.keys import make
 from slave.install import arguments, steps
 from slave.install.arguments import InstallError, plan_of
-from slave.install.bundle import calibration_of, keys_of
+from slave.install.command import calibration_of, keys_of
 from slave.install.release import Source
 from slave.install.systemd import Systemd
 

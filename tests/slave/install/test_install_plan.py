@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from slave.install import arguments
 from slave.install.arguments import InstallError, NotReadyError, Plan, plan_of
-from slave.install.bundle import calibration_of, keys_of
+from slave.install.command import calibration_of, keys_of
 from slave.install.probe import judge, probe
 from slave.install.systemd import Systemd
 from slave.install.wanted import BEGIN, END, with_block, without_block

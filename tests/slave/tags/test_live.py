@@ -20,8 +20,7 @@ from slave.markers.reloadable import NullDetector
 from slave.report import DetectionCounters
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
-from slave.tags.live import SHARE, LiveTags, Pace, finder_of
-from slave.tags.offline import TagCollector, tagged_objects
+from slave.tags.offline import SHARE, LiveTags, Pace, TagCollector, finder_of, tagged_objects
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)

@@ -9,9 +9,8 @@ from common.arrays import Image
 from common.errors import PhalanxError
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import NUMPY, Engine, engine_named
-from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
-from slave.wrist.laser import laser_lines
+from slave.wrist.laser import laser_lines, separate
 from slave.wrist.seams import FENCE
 from slave.wrist.strobe import lit
 from tests.slave.wrist.wrist_frames import VIEW, strobed

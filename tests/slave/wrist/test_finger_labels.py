@@ -8,11 +8,10 @@ from bench.both.scene import Both
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
-from slave.wrist.fingers import separate
-from slave.wrist.laser import finger_labels, laser_lines
+from slave.wrist.laser import finger_labels, laser_lines, separate
+from slave.wrist.led_image import WristView
 from slave.wrist.runs import NONE, line_runs
 from slave.wrist.strobe import lit
-from slave.wrist.view import WristView
 from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
 

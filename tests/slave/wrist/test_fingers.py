@@ -13,10 +13,10 @@ from common.geometry.transforms import axis_rotation
 from common.hand.profiles import mirrored_profile
 from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
-from slave.wrist.fingers import NONE, separate
+from slave.wrist.laser import NONE, separate
+from slave.wrist.led_image import WristView
 from slave.wrist.seams import search_bands_of
 from slave.wrist.strobe import lit
-from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)

@@ -19,13 +19,11 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png
 from slave.sources import Frame
-from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
-from slave.wrist.laser import laser_lines
-from slave.wrist.led_image import SETTINGS, fitted
+from slave.wrist.laser import laser_lines, separate
+from slave.wrist.led_image import SETTINGS, WristView, fitted
 from slave.wrist.postures import APEX, END, MCP_RAD, postures_of
 from slave.wrist.strobe import StrobeCycle, lit
-from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene, strobed
 
 HANDS = {"default": HAND, "small": generated_profile("small", "right", 0.17)}

@@ -10,8 +10,7 @@ from common.arrays import Float, Image
 from common.recording.frame_recording import Illumination
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
-from slave.wrist.fingers import separate
-from slave.wrist.laser import laser_lines
+from slave.wrist.laser import laser_lines, separate
 from slave.wrist.runs import line_runs
 from slave.wrist.strobe import lit
 from slave.wrist.workspace import workspace_of

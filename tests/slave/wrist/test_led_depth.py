@@ -4,8 +4,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.calibration.rig import FlatField, flat_of
-from slave.wrist.led_image import depth_about, led_optics, nearness, shrink
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView, depth_about, led_optics, nearness, shrink
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW
 
 VIGNETTE = FlatField((1.0, 0.05, -0.04, -0.7, 0.02, -0.7))

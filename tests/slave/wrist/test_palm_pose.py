@@ -15,8 +15,7 @@ from common.sim.wrist.scene import WristScene, WristTruth
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
 from slave.wrist.detector import find
-from slave.wrist.fingers import separate
-from slave.wrist.laser import laser_lines
+from slave.wrist.laser import laser_lines, separate
 from slave.wrist.led_image import shrink
 from slave.wrist.palm_pose import find_palm_pose, prepare, rotated_view, wrist_angles_seen
 from slave.wrist.strobe import StrobeCycle, lit

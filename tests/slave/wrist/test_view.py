@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from common.calibration.rig import LaserPlane
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW
 
 

@@ -11,7 +11,7 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import STROBE
 from slave.sources import Frame
-from slave.wrist.view import WristView
+from slave.wrist.led_image import WristView
 
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)

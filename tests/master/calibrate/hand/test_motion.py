@@ -12,7 +12,7 @@ from common.errors import CalibrationError, FitError, RecordingError
 from common.hand.fitting import joint_angles
 from common.hand.model import CHAINS, JOINTS, HandModel, couplings_of
 from master.calibrate.hand.motion import Ratio, find_palm, hand_from_motion, motion_couplings, motion_lines
-from master.mocap.joint_motion import Side
+from master.mocap.bvh_file import Side
 from tests.cli import calibrate
 from tests.master.mocap.moved import LEFT, RIGHT, ROTATION, SHIFT, hand_at, motion_of, ns, write_table
 

@@ -17,7 +17,7 @@ from common.messages import HandPose
 from common.sim.record import record_scene
 from common.sim.scenes import scene_by_name
 from master.__main__ import main
-from master.calibrate.object.session import guide, progress
+from master.calibrate.object.command import guide, progress
 from master.objects.line import ObjectLine
 from master.replay.recorded import recorded_detections
 from master.rig.setup import load_setup

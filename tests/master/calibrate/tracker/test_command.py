@@ -17,8 +17,7 @@ from common.errors import FitError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.recording.recorded_files import write_npz
 from master.__main__ import main
-from master.calibrate.tracker.command import read_motion, write_motion
-from master.calibrate.tracker.session import guide
+from master.calibrate.tracker.command import guide, read_motion, write_motion
 from master.calibrate.tracker.tracks import coverage_of, object_track, tracker_track
 from master.objects.tracker import TrackerLine
 from master.outputs.bus import DevicePoses

@@ -1,4 +1,6 @@
-"""Master and slave open a session by a handshake, one transition table.
+"""Run the handshake of both sides as one table of transitions.
+
+Master and slave open a session by a handshake, one transition table.
 
 Handshake of master and slave: its keys and its messages.
 
