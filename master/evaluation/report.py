@@ -121,9 +121,6 @@ def wrist_images(
         yield camera, t_ns, lit_view(renderer, (t_ns - epoch_ns) * 1e-9)
 
 
-Progress = Callable[[str, int, int], None]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
     """What the synthetic sensors of one hand sensed.

@@ -74,7 +74,7 @@ class _Steps:
         self._panel.clear()
         with self._panel:
             if key.startswith("wizard/"):
-                panel_lens.panel_more_wizard(self._desk, wizard_named(key.removeprefix("wizard/")))
+                panel_lens.build_wizard(self._desk, wizard_named(key.removeprefix("wizard/")))
             else:
                 PANELS[key](self._desk)
         self.update()

@@ -12,7 +12,8 @@ from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Still
-from common.sim.board import BOARD, BoardRenderer, BoardScene
+from common.sim.board import BOARD as PRINTED
+from common.sim.board import BoardRenderer, BoardScene
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.capture import NOTES, Round, capture, new_folder
 from master.calibrate.cameras.coverage import LiveViews
@@ -22,8 +23,8 @@ CALIB = Path(__file__).parents[4] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)
 CAMERAS = {name: load(CALIB / "cameras" / f"{name}.json", CameraCalibration) for name in RIG.cameras}
 SCENE = BoardScene(RIG, CAMERAS, 3)
-BOARD = Checkerboard(BOARD.columns, BOARD.rows, BOARD.square_m)
-STEP_S = BOARD.held_s + BOARD.moved_s
+BOARD = Checkerboard(PRINTED.columns, PRINTED.rows, PRINTED.square_m)
+STEP_S = PRINTED.held_s + PRINTED.moved_s
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_a_view_is_kept_once_it_is_held_still_and_only_once(renderers: dict[str,
 
 def test_a_moving_board_is_never_kept(renderers: dict[str, BoardRenderer]) -> None:
     live = LiveViews(BOARD, RIG.cameras)
-    for t_s in BOARD.held_s + BOARD.moved_s * np.linspace(0.25, 0.75, 5):
+    for t_s in PRINTED.held_s + PRINTED.moved_s * np.linspace(0.25, 0.75, 5):
         assert not live.push(at(renderers, float(t_s))).kept
 
 
@@ -133,7 +134,7 @@ def test_after_each_view_it_says_what_is_missing_until_nothing_is(
 ) -> None:
     live = LiveViews(BOARD, RIG.cameras)
     output: list[str] = []
-    for k in range(BOARD.poses):
+    for k in range(PRINTED.poses):
         for t_s in (0.2, 0.5):
             kept = live.push(at(renderers, k * STEP_S + t_s)).kept
         if kept:
