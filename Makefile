@@ -143,5 +143,6 @@ $(STAMP): pyproject.toml constraints.txt
 	fi; \
 	$$pip -c constraints.txt hatchling; \
 	$$pip -c constraints.txt --no-build-isolation -e '.[master,dev]'; \
+	find common slave master -name '*.nb[ci]' -delete; \
 	$(BIN)/python -m master.fabrik
 	@touch $@

@@ -1,7 +1,4 @@
-"""Type aliases for the arrays that cross function boundaries.
-
-The shapes are stated in the docstrings.
-"""
+"""Type aliases for the arrays of function boundaries; docstrings state shapes."""
 
 import numpy as np
 import numpy.typing as npt

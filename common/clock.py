@@ -1,11 +1,7 @@
-"""Clocks give monotonic time; a ticker keeps a loop's rate, a bucket limits it.
+"""Clocks give monotonic time, and a token bucket limits a rate.
 
-Time: monotonic clock, simulated foreign clock, and a drift-free loop tick.
-
-Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never
-asked, and setting it moves nothing. How the clock of another machine runs is `common.link.clock_offset`.
-
-Limit how often something may happen: a token bucket.
+Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never asked, and setting it
+moves nothing. How the clock of another machine runs is `common.link.clock_offset`.
 """
 
 import time
@@ -34,19 +30,10 @@ class SystemClock:
 
 
 class SkewedClock:
-    """Clock of a simulated foreign machine: another zero and another rate.
-
-    It also makes steps where a test wants them.
-
-    Holds the moment of its construction, at which it is `offset_ns` ahead of the true clock.
-    """
+    """Clock of a simulated foreign machine: another zero and rate, steps if wanted."""
 
     def __init__(self, offset_ns: int, rate_ppm: float, clock: Clock | None = None) -> None:
-        """Start `offset_ns` ahead of `clock`, gaining `rate_ppm` microseconds per second.
-
-        Raises:
-            ValueError: The rate is not above -1 000 000 ppm: such a clock would not run.
-        """
+        """Start `offset_ns` ahead of `clock`, gaining `rate_ppm` (above -1e6)."""
         self._true: Clock = SystemClock() if clock is None else clock
         self._epoch_ns = self._true.now_ns()
         self._offset_ns = offset_ns
@@ -55,10 +42,7 @@ class SkewedClock:
             raise ValueError(f"rate_ppm={rate_ppm}: must be above -1e6")
 
     def step(self, by_ns: int) -> None:
-        """Step the clock by `by_ns` [ns], as no monotonic clock should.
-
-        Simulates a machine that was asleep or restored.
-        """
+        """Step the clock by `by_ns` [ns], as for a machine that was asleep or restored."""
         self._offset_ns += by_ns
 
     def now_ns(self) -> int:
@@ -70,51 +54,14 @@ class SkewedClock:
         return t_ns + self._offset_ns + (t_ns - self._epoch_ns) * self._rate_ppb // 10**9
 
     def to_true(self, t_ns: int) -> int:
-        """Return the true clock's time [ns] when this clock shows `t_ns`.
-
-        Exact to 1 ns.
-        """
+        """Return the true clock's time [ns] when this clock shows `t_ns`. Exact to 1 ns."""
         elapsed = t_ns - self._offset_ns - self._epoch_ns
         rate = 10**9 + self._rate_ppb
         return self._epoch_ns + (2 * elapsed * 10**9 + rate) // (2 * rate)
 
 
-class Ticker:
-    """Paces a loop on a fixed grid; the time the loop's body takes does not add up.
-
-    Holds the next grid time, and in `missed` how many ticks were skipped because the loop was late.
-    """
-
-    def __init__(self, period_ns: int, clock: Clock | None = None) -> None:
-        """Start the grid now.
-
-        Raises:
-            ValueError: The period is not positive.
-        """
-        if period_ns <= 0:
-            raise ValueError(f"period_ns={period_ns}: must be positive")
-        self._clock: Clock = SystemClock() if clock is None else clock
-        self._period_ns = period_ns
-        self._next_ns = self._clock.now_ns()
-        self.missed = 0
-
-    def next(self) -> int:
-        """Sleep until the next grid time and return it [ns]; skip the ones already over."""
-        self._next_ns += self._period_ns
-        late = (self._clock.now_ns() - self._next_ns) // self._period_ns
-        if late > 0:
-            self.missed += late
-            self._next_ns += late * self._period_ns
-        while (left_ns := self._next_ns - self._clock.now_ns()) > 0:
-            time.sleep(left_ns * 1e-9)
-        return self._next_ns
-
-
 class TokenBucket:
-    """Token bucket that bounds how many messages are taken.
-
-    Holds how many may come now, and when it was last asked.
-    """
+    """Token bucket that bounds how many messages are taken."""
 
     def __init__(self, per_s: float, at_once: float) -> None:
         """So many a second, of which `at_once` may come together."""

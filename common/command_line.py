@@ -1,20 +1,10 @@
 """A command line parses options, runs one of several commands and prints.
 
-Terminal output: results on standard output, remarks on standard error.
-
-The lines are for whoever started the program.
-
-Command-line program of several commands.
-
-A table of names, and modules that are imported only when a command is requested.
-
-Each command has two functions, named as `module:function`. One adds its options to a parser; its docstring is the help,
-with the examples behind a line `Examples:`. It is imported for the help and to read the options, so its module imports
-nothing heavy. The other does the work: it takes the options, and returns the exit code, or None for 0.
-
-Types of command-line options: numbers with bounds, and ports.
-
-Their errors name the value and what is expected.
+Results go to standard output, remarks to standard error. Each command has two functions, named as `module:function`,
+whose modules are imported only when it is requested. One adds its options to a parser; its docstring is the help, with
+the examples behind a line `Examples:`. It is imported for the help and to read the options, so its module imports
+nothing heavy. The other does the work: it takes the options, and returns the exit code, or None for 0. The types of
+options check bounds; their errors name the value and what is expected.
 """
 
 import difflib
@@ -54,10 +44,7 @@ _LOG = "%(levelname)s %(name)s: %(message)s"
 
 
 class Parser(ArgumentParser):
-    """Argument parser that takes whatever begins like a negative number as a value.
-
-    Example: `--angles -20:20:10`.
-    """
+    """Argument parser that takes what begins like a negative number as a value."""
 
     def __init__(self, program: str, about: str, examples: str) -> None:
         super().__init__(
@@ -71,10 +58,7 @@ class Parser(ArgumentParser):
 
 
 class UsageError(Exception):
-    """Error raised when options are incompatible with each other.
-
-    The program ends as it does for an unknown option.
-    """
+    """Options are incompatible; the program ends as for an unknown option."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +93,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """Commands that share their first words.
-
-    Attributes:
-        name: These words.
-        group: Heading that it stands under in the help of the program.
-        purpose: What they are for, in a line.
-    """
+    """Commands whose names begin with `name`; `group`, `purpose` as of `Command`."""
 
     name: str
     group: str
@@ -127,7 +105,6 @@ class Program:
     """A program.
 
     Attributes:
-        name: As a user types it.
         about: Its help, in front of the table of commands.
         table: Commands and families, in the order of the help.
         missing: What to do where a package is missing that a command needs.
@@ -253,20 +230,14 @@ class Program:
 
 
 def defaults_of(declare: Callable[[ArgumentParser], None]) -> Namespace:
-    """Return the default values of the options that `declare` adds.
-
-    None of them may be required.
-    """
+    """Default values of the options that `declare` adds; none may be required."""
     parser = ArgumentParser()
     declare(parser)
     return parser.parse_args([])
 
 
 def help_of(declare: Callable[..., object]) -> tuple[str, str]:
-    """Return the description and examples of a command.
-
-    From the docstring of the function that declares its options.
-    """
+    """Description and examples from the docstring of a function of options."""
     first, _, rest = (declare.__doc__ or "").strip().partition("\n")
     about, _, examples = f"{first}\n{dedent(rest)}".partition(f"\n{_EXAMPLES}\n")
     return about.strip(), examples.rstrip()
@@ -279,23 +250,14 @@ def _function(place: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A finite number, or a whole one, between two bounds.
-
-    Attributes:
-        low, high: Bounds; None: there is none.
-        whole: Whether it has to be an integer.
-    """
+    """A finite number, or with `whole` an integer, between bounds; None: no bound."""
 
     low: float | None = None
     high: float | None = None
     whole: bool = False
 
     def __call__(self, text: str) -> float | int:
-        """Read it.
-
-        Raises:
-            ArgumentTypeError: It is no such number.
-        """
+        """Read it; raises ArgumentTypeError if it is no such number."""
         try:
             value = int(text) if self.whole else float(text)
         except ValueError as error:  # argparse would print the name of the class
@@ -321,11 +283,7 @@ def whole(low: int | None = None, high: int | None = None) -> Number:
 
 
 def positive(text: str) -> float:
-    """A number above 0.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
+    """A number above 0, or ArgumentTypeError."""
     value = Number()(text)
     if not value > 0.0:
         raise ArgumentTypeError(f"{text}: must be positive")
@@ -333,11 +291,7 @@ def positive(text: str) -> float:
 
 
 def megabytes(text: str) -> float:
-    """A number from 0 on.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
+    """A number from 0 on, or ArgumentTypeError."""
     value = Number()(text)
     if value < 0.0:
         raise ArgumentTypeError(f"{text}: must not be negative")
@@ -345,22 +299,14 @@ def megabytes(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number from 1 on.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
+    """A whole number from 1 on, or ArgumentTypeError."""
     if not text.isdecimal() or int(text) < 1:
         raise ArgumentTypeError(f"{text}: must be a whole number, at least 1")
     return int(text)
 
 
 def port(text: str) -> int:
-    """A port of UDP or TCP.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
+    """A port of UDP or TCP, or ArgumentTypeError."""
     if not text.isdecimal() or not 0 < int(text) < 65536:
         raise ArgumentTypeError(f"{text}: must be a port, 1 to 65535")
     return int(text)

@@ -20,17 +20,11 @@ what it is everywhere: the caller passed something of the wrong shape or range.
 
 
 class PhalanxError(Exception):
-    """Base of every error that a user can cause or fix.
-
-    Its text names the thing and the fix.
-    """
+    """Base of every error that a user can cause or fix; its text names thing and fix."""
 
 
 class CalibrationError(PhalanxError):
-    """Error of a missing, broken or impossible calibration file.
-
-    The text names file and key.
-    """
+    """A calibration file is missing, broken or impossible; the text names the key."""
 
 
 class RecordingError(PhalanxError):
@@ -46,31 +40,19 @@ class ImuError(PhalanxError):
 
 
 class TrackerError(PhalanxError):
-    """Error of a tracking device that is gone, or whose system is not installed.
-
-    It concerns a device that tracks itself. A fake one is never substituted.
-    """
+    """A self-tracking device is gone, or its system. Never answered with a fake."""
 
 
 class TrackerChoiceError(TrackerError):
-    """Error raised when several devices are present and none was selected.
-
-    Waiting does not help.
-    """
+    """Several devices are there and none was selected: waiting does not help."""
 
 
 class LightsError(PhalanxError):
-    """Error of laser or LEDs that cannot be switched, or would be on unsafely long.
-
-    Fake ones are never substituted.
-    """
+    """Laser or LEDs cannot be switched, or are on too long. Never answered by fakes."""
 
 
 class PictureError(PhalanxError):
-    """Bytes that are no picture, or claim another size than they may have.
-
-    The text goes on behind a name.
-    """
+    """Bytes that are no picture, or of another size; the text goes on behind a name."""
 
 
 class MessageError(PhalanxError):

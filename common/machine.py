@@ -1,12 +1,9 @@
 """State of the computer: temperature, throttling, free disk space.
 
-Of the computer that a process runs on. Linux; what is not available is not reported.
-
-A Raspberry Pi reports by its firmware that it throttles, its clock is capped, or its supply is too weak. Others
-define by the trip points of their thermal zones how warm is too warm.
-
-Everything is read below a root, / unless the variable `PHALANX_SYSTEM_ROOT` is set: there a rehearsal or a test
-lays its own files, with the room of the disk in `disk_free_mb`.
+Linux; what is not available is not reported. A Raspberry Pi reports by its firmware that it throttles, its clock is
+capped, or its supply is too weak. Others define by the trip points of their thermal zones how warm is too warm.
+Everything is read below a root, / unless the variable `PHALANX_SYSTEM_ROOT` is set: there a rehearsal or a test lays
+its own files, with the room of the disk in `disk_free_mb`.
 """
 
 import contextlib
@@ -37,10 +34,7 @@ class Program(NamedTuple):
 
 @cache
 def program() -> Program:
-    """Return this program on this machine.
-
-    Its version is empty where it was never installed.
-    """
+    """This program on this machine; its version is empty if never installed."""
     try:
         installed = version("phalanx-hand")
     except PackageNotFoundError:
@@ -49,10 +43,7 @@ def program() -> Program:
 
 
 class Machine:
-    """Reader of the computer's metrics.
-
-    Holds where they are.
-    """
+    """Reader of the computer's metrics."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str] = os.environ) -> None:
         """Of this computer, and the disk that `folder` is on."""
@@ -64,7 +55,7 @@ class Machine:
         self._weak = next(sensors, None) if self._flags is None else None
 
     def metrics(self) -> dict[str, float]:
-        """Return temperature, throttling and free disk space.
+        """Temperature, throttling and free disk space, as far as known.
 
         temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb.
         """
@@ -77,8 +68,7 @@ class Machine:
             found |= {"temperature_c": round(now, 1), "temperature_limit_c": limit}
         if (flags_path := self._flags or self._weak) is not None and (flags := _text(flags_path)) is not None:
             with contextlib.suppress(ValueError):  # of another firmware: nothing is known
-                # bits of what holds now; those above are of what has been since the start
-                found["throttled"] = float(int(flags, 16) & 0xF)
+                found["throttled"] = float(int(flags, 16) & 0xF)  # now; bits above: since the start
         if (free := self.disk_free_mb()) is not None:
             found["disk_free_mb"] = round(free, 1)
         return found
@@ -95,10 +85,7 @@ class Machine:
 
 
 def _zone(path: Path) -> tuple[float, float] | None:
-    """Return the temperature of a thermal zone and its limit [degrees C].
-
-    The limit is what it should stay below; None where it has no limit.
-    """
+    """Temperature of a thermal zone and its limit [degrees C]; None: no limit."""
     kind, milli = _text(path / "type"), _text(path / "temp")
     if kind is None or milli is None:
         return None
@@ -112,8 +99,7 @@ def _zone(path: Path) -> tuple[float, float] | None:
     except ValueError:
         return None
     if kind == "cpu-thermal":  # of a Raspberry Pi; its only trip point is far above what its firmware allows
-        # from here on a Raspberry Pi lowers its clock (its documentation, "Frequency management")
-        hot_c = 80.0
+        hot_c = 80.0  # from here on its clock is lowered (Raspberry Pi documentation, "Frequency management")
         return now, hot_c
     least_trip_c = 50.0  # a lower one switches a fan, or is a dummy of the firmware
     trips = [trip for trip in trips if trip >= least_trip_c]

@@ -1,19 +1,10 @@
 """A supervisor ends a process whose thread fails and notifies its manager.
 
-Supervise all threads of a process: one that fails ends the process.
-
-Whoever started the process starts it again.
-
 A thread that dies leaves a process that looks alive and does half of its work. So no exception of any thread is lost:
 the process is asked to end as by a stop of the system (SIGTERM), which closes files and devices, and ends with
-`EXIT_CODE`; where that takes too long, or nobody waits for that signal, it ends at once.
-
-Notify the system's service manager of a process (sd_notify(3)).
-
-That it is ready, that it is alive, and what it does.
-
-Datagrams of `NAME=VALUE` lines go to the socket in `NOTIFY_SOCKET`. Without that variable nobody listens, nothing is
-sent, and a process on a terminal runs as ever.
+`EXIT_CODE`; where that takes too long, or nobody waits for that signal, it ends at once. Whoever started it starts it
+again. The service manager (sd_notify(3)) gets datagrams of `NAME=VALUE` lines at the socket in `NOTIFY_SOCKET`; without
+that variable nothing is sent.
 """
 
 import logging
@@ -33,13 +24,9 @@ class ThreadEndedError(Exception):
 
 
 class ThreadSupervisor:
-    """Supervisor that is notified of every thread that fails.
-
-    It holds the name of the first.
-    """
+    """Supervisor that is notified of every thread that fails; holds the first name."""
 
     def __init__(self) -> None:
-        """Nothing failed yet."""
         self.failed: str | None = None
 
     def thread_failed(self, args: threading.ExceptHookArgs) -> None:
@@ -82,10 +69,7 @@ def supervised_threads() -> Generator[ThreadSupervisor, None, None]:
 
 
 def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[], None]:
-    """Make `work` a thread's work that fails when it returns too early.
-
-    To return is to fail unless `stopped` reports that it was asked to.
-    """
+    """Make `work` a thread's work that fails if it returns before `stopped`."""
 
     def run() -> None:
         work()
@@ -96,14 +80,13 @@ def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[],
 
 
 MAIN, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
-_SERVICE_MANAGER_LOG = logging.getLogger(__name__)
 
 
 class ServiceManager:
-    """Who started this process, if it wants to know how it is.
+    """Manager of this process, if it has one.
 
     Attributes:
-        listens: Whether it does.
+        listens: Whether it has.
         watchdog_us: How long it waits for a sign of life [us]; 0: for ever.
     """
 
@@ -114,11 +97,9 @@ class ServiceManager:
         self.watchdog_us = _watchdog_us(environment) if self.listens else 0
 
     def send(self, text: str, wait: bool = False) -> bool:
-        """Send lines, and return whether that could be done.
+        """Send lines of `NAME=VALUE`, and return whether that could be done.
 
-        Args:
-            text: Lines of `NAME=VALUE`.
-            wait: Wait until the manager has room for it, where a loss would matter.
+        `wait`: until the manager has room, where a loss would matter.
         """
         if self._address is None:
             return True
@@ -127,7 +108,7 @@ class ServiceManager:
                 to.sendto(text.encode(), 0 if wait else socket.MSG_DONTWAIT, self._address)
         except OSError as error:
             if wait:
-                _SERVICE_MANAGER_LOG.warning("%s: cannot reach the service manager: %s", MAIN, error)
+                _LOG.warning("%s: cannot reach the service manager: %s", MAIN, error)
             return False
         return True
 
@@ -138,16 +119,13 @@ def one_line(text: str) -> str:
 
 
 def _address(text: str) -> str | None:
-    """The address of a socket: a path, or `@name` for one without a file.
-
-    None: nobody listens.
-    """
+    """The address of a socket, a path or `@name` (without a file), or None."""
     if not text:
         return None
     if text[0] == "@":
         return "\0" + text[1:]
     if text[0] != "/":
-        _SERVICE_MANAGER_LOG.warning("%s=%s: neither a path nor @name; nothing is sent", MAIN, text)
+        _LOG.warning("%s=%s: neither a path nor @name; nothing is sent", MAIN, text)
         return None
     return text
 

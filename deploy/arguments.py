@@ -1,11 +1,4 @@
-"""Options of `phalanx demo` and of the remote fleet commands, with checks.
-
-What of a command line can be refused before a machine is asked.
-
-Options of `phalanx demo` and of the remote commands of `phalanx fleet status`.
-
-These are the commands that reach other machines.
-"""
+"""Options of `phalanx demo` and of the remote fleet commands, with checks."""
 
 import argparse
 import os
@@ -20,10 +13,10 @@ _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before op
 
 
 def check_wish(options: argparse.Namespace, rig: RigFile) -> None:
-    """Look at the options of `phalanx fleet deploy`.
+    """Check what `phalanx fleet deploy` can refuse before a machine is asked.
 
     Raises:
-        DeployError: One is for a name that the rig does not have, or `--wheelhouse` has no wheels.
+        DeployError: An option is for a name that the rig does not have, or `--wheelhouse` has no wheels.
     """
     for option in ("camera", "options"):
         for text in getattr(options, option):
@@ -39,11 +32,7 @@ def check_wish(options: argparse.Namespace, rig: RigFile) -> None:
 
 
 def check_reach(options: argparse.Namespace) -> None:
-    """Look at how machines are to be reached.
-
-    Raises:
-        DeployError: The private key is not there.
-    """
+    """Raise DeployError where the private key of ssh is not there."""
     if options.identity is not None and not options.identity.is_file():
         raise DeployError(f"--identity {options.identity}: no such file; ssh-keygen makes one")
 

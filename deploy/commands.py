@@ -1,15 +1,4 @@
-"""Commands run the demo, or deploy, roll back and uninstall slaves.
-
-What the options of `phalanx fleet deploy`, `rollback` and `uninstall` mean.
-
-Keys for a dry run.
-
-As if the keys folder had what it lacks, while nothing is written into it.
-
-Commands `phalanx demo` and those of `phalanx fleet status` for other machines.
-
-The latter are the commands that reach other machines.
-"""
+"""Commands run the demo, or deploy, roll back and uninstall slaves."""
 
 import argparse
 import contextlib
@@ -25,7 +14,18 @@ from pathlib import Path
 
 from deploy.arguments import check_reach, check_wish
 from deploy.demo import DemoError, DemoSettings, best_rigs, run_demo, stop_on_signals
-from deploy.deployment import Ears, Lines, Reached, Wish, deploy, make_keys, reach_of, roll_back, uninstall
+from deploy.deployment import (
+    Ears,
+    Lines,
+    Notify,
+    Reached,
+    Wish,
+    deploy,
+    make_keys,
+    reach_of,
+    roll_back,
+    uninstall,
+)
 from deploy.payload import Kind, export
 from deploy.remote import DeployError, RigFile, Target, read_rig, targets_of
 
@@ -48,10 +48,7 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
     """What is wanted on the machines."""
     check_wish(options, rig)
     handed = [
-        word
-        for name in ("camera", "options", "overlay")
-        for one in getattr(options, name)
-        for word in (f"--{name}={one}",)
+        f"--{name}={one}" for name in ("camera", "options", "overlay") for one in getattr(options, name)
     ]
     handed += [
         f"--{name}={value}"
@@ -73,10 +70,7 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
 
 
 def ears_of(options: argparse.Namespace) -> Ears | None:
-    """Return how first datagrams are received.
-
-    Here, or at the master of another machine.
-    """
+    """Return how first datagrams are received: here, or at another machine's master."""
     if options.no_wait:
         return None
     address = _here(options.master)
@@ -99,11 +93,7 @@ def reached_of(options: argparse.Namespace) -> Reached:
 
 
 def _here(master: str) -> str | None:
-    """The address of `--master`, if it is one of this machine's.
-
-    Raises:
-        DeployError: The name is not known.
-    """
+    """Address of `--master`, if this machine's; DeployError: the name is not known."""
     try:
         address = str(socket.getaddrinfo(master, None, socket.AF_INET)[0][4][0])
     except OSError as error:
@@ -116,18 +106,14 @@ def _here(master: str) -> str | None:
     return address
 
 
-Notify = Callable[[str], None]
-
-
 @contextlib.contextmanager
 def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Notify) -> Generator[Path]:
-    """A keys folder that has all that these senders need.
+    """Provide a keys folder that has all that these senders need.
 
     Args:
         folder: That of the user; what it lacks is made.
-        names: Senders.
-        dry_run: Nothing is made there. A private folder takes its place for as long as this lasts, so that the rest of
-            the way can be looked at: links to what is there, and what is lacking, made for nobody.
+        dry_run: Nothing is made there. A private folder takes its place meanwhile, so that the rest of the
+            way can be looked at: links to what is there, and what is lacking, made for nobody.
         notify: Called with what is made.
 
     Raises:

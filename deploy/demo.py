@@ -1,15 +1,8 @@
 """The demo runs simulated sensors and a master as processes of this machine.
 
-Sensors that a demo simulates, and which rigs see a scene best.
-
-The sensors are the cameras, IMUs and trackers of its rigs.
-
-Demo of a complete synthetic system, as processes of this machine.
-
-A slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer.
-
-Real sealed UDP on 127.0.0.1, real zenoh over TLS, with keys that are made for this run and gone after it. The slaves'
-clocks have different zeros and rates, and each camera runs 5 ms after the one before.
+A slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer. Real sealed UDP on
+127.0.0.1, real zenoh over TLS, with keys that are made for this run and gone after it. The slaves' clocks have
+different zeros and rates, and each camera runs 5 ms after the one before.
 """
 
 import json
@@ -32,14 +25,8 @@ from deploy.process import Process
 
 SensorKind = Literal["camera", "imu", "tracker"]
 
-TOGETHER = (
-    "grasp",
-    "both-poses",
-    "both-curl",
-    "both-travel",
-    "both-moves",
-    "gestures",
-)  # seen by both kinds of rig alike
+# seen by both kinds of rig alike
+TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 # Scene -> its rigs, where it is no other than `desk`.
 _BEST = {
     **dict.fromkeys(TOGETHER, ("desk-back3", "wrist-back3")),
@@ -49,10 +36,7 @@ _BEST = {
 
 
 class DemoError(Exception):
-    """Error for a demo that cannot run.
-
-    The text states why and what to do.
-    """
+    """A demo that cannot run; the text states why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +55,11 @@ def best_rigs(scene: str) -> tuple[str, ...]:
 
 
 def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sensor]:
-    """Return the simulated sensors of all rigs.
-
-    The cameras of all rigs, then each IMU whose mounting and world are known, then each tracker on an object.
+    """Return cameras of all rigs, then placed IMUs, then trackers on objects.
 
     Raises:
-        DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each see another.
+        DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each
+            see another.
     """
     read = {name: _rig(calibration, name) for name in rigs}
     if len(read) < len(rigs):
@@ -150,11 +133,6 @@ _STALE = ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd", "obje
 _KNOWN_S = 1.0
 # What draws pictures gives way to what is measured: a real camera costs no processor its time.
 _GIVES_WAY = 4
-_DRIVERS: dict[SensorKind, Callable[[str], list[str]]] = {
-    "camera": lambda name: ["run", "--camera", "synthetic", "--name", name],
-    "imu": lambda name: ["run", "--imu", "synthetic", "--name", name],
-    "tracker": lambda name: ["run", "--tracker", "synthetic", "--name", name],
-}
 _LATE_MS, _APART_PPM = 5.0, 50.0
 
 
@@ -168,12 +146,11 @@ class DemoSettings:
         out: Folder for logs and results.
         calibration: calib_json tree.
         rigs: Rigs to simulate, which one master runs.
-        seed: Seed of the scene.
         scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
-        console: The console, a page as well, takes the viewer's place.
         master: Module that is run as the master.
         bus: Endpoint of the master's bus; None: encrypted, on a port that is free.
+        console: The console, a page as well, takes the viewer's place.
     """
 
     seconds: float
@@ -209,10 +186,7 @@ def run_demo(
 ) -> dict[str, object]:
     """Run the demo and return its summary.
 
-    Args:
-        settings: What the user chose.
-        stop: Set by Ctrl-C; the run then ends early, cleanly, and is summed up all the same.
-        notify: Called with one line of progress at a time.
+    When `stop` is set, by Ctrl-C, the run ends early, cleanly, and is summed up all the same.
 
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
@@ -229,9 +203,7 @@ def run_demo(
 
 @contextmanager
 def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
-    """Provide a keys folder for one run, gone at the end of the block.
-
-    It is in a place that only this user can enter.
+    """Provide a private keys folder for one run, gone at the end of the block.
 
     Raises:
         DemoError: It cannot be made.
@@ -247,10 +219,7 @@ def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
 
 
 def lead_s(processes: int, load: float) -> float:
-    """Return how long after process start [s] the scene begins.
-
-    It depends on the number of processes and on the `load` of others that want to run.
-    """
+    """Return how long after process start [s] the scene begins, with others' `load`."""
     # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else
     # runs, and one in which cameras already look at the hand, which does not move yet, so that the light is known
     # and a hand found.
@@ -263,16 +232,10 @@ def lead_s(processes: int, load: float) -> float:
 def play(
     settings: DemoSettings, keys: Path, epoch_ns: int, stop: threading.Event, notify: Callable[[str], None]
 ) -> dict[str, int]:
-    """Run the processes for as long as wanted and return the restart counts.
+    """Run the processes for as long as wanted; return who was restarted how often.
 
-    The master leaves live.json and poses.npz. The result is who was restarted how often.
-
-    Args:
-        settings: What the user chose.
-        keys: Keys folder of all processes.
-        epoch_ns: When the scene begins, on this machine's monotonic clock.
-        stop: Ends the run early.
-        notify: Called with one line of progress at a time.
+    The master leaves live.json and poses.npz. The scene begins at `epoch_ns` on this machine's monotonic
+    clock; `stop` ends the run early.
 
     Raises:
         DemoError: A process does not come up.
@@ -303,10 +266,7 @@ def play(
 
 
 def _stop(processes: list[Process]) -> None:
-    """End all processes.
-
-    Whoever presses Ctrl-C again while they take their time leaves none behind either.
-    """
+    """End all processes, also where somebody presses Ctrl-C again meanwhile."""
     try:
         # The master first: slaves that end under it would look like lost frames.
         for process in sorted(processes, key=lambda p: p.name not in ("master", "viewer")):
@@ -332,7 +292,17 @@ def _table(settings: DemoSettings, keys: Path, epoch_ns: int) -> list[tuple[str,
         clock = ["--clock-offset-ms", str(zero_ms * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
         who = ["--rig", sensor.rig, *tree, "--scene", sensor.scene]
-        command = [*_DRIVERS[sensor.kind](sensor.name), *who, *played, *clock, *link]
+        command = [
+            "run",
+            f"--{sensor.kind}",
+            "synthetic",
+            "--name",
+            sensor.name,
+            *who,
+            *played,
+            *clock,
+            *link,
+        ]
         command += start if sensor.kind == "camera" else []
         rows.append((sensor.name, [sys.executable, "-m", "slave", *command], key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
@@ -384,10 +354,7 @@ def _wait_until_tracking(
 
 
 def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[str], None]) -> None:
-    """Report the viewer's address once, and once that the viewer ended.
-
-    Nobody needs the viewer, the run goes on without it.
-    """
+    """Report the viewer's address once, and once its end; the run goes on."""
     viewer = next((p for p in processes if p.name == "viewer"), None)
     if viewer is None:
         return
@@ -411,10 +378,7 @@ def _until_end(
     stop: threading.Event,
     notify: Callable[[str], None],
 ) -> None:
-    """Run for the wanted time, reporting the rate and any restarted process.
-
-    That is any process that died and was started again.
-    """
+    """Run for the wanted time, reporting the rate and any restarted process."""
     end = max(time.monotonic(), epoch_ns * 1e-9) + settings.seconds
     next_line = 0.0
     while not stop.is_set() and (left := end - time.monotonic()) > 0:
@@ -442,15 +406,8 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
     place = [*rig_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
-    command = [
-        sys.executable,
-        "-m",
-        "master.commands.report",
-        *place,
-        *files,
-        "--scene-epoch-ns",
-        str(epoch_ns),
-    ]
+    command = [sys.executable, "-m", "master.commands.report", *place, *files]
+    command += ["--scene-epoch-ns", str(epoch_ns)]
     # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.
     done = subprocess.run(command, env=dict(os.environ), start_new_session=True, check=False)
     if done.returncode != 0:

@@ -1,21 +1,9 @@
 """Deploy the slave to a host, and wait until it sends.
 
-Check that the senders of a deployment are received, before and after it.
-
-Before it, this measures how soon that shows.
-
-A new version that runs and sends nothing costs the stream for as long as it is listened for. So where a master runs and
-took all of them before, it waits twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
-
-Deployment brings slaves to all machines of a rig, step by step on each.
-
-Deployment steps on one machine.
-
-Look at it, bring packages, wheels and files, install; or take back, or remove.
-
-Deployment to all machines of a rig at once.
-
-Each is deployed to by itself, then their first datagrams are waited for.
+All machines of a rig at once, step by step on each: look at it, bring packages, wheels and files, install; or take
+back, or remove. A new version that runs and sends nothing costs the stream for as long as it is listened for. So
+where a master runs and took all senders before, it waits twice as long as that took, or as the slave's own start did;
+else `WAIT_SENDERS_S`.
 """
 
 import json
@@ -31,21 +19,14 @@ from typing import cast
 from deploy.payload import BUNDLE, Kind, bundle, command, wheelhouse
 from deploy.remote import Deadline, DeployError, Remote, RigFile, Target, printable, run_bounded
 
-WAIT_SENDERS_S = (
-    12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
-)
+# from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
+WAIT_SENDERS_S = 12.0
 LEAST_S = 4.0  # a master reports its counts once a second, a beacon comes as often
 
 
 @dataclass(frozen=True, slots=True)
 class Ears:
-    """How datagrams are received.
-
-    Attributes:
-        options: Of `phalanx fleet status --wait`.
-        keys: Keys folder.
-        seconds: How long they are waited for.
-    """
+    """How datagrams are received, for how long; options of `fleet status --wait`."""
 
     options: tuple[str, ...]
     keys: Path
@@ -68,10 +49,7 @@ class Received:
 
 
 def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
-    """Return which senders `phalanx fleet status --wait` receives.
-
-    It ends early if `ended` is set.
-    """
+    """Return which senders `fleet status --wait` receives, until `ended` is set."""
     words = [sys.executable, "-m", "master", "fleet", "status", "--json", "--seconds", str(ears.seconds)]
     words += [*ears.options, *(word for name in names for word in ("--wait", name))]
     lines: list[str] = []
@@ -88,10 +66,7 @@ def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None 
 
 
 class Before:
-    """Senders received before anything is changed.
-
-    Found out while wheels are gathered and sent. It holds the thread.
-    """
+    """Senders received before anything is changed; holds the thread that listens."""
 
     def __init__(self, names: Sequence[str], ears: Ears) -> None:
         """Begin to listen."""
@@ -103,18 +78,14 @@ class Before:
 
     @property
     def at_master(self) -> bool:
-        """Report whether a master runs, so that each machine can be checked by itself.
-
-        It waits for the end of the listening.
-        """
+        """Whether a master runs, so that each machine can be checked by itself; blocks."""
         self._thread.join()
         return self._received.master
 
     def ears(self, start_s: float | None) -> Ears:
         """How to listen for one machine afterwards.
 
-        Args:
-            start_s: How long its slaves took to start before [s]; None: they did not run.
+        `start_s` is how long its slaves took to start before [s]; None: they did not run.
         """
         self._thread.join()
         if start_s is None or not self._received.master or set(self._received.rates) < set(self._names):
@@ -145,14 +116,12 @@ class Wish:
 
     Attributes:
         master: Host name or address of the PC.
-        rig: The rig's file.
         calibration: calib_json tree of the PC.
         keys: Keys folder of the PC.
         options: Of the installer, handed on.
         cameras: Their drivers as given: DRIVER or NAME=DRIVER.
         wheels: Folder of wheels; None: they are downloaded.
         apt: Whether packages of the system are installed.
-        dry_run: Write nothing.
         ready_s: How long slaves may take until they are ready.
     """
 
@@ -168,11 +137,9 @@ class Wish:
     ready_s: float
 
     def driver(self, names: Sequence[str]) -> str:
-        """Return the driver of the cameras among `names`.
+        """Return the driver of the cameras among `names`; empty: none is a camera.
 
-        It decides what their machine has to have; empty: none of them is a camera.
-
-        Of several, picamera2 asks for the most.
+        It decides what their machine has to have. Of several, picamera2 asks for the most.
         """
         drivers: list[str] = []
         for name in [one for one in names if one in self.rig.cameras]:
@@ -188,9 +155,6 @@ class Host:
     """One machine while it is deployed to.
 
     Attributes:
-        target: Which, and for what.
-        remote: How it is reached.
-        notify: Called with one line a step.
         sudo: Whether root is reached by sudo.
         changed: Whether something was changed, which can be taken back.
         reboot: Whether it runs only after it was restarted.
@@ -232,15 +196,8 @@ class Host:
         if not there and not wish.dry_run:
             self.remote.send(wheels.files, stage, self.sudo)
         words = ["install", "--json", "--bundle", BUNDLE, "--master", wish.master, "--rig", wish.rig.name]
-        words += [
-            "--release",
-            wheels.release,
-            "--wheelhouse",
-            stage,
-            "--ready-s",
-            str(wish.ready_s),
-            *wish.options,
-        ]
+        words += ["--release", wheels.release, "--wheelhouse", stage]
+        words += ["--ready-s", str(wish.ready_s), *wish.options]
         words += [word for name in self.target.names for word in ("--name", name)]
         words += ["--dry-run"] if wish.dry_run else []
         packed = bundle(wish.keys, self.target.names, wish.calibration, wish.rig)
@@ -304,11 +261,7 @@ class Host:
         self.notify(str(self._act(words, _plain_bundle())["text"]))
 
     def _packages(self, facts: dict[str, object], wish: Wish, picamera2: bool) -> None:
-        """Install the packages that the system lacks, or report what it lacks.
-
-        Raises:
-            DeployError: apt failed, or it cannot be done without.
-        """
+        """Install the packages that the system lacks, or report what it lacks."""
         there = cast(list[str], facts["packages"])
         wanted = ["rsync", "chrony", *(["python3-picamera2"] if picamera2 else [])]
         missing = [name for name in wanted if name not in there]
@@ -320,11 +273,7 @@ class Host:
         self.notify(f"{'would install' if wish.apt else 'not installed'}: {' '.join(missing)}")
 
     def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
-        """Run the installer there; its result.
-
-        Raises:
-            DeployError: It failed; its own line states why.
-        """
+        """Run the installer there and return its result; DeployError: why it failed."""
         result: dict[str, object] = {}
         last = ""
 
@@ -345,10 +294,7 @@ class Host:
 
 
 def _result(line: str) -> dict[str, object] | None:
-    """Parse what the installer found or did.
-
-    None: the line is another, or the link broke within it.
-    """
+    """What the installer found or did; None: another line, or the link broke in it."""
     if not line.startswith('{"result"'):
         return None
     try:
@@ -367,21 +313,14 @@ Notify = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """How machines are reached.
-
-    Attributes:
-        options: Of ssh.
-        deadline_s: By when all of one machine is done.
-    """
+    """How machines are reached: options of ssh, by when all of one machine is done."""
 
     options: tuple[str, ...]
     deadline_s: float
 
 
 def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
-    """Make the missing keys of a keys folder for these senders.
-
-    By `phalanx fleet keys --make`.
+    """Make the missing keys of a folder, by `phalanx fleet keys --make`.
 
     Raises:
         DeployError: They cannot be made.
@@ -403,14 +342,9 @@ def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
 def deploy(
     targets: Sequence[Target], wish: Wish, reached: Reached, ears: Ears | None, notify: Notify
 ) -> dict[str, str | None]:
-    """Deploy to all of them at once; host -> None, or one line why it failed there.
+    """Deploy to all at once; host -> None, or one line why it failed there.
 
-    Args:
-        targets: The machines.
-        wish: What is wanted on them.
-        reached: How they are reached.
-        ears: How their first datagrams are received; None: nobody listens.
-        notify: Called with one line a step, each with its host.
+    `ears` is how first datagrams are received; None: nobody listens.
     """
     hosts = _hosts(targets, reached, notify)
     if ears is None or wish.dry_run:
@@ -435,20 +369,14 @@ def deploy(
 def uninstall(
     targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
 ) -> dict[str, str | None]:
-    """Remove everything of this project from all machines.
-
-    Returns host -> None, or one line why it failed there.
-    """
+    """Remove this project from all machines; host -> None, or why it failed there."""
     return _each(_hosts(targets, reached, notify), lambda host: host.uninstall(dry_run))
 
 
 def roll_back(
     targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
 ) -> dict[str, str | None]:
-    """Roll all machines back to what was before.
-
-    Returns host -> None, or one line why it failed there.
-    """
+    """Roll all machines back; host -> None, or one line why it failed there."""
 
     def one(host: Host) -> None:
         host.look()
@@ -497,21 +425,13 @@ def _wait_for_senders(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None
 
 
 def _wait_received(host: Host, ears: Ears) -> None:
-    """The same for one machine.
-
-    Raises:
-        DeployError: It is silent, and went back.
-    """
+    """The same for one machine."""
     host.notify("waiting for its first datagram")
     _judge(host, received_of(host.target.names, ears, host.remote.deadline.ended), ears)
 
 
 def _judge(host: Host, received: Received, ears: Ears) -> None:
-    """Roll back a machine if one of its senders is not received.
-
-    Raises:
-        DeployError: It is so.
-    """
+    """Roll back a machine one of whose senders is silent, and raise DeployError."""
     missing = [name for name in host.target.names if name not in received.rates]
     if not missing:
         host.notify(f"streams: {', '.join(f'{n} {received.rates[n]:.0f}/s' for n in host.target.names)}")

@@ -1,16 +1,10 @@
 """The payload is what goes to a machine: bundle, keys, files and wheels.
 
-Bundle that goes to a machine by the input of ssh.
+The bundle, by the input of ssh, is installer, keys of that machine and files of the rig as one zip in memory. Nothing
+of it touches a disk there before the installer writes it: a dry run writes nothing, no key is left in a file.
 
-Installer, keys of that machine, files of the rig, as one zip in memory.
-
-Nothing of it touches a disk there before the installer writes it: a dry run writes nothing, no key is left in a file.
-
-Wheels for another machine, gathered on this one.
-
-What a slave needs, for its Python and processor, and our own.
-
-Downloaded once for each kind of machine, and kept below ~/.cache/phalanx.
+Wheels for another machine, for its Python and processor, are gathered on this one: downloaded once for each kind of
+machine, and kept below ~/.cache/phalanx.
 """
 
 import hashlib
@@ -50,13 +44,7 @@ def command(arguments: Sequence[str], sudo: bool) -> list[str]:
 
 
 def bundle(keys: Path | None, names: Sequence[str], calibration: Path | None, rig: RigFile | None) -> bytes:
-    """The zip.
-
-    Args:
-        keys: Keys folder, of which only what the machine may have is taken; None: none.
-        names: Cameras and IMUs that it serves.
-        calibration: calib_json tree, of which only what the rig needs is taken; None: none.
-        rig: That rig.
+    """Return the zip, with only the keys and files that the machine needs.
 
     Raises:
         DeployError: A file is missing.
@@ -113,12 +101,7 @@ def cache() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """What a release is made of.
-
-    Attributes:
-        files: Wheels, ours among them.
-        release: Its name: our version and a hash of all of them, so that other content is another release.
-    """
+    """Wheels, ours among them, and their release: our version and a hash of them all."""
 
     files: tuple[Path, ...]
     release: str
@@ -130,12 +113,9 @@ class Wheels:
 
 
 def wheelhouse(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
-    """The wheels for machines of this kind.
+    """Return the wheels for machines of this kind.
 
-    Args:
-        kind: Of machine.
-        given: Folder that the user made; ours is added if it is missing there. None: they are downloaded.
-        notify: Called when something is downloaded.
+    `given` is a folder that the user made; ours is added if it is missing there. None: they are downloaded.
 
     Raises:
         DeployError: A wheel cannot be had.
@@ -164,11 +144,7 @@ def _gathered(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> 
 
 
 def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
-    """Refuse wheels of another kind of machine here, where it costs nothing.
-
-    Raises:
-        DeployError: Names the first of them.
-    """
+    """Refuse wheels of another kind of machine here, where it costs nothing."""
     for file in files if given is not None else ():
         if not fits(file.name, kind):
             raise DeployError(
@@ -178,10 +154,7 @@ def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
 
 
 def fits(wheel: str, kind: Kind) -> bool:
-    """Check whether a wheel can be installed on such a machine.
-
-    By the tags of its name (PEP 427).
-    """
+    """Whether a wheel fits such a machine, by the tags of its name (PEP 427)."""
     parts = wheel.removesuffix(".whl").split("-")
     if len(parts) < 5:
         return False
@@ -199,9 +172,7 @@ def fits(wheel: str, kind: Kind) -> bool:
 
 
 def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
-    """Put the wheels for machines of this kind into a folder.
-
-    For a machine without a network.
+    """Put the wheels for machines of this kind, that have no network, into a folder.
 
     Raises:
         DeployError: A wheel cannot be had, or the folder has others already.
@@ -216,9 +187,7 @@ def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
 
 
 def own_wheel() -> Path:
-    """Return the wheel of this program as it is, installed or in a source tree.
-
-    It is made without a network or a build.
+    """Make the wheel of this program as it is, without a network or a build.
 
     Raises:
         DeployError: It was never installed, so that nobody knows what it needs.
@@ -292,20 +261,18 @@ def _downloaded(kind: Kind, notify: Callable[[str], None]) -> Path:
 
 
 def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: Path) -> None:
-    platforms = [f"manylinux_{glibc}_{kind.machine}" for glibc in reversed(_GLIBC)] + [
-        f"manylinux2014_{kind.machine}"
-    ]
-    words = [
-        sys.executable,
-        "-m",
-        "pip",
-        "download",
-        "--quiet",
-        "--disable-pip-version-check",
+    platforms = [f"manylinux_{glibc}_{kind.machine}" for glibc in reversed(_GLIBC)]
+    platforms += [f"manylinux2014_{kind.machine}"]
+    words = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
+    words += [
         "--dest",
         str(folder),
+        "--only-binary=:all:",
+        "--implementation",
+        "cp",
+        "--python-version",
+        kind.python,
     ]
-    words += ["--only-binary=:all:", "--implementation", "cp", "--python-version", kind.python]
     words += [word for platform in platforms for word in ("--platform", platform)]
     words += ["-c", str(limits)] if limits is not None else []
     download_s = 600.0

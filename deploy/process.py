@@ -1,7 +1,4 @@
-"""Supervised child processes: started, logged, restarted on a crash.
-
-They are stopped cleanly.
-"""
+"""Supervised child processes: started, logged, restarted on a crash, stopped."""
 
 import os
 import signal
@@ -19,8 +16,8 @@ _STOP_S = 20.0  # a master writes what it has; whoever cannot wait presses Ctrl-
 class Process:
     """One row of the process table: a command that is kept running until `stop`.
 
-    Holds the child, its last lines, and how often it was restarted. Its output goes to a log file and, line by
-    line, to `on_line`, which runs on a thread of its own.
+    Holds the child, its last lines, and how often it was restarted. Its output goes to a log file and, line
+    by line, to `on_line`, which runs on a thread of its own.
     """
 
     def __init__(
@@ -34,13 +31,8 @@ class Process:
     ) -> None:
         """Start the command.
 
-        Args:
-            name: For messages.
-            command: Program and arguments.
-            environment: Added to this process's own.
-            log: File that its output goes to, begun anew; a restarted child goes on in it.
-            on_line: Called with name and line.
-            nice: By how many steps of the scheduler's it gives way to others, 0..19.
+        `environment` is added to this process's own. `log` is begun anew, and a restarted child goes on in
+        it; `on_line` takes name and line; `nice` is by how many steps of the scheduler's it gives way, 0..19.
 
         Raises:
             OSError: The program or the log file cannot be opened.
@@ -61,10 +53,7 @@ class Process:
         return self._child.pid
 
     def check(self) -> int | None:
-        """Restart the process if it ended unexpectedly, and return the exit code.
-
-        None while it runs; after an unexpected end the exit code, and it has been started again.
-        """
+        """Restart the process if it ended unexpectedly; its exit code, None: it runs."""
         code = self._child.poll()
         if code is None or self._stopping:
             return None
@@ -77,10 +66,7 @@ class Process:
         return self._child.poll()
 
     def stop(self) -> int:
-        """Stop the process and return the exit code.
-
-        Ask it to end (SIGINT), insist after twenty seconds (SIGKILL).
-        """
+        """Ask it to end (SIGINT), insist after 20 s (SIGKILL); return the exit code."""
         self._stopping = True
         if self._child.poll() is None:
             self._child.send_signal(signal.SIGINT)
@@ -127,10 +113,7 @@ class Process:
 
 
 def _give_way(pid: int, nice: int) -> None:
-    """Lower the priority of a process that was just started and of all it starts.
-
-    They run after others that want to.
-    """
+    """Lower the priority of a process that was just started and of all it starts."""
     try:
         os.setpriority(os.PRIO_PROCESS, pid, min(os.getpriority(os.PRIO_PROCESS, 0) + nice, 19))
         # Linux may share its time among sessions first, and each child has one of its own (sched(7), autogroup).

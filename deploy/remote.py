@@ -1,12 +1,7 @@
 """Run commands and copy files on the hosts of a fleet.
 
-Assignment of machines to cameras.
-
-The hosts of a command line, read with the rig's file.
-
-Commands on another machine by ssh and folder transfer by rsync.
-
-Both come to an end, also when the network goes meanwhile.
+Hosts of a command line are assigned to the cameras of a rig's file. Commands go by ssh, files by rsync, and both come
+to an end, also when the network goes meanwhile.
 """
 
 import contextlib
@@ -27,10 +22,7 @@ _HOST = re.compile(r"(?:[A-Za-z0-9._-]+@)?[A-Za-z0-9.:-]+")
 
 
 class DeployError(Exception):
-    """Error for a deployment that is not possible.
-
-    The text is one line that states why, and what to do.
-    """
+    """A deployment that is not possible; one line why, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +77,8 @@ def read_rig(calibration: Path, name: str) -> RigFile:
 def targets_of(hosts: Sequence[str], rig: RigFile) -> list[Target]:
     """Parse `HOST` or `NAME[+NAME...]=HOST` of each host.
 
-    Hosts without a name take the rig's cameras in their order.
-
-    The IMU of a rig goes to the host of its first camera, unless it is named.
+    Hosts without a name take the rig's cameras in their order. The IMU of a rig goes to the host of its first
+    camera, unless it is named.
 
     Raises:
         DeployError: A name is none of the rig's, stands twice, or there are more hosts than cameras.
@@ -153,10 +144,7 @@ _HINTS = (  # the first that is found: a changed host key is reported with two o
 
 
 class Deadline:
-    """Time by which all must be done.
-
-    It holds that time, and whether somebody wanted an end before.
-    """
+    """Time by which all must be done, and whether somebody wanted an end before."""
 
     def __init__(self, seconds: float) -> None:
         """So many seconds from now."""
@@ -168,7 +156,7 @@ class Deadline:
         self.ended.set()
 
     def left_s(self) -> float:
-        """What is left of it.
+        """Return what is left [s].
 
         Raises:
             DeployError: Nothing.
@@ -183,13 +171,7 @@ class Deadline:
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """How one machine is reached.
-
-    Attributes:
-        host: HOST or USER@HOST.
-        options: Of ssh, as it takes them.
-        deadline: Of all that is done there.
-    """
+    """How one machine, HOST or USER@HOST, is reached, with options of ssh."""
 
     host: str
     options: tuple[str, ...]
@@ -198,9 +180,7 @@ class Remote:
     def run(
         self, command: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = 1e9
     ) -> int:
-        """Run a command on the other machine and return its exit code.
-
-        Gives it `send` as its input, and hands on each line it prints.
+        """Run a command there, with input `send`, and return its exit code.
 
         Raises:
             DeployError: The machine is not reached, the link broke, or the time is over.
@@ -220,21 +200,13 @@ class Remote:
         return code
 
     def send(self, files: Sequence[Path], to: str, sudo: bool) -> None:
-        """Send files to the folder `to` on the other machine.
-
-        What is already there of them, whole or in part, is not sent again.
+        """Send files to the folder `to` there, but for what is there, whole or in part.
 
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
         """
         stalled_s = 15
-        words = [
-            "rsync",
-            "--partial",
-            "--times",
-            "--mkpath",
-            f"--timeout={stalled_s}",
-        ]
+        words = ["rsync", "--partial", "--times", "--mkpath", f"--timeout={stalled_s}"]
         if sudo:
             words += ["--rsync-path", "sudo -n rsync"]
         words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{_bracketed(self.host)}:{to}/"]
@@ -258,17 +230,9 @@ def run_bounded(
     environment: Mapping[str, str] | None = None,
     ended: threading.Event | None = None,
 ) -> tuple[int | None, list[str]]:
-    """Run a command of this machine with a time limit.
+    """Run a command of this machine; return exit code and lines of its errors.
 
-    Returns its exit code and the lines of its errors. None: it was ended.
-
-    Args:
-        words: The command.
-        send: Its input.
-        on_line: Called with each line that it prints.
-        limit_s: After so many seconds it is ended, with all that it started.
-        environment: Variables besides those of this process.
-        ended: It is ended when this is set, too.
+    After `limit_s` [s], or when `ended` is set, it is ended with all that it started: None.
 
     Raises:
         DeployError: There is no such command.
@@ -325,15 +289,12 @@ def _lines(pipe: IO[bytes], on_line: Callable[[str], None]) -> None:
 
 
 def printable(text: str) -> str:
-    """The text with a question mark for each control character.
-
-    A device writes to the operator's terminal.
-    """
+    """The text with ? for control characters: a device writes to the user's terminal."""
     return "".join(c if c.isprintable() or c == "\t" else "?" for c in text)
 
 
 def _plain(errors: Sequence[str], host: str) -> str:
-    """Return the line that gives the reason, with what to do about it."""
+    """The line that gives the reason, with what to do about it."""
     text = "\n".join(errors)
     for sign, hint in _HINTS:
         if sign in text:

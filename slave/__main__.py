@@ -7,9 +7,7 @@ from slave.cli.table import PROGRAM
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code.
-
-    0 done, 1 something the user can mend, 2 wrong usage, 130 interrupted.
+    """Run one command: 0 done, 1 a user can mend it, 2 wrong usage, 130 interrupted.
 
     Raises:
         SystemExit: With code 70, if a thread or the command itself failed.

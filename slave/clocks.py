@@ -1,21 +1,17 @@
 """Bring time stamps of devices to the slave's clock.
 
-A driver of a camera stamps its frames on a clock of its own choice: monotonic, since boot, or the wall clock. Two
-clocks are compared by reading the slave's clock, then the other one, then the slave's again (`ForeignClock`): the other
-was read in between, so the difference is known to half the width of that sandwich, a microsecond or less. It is
-measured anew for every frame, and a wide sandwich (the process was interrupted) is read again. A wall clock may be
-stepped by NTP between the moment of the stamp and that of the reading. Such a frame could be converted with the
-difference before or after the step; the right one is that which leaves the frame as old at its hand-over as its
-predecessors were. So a step moves no `t_ns`.
+A camera driver stamps on a clock of its own choice, which can be read: `ForeignClock` reads it between two readings
+of the slave's clock, so that the difference is known to half the width of that sandwich, a microsecond or less; a
+wide one (the process was interrupted) is read again. A wall clock may be stepped by NTP between stamp and reading: of
+the differences before and after the step the one is right that leaves the frame as old at its hand-over as the frames
+before it. So a step moves no `t_ns`.
 
-The clock of an IMU or of a tracking program cannot be read; nothing is known but when its stamps arrived
-(`DeviceClock`). Whatever lies between the sensor's clock and the moment its bytes are read (its buffer, the bus, the
-kernel, a busy machine) only ever delays. So the lags, arrival minus stamp, lie above a line, which is the offset of the
-two clocks plus the least delay, and the line that touches them from below with the least area between is the best one:
-the edge of their lower convex hull over the mean stamp (Moon, Skelly & Towsley, "Estimation and removal of clock skew
-from network delay measurements", INFOCOM 1999). Its slope is the rate of the two clocks, its height the offset. Jitter
-of arrivals, and samples that come in bunches, move neither. What no one-way measurement can see is the least delay
-itself; `least_delay_ns` is what is known of it.
+The clock of an IMU or of a tracking program cannot be read; only the arrival of its stamps is known (`DeviceClock`).
+Buffer, bus, kernel and a busy machine only ever delay, so the lags, arrival minus stamp, lie above a line: offset of
+the two clocks plus the least delay. The line below them with the least area between is the edge of their lower convex
+hull over the mean stamp (Moon, Skelly & Towsley, "Estimation and removal of clock skew from network delay
+measurements", INFOCOM 1999). Its slope is the rate of the clocks, its height the offset; jitter and bunches of
+samples move neither. The least delay itself no one-way measurement can see; `least_delay_ns` is what is known of it.
 """
 
 import time
@@ -37,14 +33,9 @@ CLOCKS: dict[str, int] = {
 
 
 class ForeignClock:
-    """Converts the stamps of one driver.
-
-    Holds the last difference between the clocks and how well it was read, the age of the last frame when it was
-    converted, and in `steps` how often the foreign clock was set.
-    """
+    """Converts stamps of `read_ns` [ns] to `own`; `steps`: how often it was set."""
 
     def __init__(self, own: Clock, read_ns: Callable[[], int]) -> None:
-        """Convert to `own` from the clock that `read_ns` reads [ns]."""
         self._own = own
         self._read_ns = read_ns
         self._offset_ns: int | None = None
@@ -98,8 +89,8 @@ def system_clock(name: str) -> Callable[[], int]:
 def clock_of(stamp_ns: int) -> str | None:
     """Name of the clock that a stamp taken just now is on; None: no clock fits.
 
-    On a machine that never slept, monotonic and boot are the same and the first one is named. After a sleep of
-    more than the age of a frame only one of them makes the frame neither old nor from the future.
+    On a machine that never slept, monotonic and boot are the same, and the first is named; after a sleep only one of
+    them makes the frame neither old nor from the future.
     """
     for name in CLOCKS:
         if 0 <= system_clock(name)() - stamp_ns < OLDEST_NS:
@@ -116,18 +107,10 @@ class ClockSteppedError(Exception):
 
 
 class DeviceClock:
-    """Push machine that fits offset and rate of a sensor's clock.
-
-    Holds the least lag of each half second of the last minute, and the line below them.
-    """
+    """Fit of offset and rate of a sensor's clock over the last minute of stamps."""
 
     def __init__(self, rate_error: float, least_delay_ns: int = 0) -> None:
-        """Begin without any stamp.
-
-        Args:
-            rate_error: How much faster or slower than the slave's clock the sensor's can be.
-            least_delay_ns: How long the fastest sample is on its way [ns], as far as known.
-        """
+        """Clocks differ by at most the share `rate_error`; no sample is faster [ns]."""
         self._rate_error, self._least_delay_ns = rate_error, least_delay_ns
         # A minute of buckets: a crystal's rate changes by less than 1 ppm in that time
         self._least: deque[tuple[int, int]] = deque(maxlen=120)  # stamp, lag [ns]
@@ -138,16 +121,10 @@ class DeviceClock:
         self._suspects = 0
 
     def observe(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Learn from one stamp.
+        """Take one stamp [ns], and a time at which it had already been received [ns].
 
-        Of stamps that came together all are learned from before the first becomes a time.
-
-        Args:
-            stamp_ns: The sensor's time stamp, later than the last one [ns].
-            arrival_ns: A time at which that stamp had already been received, slave's clock [ns].
-
-        Returns:
-            Whether it can be: it is not older than the last, and not from the future.
+        Of stamps that came together all are observed before the first becomes a time. False for a stamp that cannot
+        be: not later than the last one, or from the future.
 
         Raises:
             ClockSteppedError: Impossible stamps came one after another.

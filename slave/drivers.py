@@ -1,13 +1,4 @@
-"""Name the drivers and the engines that options choose from.
-
-Names of the drivers as the help and the errors list them.
-
-They are those behind `--camera`, `--imu`, `--tracker` and `--lights`.
-
-Engines of the inner loops.
-
-OpenCV and numpy, or machine code that does the same. The engine is chosen by name alone.
-"""
+"""Name the drivers and the engines that options choose from."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -35,12 +26,7 @@ _Engine = TypeVar("_Engine")
 
 
 def engine_of(name: str, numpy: _Engine, numba: Callable[[], _Engine]) -> _Engine:
-    """The engine of a name of `ENGINES`.
-
-    Args:
-        name: What the user chose.
-        numpy: The engine that is always there.
-        numba: Loads the other one: an optional package, which only who asks for it loads.
+    """The engine `name`; `numba` loads the optional one, `numpy` is always there.
 
     Raises:
         PhalanxError: numba is asked for and not installed; the message states how to install it.

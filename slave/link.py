@@ -1,18 +1,16 @@
-"""The slave's side of the datagram link.
-
-It runs from the first beacon to data, as a push machine.
+"""The slave's side of the datagram link, from the first beacon to data.
 
 `common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
-- While the master of the session is received, beacons of any other life are ignored: an old one
-  replayed cannot end a live session, and two masters do not tear a slave apart.
+- While the master of the session is received, beacons of any other life are ignored: an old one replayed cannot end a
+  live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
-  this device; the session changes only then. Who only has the rig key ends none. Unanswered for `NONCE_NS` it goes on
-  with another nonce: the master takes none twice, and may have rejected that one as a duplicate sender's or a replay.
+  this device; only then the session changes. Who only has the rig key ends none. Unanswered for two seconds it goes on
+  with another nonce: the master takes none twice, and may have rejected that one as a duplicate's or a replay.
 - A session that the master's beacons do not list for a second is lost to it: send a hello again.
-- Whoever is not welcomed though the beacons list its name has a duplicate. It keeps sending hello: it is accepted as
-  soon as the other one is silent.
-- To a beacon of its rig in another wire version it sends a hello in its own, once a second: the master cannot take it,
-  and can identify the sender.
+- Whoever is not welcomed though the beacons list its name has a duplicate. It goes on sending hello, and is accepted
+  as soon as the other one is silent.
+- To a beacon of its rig in another wire version it sends a hello in its own, once a second: the master cannot take
+  it, and can identify the sender.
 """
 
 from collections import Counter
@@ -94,8 +92,6 @@ class _Offer:
 
 @dataclass(slots=True)
 class _Session:
-    """The session that is."""
-
     master_nonce: bytes
     slave_nonce: bytes
     beacon_counter: int  # of the newest beacon: an older one may not list this session
@@ -110,19 +106,10 @@ class _Session:
 
 
 class SlaveLink:
-    """Push machine that takes beacons and datagrams and seals outgoing ones.
-
-    It also states what to send by itself.
-
-    Holds the session, the offer under way, and the counters.
-    """
+    """State machine of the link: takes datagrams, and states which to send."""
 
     def __init__(self, name: str, key: LinkKey | bytes, clock: Clock, random: Random) -> None:
-        """Begin a new life of the slave `name`, with an id from `random`.
-
-        Raises:
-            ValueError: Key of wrong length.
-        """
+        """Begin a new life of the slave `name`; `ValueError`: key of wrong length."""
         self._name = name
         self._keys = RigKeys(key)
         self._clock = clock
@@ -138,24 +125,21 @@ class SlaveLink:
 
     @property
     def wrong(self) -> str | None:
-        """Return why no master accepts this slave, where that is known.
-
-        A duplicate sender, another wire version, another secret.
-        """
+        """Why no master accepts this slave, if known: duplicate, wire version, secret."""
         lately_ns = 2_500_000_000  # so long after it was last seen something is reported as wrong
         if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < lately_ns:
             return None
         return self._wrong[1]
 
     def state(self, t_ns: int) -> State:
-        """Return how far the session with a master is at `t_ns`, on this slave's clock."""
+        """State of the handshake at `t_ns`, on this slave's clock."""
         if self._session is None:
             return State.IDLE if self._offer is None else State.OFFERED
         return State.LIVE if t_ns - self._session.received_ns < WELL_NS else State.SILENT
 
     @property
     def started(self) -> bool:
-        """Return whether the master has sent start and is still there."""
+        """Whether the master has sent start and is still there."""
         session = self._session
         if session is None or session.start_t_ns is None:
             return False
@@ -163,18 +147,12 @@ class SlaveLink:
 
     @property
     def start_t_ns(self) -> int | None:
-        """Return when to begin [ns], on this slave's clock.
-
-        None before the start of this session.
-        """
+        """When to begin [ns], on this slave's clock; None before the start."""
         return None if self._session is None else self._session.start_t_ns
 
     @property
     def zenoh_endpoint(self) -> str | None:
-        """Where the bus of the session's master listens; None without session or bus.
-
-        Of a master that listens everywhere it is the address that its beacon came from.
-        """
+        """Where the master's bus listens, as this slave reaches it; None without one."""
         return None if self._session is None else self._session.zenoh_endpoint
 
     def receive_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
@@ -196,18 +174,14 @@ class SlaveLink:
             self._count(Refusal.UNEXPECTED)
 
     def seal(self, message: Message) -> tuple[bytes, Address] | None:
-        """Return `message` as a datagram and its destination, or None while not started.
-
-        Raises:
-            ValueError: The message does not fit into a datagram.
-        """
+        """`message` as a datagram, if it fits, and its address; None while not started."""
         session = self._session
         if session is None or not self.started:
             return None
         return session.sealer.seal(Kind.DATA, encode(message)), session.address
 
     def due(self) -> list[tuple[bytes, Address]]:
-        """Return the datagrams to send now, each with its destination."""
+        """The datagrams to send now, each with its destination."""
         t_ns = self._clock.now_ns()
         offer = self._offer
         # A clock that was set back is no reason to be silent until it is there again.
@@ -277,7 +251,7 @@ class SlaveLink:
         self._send_hello(self._offer, t_ns)
 
     def _has_duplicate(self, beacon: Beacon, t_ns: int) -> Refusal | None:
-        """Return a refusal if the master only reports a sender of the same name."""
+        """Refusal if the master lists another process of this name."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
         # unanswered for so long while the beacons list the name: another process has it
@@ -292,11 +266,7 @@ class SlaveLink:
         return Refusal.DUPLICATE_SENDER
 
     def _answer_other_version(self, datagram: bytes, address: Address, t_ns: int) -> None:
-        """Send this slave's identity to a master of another wire version.
-
-        The master is of this rig and cannot understand this slave; its word is not proven, so the answer is sent
-        seldom.
-        """
+        """Send, seldom, who this is to a master of its rig with another wire version."""
         if len(datagram) < OVERHEAD:
             return
         _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)
@@ -343,7 +313,7 @@ class SlaveLink:
         return None
 
     def _welcome_event(self, welcome: Welcome, offer: _Offer | None) -> tuple[Event, SessionKeys | None]:
-        """Return what a welcome is, and the keys of its session if it is a proven one."""
+        """What a welcome is, and the keys of its session if it is a proven one."""
         if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
             return Event.WELCOME_AGAIN, None
         if offer is None or welcome.slave_nonce != offer.slave_nonce:
@@ -356,10 +326,7 @@ class SlaveLink:
         return Event.WELCOME, keys
 
     def _on_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        """Take the master's unproven reason why there is no welcome.
-
-        It changes nothing here: whoever has the rig key can send it.
-        """
+        """Keep why there is no welcome; whoever has the rig key can send it."""
         unproven = self._keys.open_as(header, datagram, Unproven)
         if isinstance(unproven, Refusal):
             return unproven

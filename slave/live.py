@@ -1,14 +1,6 @@
-"""Send what a camera shows, with what its picture says of light and colours.
+"""Send what a camera shows: detector, settings, previews and light around it.
 
-Marker colour from a click on the picture of a running slave.
-
-It finds the frame, the light and the other colours.
-
-Report of how the light affects the colours.
-
-Counts, metrics, and a log line before it costs a marker.
-
-Send what a camera shows: detector, settings and previews around it.
+A device that is gone raises `CameraError`; a wrist device that is not calibrated `CalibrationError`.
 """
 
 import logging
@@ -52,32 +44,19 @@ from slave.wrist.engine import Engine as WristEngine
 
 
 class ColourSampler:
-    """Holds what was picked since the start. Its callers take turns."""
+    """Samples marker colours from clicks. Its callers take turns."""
 
     def __init__(
         self, detector: ReloadableDetector, shown: Callable[[int], Frame | None], markers: tuple[str, ...]
     ) -> None:
-        """Pick colours of `markers`, those of the rig.
-
-        Args:
-            detector: Has the newest frame, and knows the light.
-            shown: Time of a preview [ns] -> its frame, if that is still there.
-            markers: Others in a camera file belong to other rigs, and collide with nothing here.
-        """
+        """Pick the rig's `markers`; `shown` has the frame of a preview's time [ns]."""
         self._detector, self._shown, self._markers = detector, shown, markers
         self._picked = SampledColours()
 
     def pick(
         self, wish: ColourPick, camera: CameraCalibration
     ) -> tuple[CameraCalibration, Mapping[str, float]]:
-        """Return the camera file with the colour at the clicked position.
-
-        Also returns how many pixels it has, and what its range holds.
-
-        Raises:
-            CameraError: No frame was read yet.
-            FitError: As `SampledColours.sample`.
-        """
+        """The camera file with the clicked colour; its pixels and what its range holds."""
         every = camera.markers or {}
         ranges = {name: every[name] for name in self._markers if name in every}
         light = self._detector.log_gains
@@ -107,11 +86,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class LightReport:
-    """Counts warnings and logs them, and adds the light to what `others` report.
-
-    Holds the subjects warned of in the last frame, how often each was, and when each was last logged. The loop
-    writes, the health thread reads.
-    """
+    """Counts and logs how the light affects colours; adds it to what `others` report."""
 
     def __init__(
         self,
@@ -121,14 +96,13 @@ class LightReport:
         markers: tuple[str, ...],
         show: Callable[[Frame], None] = lambda _frame: None,
     ) -> None:
-        """Report on the `detector` of camera `name`; every frame is handed on to `show`."""
         self._name, self._detector, self._others, self._show = name, detector, others, show
         self._warned = dict.fromkeys((ALL, *markers), 0)
         self._now: set[str] = set()
         self._logged_ns: dict[str, int] = {}
 
     def offer(self, frame: Frame) -> None:
-        """Take note after a frame, and hand it on."""
+        """Take note of the warnings after a frame, and hand it on."""
         self._show(frame)
         warnings = self._detector.warnings
         if not warnings and not self._now:
@@ -145,22 +119,13 @@ class LightReport:
                 _LOG.warning("%s: %s", self._name, warning.text)
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of the other reports and of the light.
-
-        The light's are warnings.light, warnings.<marker>, refused.light, colour_tables.
-        """
+        """Those of the others; warnings.light, warnings.<marker>, refused.light, ..."""
         warned = {f"warnings.{subject}": count for subject, count in self._warned.items()}
         own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
         return {**self._others.counts(), **warned, **own}
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics of the other reports and of the light.
-
-        While the light is followed, its metrics compare it with calibration.
-
-        That is red and blue relative to green, and green. Of markers that look alike
-        alike.<one>..<other>, the hues between them.
-        """
+        """Those of the others; light_red, light_blue by green; alike.<one>..<other>."""
         if not self._detector.adapts:
             return dict(self._others.metrics())
         blue, green, red = np.exp(self._detector.log_gains).tolist()
@@ -184,7 +149,6 @@ NO_COLOUR = (
     "{}: markers: no colour for {} yet, which cannot be seen: pick them in the console, or calibrate them with "
     "`phalanx-slave colours`"
 )
-_LIVE_LOG = logging.getLogger(__name__)
 
 
 def send_detections(
@@ -198,18 +162,8 @@ def send_detections(
 ) -> None:
     """Detect in the frames of a camera and send until stopped.
 
-    Args:
-        sender: The process; its name is that of the camera.
-        files: The camera's file and the rig's; monitored for changes.
-        source: The open camera.
-        colours: Whether those of markers follow the light, stay fixed, or nothing is detected at all.
-        scan: Whether whole frames are scanned for markers, or windows (`scan_choice`).
-        engine: What scans and measures for markers, or what does the inner loops before a wrist device.
-        raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
-
-    Raises:
-        CalibrationError: Something of a wrist device is not calibrated.
-        CameraError: The camera is gone.
+    `colours`: those of markers follow the light, stay fixed, or nothing is detected; `scan` as of `ScanChoice`;
+    `engine` is that of markers or of a wrist device; `raw_frames`: where raw frames go when somebody asks for them.
     """
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{sender.name} colours")
     raw = RawFrames(
@@ -233,15 +187,7 @@ def send_detections(
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """What a slave does with its frames.
-
-    Attributes:
-        pipeline: Detects in a frame and sends.
-        previews: Shows them.
-        prepare: How changed files reach it; None: it uses none of them.
-        sample: Makes a colour of a click; None: it uses none.
-        reported: What the reports have in place of the counters; None: those.
-    """
+    """What a slave does with its frames; None: not at all, or as usual."""
 
     pipeline: MarkerPipeline | WristPipeline
     previews: Previews
@@ -327,7 +273,6 @@ def _tag_changes(tags: LiveTags) -> Prepare:
 
 
 def _both(first: Prepare, second: Prepare) -> Prepare:
-    """What two that use the same files make of a change."""
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         switches = [made for one in (first, second) if (made := one(old, new)) is not None]
@@ -344,7 +289,6 @@ def _both(first: Prepare, second: Prepare) -> Prepare:
 
 
 def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
-    """Return what `Health` reports of markers without a colour."""
     return {"uncalibrated": int(bool(missing))} | {f"uncalibrated.{name}": 1 for name in missing}
 
 
@@ -355,11 +299,11 @@ def _maker(
 
     def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:
-            _LIVE_LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
+            _LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
             return CalibratedDetector(camera, rig.markers, engine, rig.free_markers)
         if colours == "follow":
             if not can_adapt(camera, rig.markers):
-                _LIVE_LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
+                _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
             return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
         return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
 

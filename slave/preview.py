@@ -1,23 +1,9 @@
 """Send small JPEGs of the camera, with the detections drawn over them.
 
-Overlay of the detections on a preview image.
-
-Pixels in the range of a marker are tinted, detections are marked by crosses.
-
-It is drawn on the thread of the previews, while somebody asks for it; the loop does nothing for it but keep what it
-found in its last frames.
-
-Preview images of the camera as small JPEGs.
-
-At most 10 Hz, and nothing at all when there was no recent request.
-
-The loop only offers its frames: one comparison when nobody looks, otherwise a reference is left behind ten times
-a second. A thread of its own shrinks, encodes and publishes; while it is busy the newest frame replaces the
-waiting one, so a slow bus costs pictures and never a measurement. A *still*, one whole frame on request, goes the
-same way: cameras are calibrated from stills.
-
-Who looks may wish to see which pixels are in the range of a marker, and what was found: that is drawn on the same
-thread. Of several who look, each sees what all have wished for in the last three seconds.
+At most 10 Hz, and nothing without a recent request: the loop only offers its frames. A thread of its own shrinks,
+draws, encodes and publishes; while it is busy the newest frame replaces the waiting one, so a slow bus costs pictures
+and never a measurement. A *still*, one whole frame on request, goes the same way: cameras are calibrated from stills.
+Of several who look, each sees what all have wished for in the last three seconds.
 """
 
 import logging
@@ -48,13 +34,9 @@ LASER, TIP = (60, 60, 255), (80, 255, 80)
 
 
 class MarkerOverlay:
-    """Overlay of a camera that looks for markers, by the detector in use.
-
-    Has no state of its own.
-    """
+    """Overlay of a camera that looks for markers, by the detector in use."""
 
     def __init__(self, detector: ReloadableDetector, markers: tuple[str, ...]) -> None:
-        """Draw what `detector` finds of the rig's `markers`."""
         self._detector, self._markers = detector, markers
 
     @property
@@ -63,15 +45,9 @@ class MarkerOverlay:
         return self._markers
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Return a new image (h, w, 3) with tinted markers and crosses at centroids.
+        """New image of `small`, (h, w, 3) or (h, w), with tinted markers and crosses.
 
         Tinted by the colour table in use, which follows the light.
-
-        Args:
-            small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
-            frame: The frame itself.
-            mask: Markers to tint.
-            found: Whether to cross what was found in that frame.
         """
         drawn, plain = small.copy(), self._detector.plain
         if mask and plain is not None:
@@ -86,10 +62,9 @@ class MarkerOverlay:
 
 
 class WristOverlay:
-    """Overlay of the camera of a wrist device. Holds nothing of its own."""
+    """Overlay of the camera of a wrist device."""
 
     def __init__(self, detector: WristDetector) -> None:
-        """Draw what `detector` finds."""
         self._detector = detector
 
     @property
@@ -98,10 +73,7 @@ class WristOverlay:
         return ()
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Return a new image with crosses at laser points (red) and tips (green).
-
-        As of `MarkerOverlay`.
-        """
+        """New image with crosses at laser points (red) and tips (green)."""
         del mask
         drawn = (
             np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8) if small.ndim == 2 else small.copy()
@@ -113,10 +85,7 @@ class WristOverlay:
 
 
 def contrast_of(colour: HsvRange) -> tuple[int, int, int]:
-    """Return the tint (BGR) for the pixels of a marker colour.
-
-    It is the hue across the circle from the middle of its range.
-    """
+    """Tint (BGR) for the pixels of a marker colour: the hue opposite its middle."""
     low, high = colour.hsv_low[0], colour.hsv_high[0]
     middle = low + (high - low) % HUES // 2
     pixel = np.array([[[(middle + HUES // 2) % HUES, 255, 255]]], np.uint8)
@@ -125,10 +94,7 @@ def contrast_of(colour: HsvRange) -> tuple[int, int, int]:
 
 
 def _tint(drawn: Image, inside: Mapping[str, np.ndarray], ranges: Mapping[str, HsvRange]) -> None:
-    """Tint the pixels (h, w) of each marker, in place.
-
-    Those of several markers are white; a dark rim sets each area off.
-    """
+    """Tint the pixels (h, w) of each marker, in place; a dark rim sets each off."""
     count = np.zeros(drawn.shape[:2], np.uint8)
     for name, where in inside.items():
         tint = np.array(contrast_of(ranges[name]), np.float64)
@@ -140,10 +106,7 @@ def _tint(drawn: Image, inside: Mapping[str, np.ndarray], ranges: Mapping[str, H
 
 
 def _cross(drawn: Image, uv: Float, whole: Image, colour: tuple[int, int, int]) -> None:
-    """Draw upright crosses at uv (K, 2) [px of the whole image], in place.
-
-    NaN: none. Dark below, so that they show.
-    """
+    """Draw upright crosses at uv (K, 2) [px of the whole image], in place; NaN: none."""
     scale = np.array([drawn.shape[1] / whole.shape[1], drawn.shape[0] / whole.shape[0]])
     near, far = ARM_PX
     for u, v in np.rint((uv[np.isfinite(uv).all(axis=1)] + 0.5) * scale - 0.5).astype(int).tolist():
@@ -161,15 +124,9 @@ _LOG = logging.getLogger(__name__)
 
 
 class Gate:
-    """Gate that decides which frames are shown.
-
-    At least 100 ms apart, until 3 s after the last request.
-
-    Holds the end of the looking and the earliest time of the next frame.
-    """
+    """Decides which frames are shown: 100 ms apart, until 3 s after a request."""
 
     def __init__(self) -> None:
-        """Nobody looks yet."""
         never_ns = -(2**63)
         self._end_ns = never_ns
         self._next_ns = never_ns
@@ -180,33 +137,19 @@ class Gate:
 
     def wants(self, t_ns: int) -> bool:
         """Whether the frame taken at `t_ns` [ns] is to be shown; a yes counts as shown."""
-        if t_ns > self._end_ns:
-            return False
-        if t_ns < self._next_ns:
+        if t_ns > self._end_ns or t_ns < self._next_ns:
             return False
         self._next_ns = t_ns + PERIOD_NS
         return True
 
 
 class Previews:
-    """Publisher of the previews of one camera.
-
-    On stream "preview" while somebody looks, and on "still" when one is asked for.
-
-    Holds the gate, what is wished to be drawn, the newest frames that wait, those shown last, the bus while there is
-    one, and how many pictures went out.
-    """
+    """Publisher of the previews of one camera, on streams "preview" and "still"."""
 
     def __init__(
         self, camera: str, clock: Clock, overlay: MarkerOverlay | WristOverlay | None = None
     ) -> None:
-        """Start the thread; nothing is published before `use` and `ask`.
-
-        Args:
-            camera: Name of the camera.
-            clock: Clock of the frames' times.
-            overlay: Draws what is wished for; None: nothing is sought, so there is nothing to draw.
-        """
+        """Start the thread; nothing is published before `use` and `ask`."""
         self._camera, self._overlay = camera, overlay
         self._wishes: dict[str, int] = {}  # what -> until when [ns]
         # The last second, for a click on one of them
@@ -226,13 +169,7 @@ class Previews:
         self._thread.start()
 
     def ask(self, body: str = "") -> None:
-        """Show the camera for the next 3 s because somebody looks.
-
-        With what the body, a `PreviewWish`, asks for. Never waits.
-
-        Raises:
-            CalibrationError: The body is none, or names a marker that is not sought.
-        """
+        """Show the camera for 3 s, as a `PreviewWish` asks; else `CalibrationError`."""
         wish = PreviewWish.of(body)
         known = () if self._overlay is None else self._overlay.markers
         if strange := [name for name in wish.mask if name not in known]:
@@ -246,10 +183,7 @@ class Previews:
         self._gate.ask(now_ns)
 
     def shown(self, t_ns: int) -> Frame | None:
-        """Return the frame of that time [ns] if it was shown within the last second.
-
-        From any thread.
-        """
+        """The frame of that time [ns] if it was shown within the last second."""
         return next((frame for frame in tuple(self._shown) if frame.t_ns == t_ns), None)
 
     def ask_still(self) -> None:
@@ -267,10 +201,7 @@ class Previews:
             self._wake.set()
 
     def use(self, bus: Bus | None) -> None:
-        """Publish on `bus` from now on, or on none.
-
-        Waits until the present image is out.
-        """
+        """Publish on `bus` from now on, or on none; waits until the present image is out."""
         with self._lock:
             self._bus = bus
 
@@ -328,12 +259,7 @@ class Previews:
 
 
 def whole_jpeg(image: Image) -> bytes | None:
-    """Return a JPEG file of `image` in its full size.
-
-    `image` is (H, W, 3) BGR or (H, W) grey; the quality is as good as fits into a message.
-
-    None: not even the worst does, which are tens of megapixels, or noise.
-    """
+    """JPEG of `image`, (H, W, 3) or (H, W), as good as fits a message, or None."""
     for quality in STILL_QUALITIES:
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(data) <= MAX_STILL_BYTES:
@@ -342,10 +268,7 @@ def whole_jpeg(image: Image) -> bytes | None:
 
 
 def small_jpeg(image: Image) -> bytes:
-    """Return a JPEG file of `image` at half its width and height.
-
-    `image` is (H, W, 3) BGR or (H, W) grey; it is smaller still if it must be.
-    """
+    """JPEG of `image`, (H, W, 3) BGR or (H, W) grey, at half its size or less."""
     return _within(_half(image))
 
 

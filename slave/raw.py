@@ -1,6 +1,4 @@
-"""Recording of raw frames to disk while the slave goes on detecting.
-
-Begun and ended by commands on the bus.
+"""Record raw frames to disk while the slave goes on detecting.
 
     raw         begin a recording of raw frames (body: `common.messages.command_bodies.RawWish`), or ask for it to go on
     raw_stop    end it; the answer comes when every frame that waited is written
@@ -36,24 +34,15 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RawSettings:
-    """Where raw frames go.
+    """Where raw frames go."""
 
-    Attributes:
-        folder: Where each recording is a folder.
-        reserve_bytes: Stays free on its disk.
-        skewed: How the slave's clock differs from the machine's; empty: it is the machine's.
-    """
-
-    folder: Path
-    reserve_bytes: int = RESERVE_BYTES
-    skewed: str = ""
+    folder: Path  # where each recording is a folder
+    reserve_bytes: int = RESERVE_BYTES  # stays free on its disk
+    skewed: str = ""  # how the slave's clock differs from the machine's; empty: it is the machine's
 
 
 class RawFrames:
-    """Answers "raw" and "raw_stop", and counts, for `slave.report.Reporter`.
-
-    Holds the recorder while there is one, that of the last recording for its counts, and how often one ended by itself.
-    """
+    """Answers "raw" and "raw_stop", and counts, for `slave.report.Reporter`."""
 
     def __init__(
         self,
@@ -64,16 +53,7 @@ class RawFrames:
         here: Callable[[], bool],
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
-        """Nothing is recorded yet.
-
-        Args:
-            camera: Name of the camera.
-            settings: Where to; None: nowhere, and both commands are refused.
-            files: The files in use; whatever is recorded carries them.
-            clock: Clock of the frames' times.
-            here: Whether there is a master.
-            free_bytes: What is free on the disk of a folder.
-        """
+        """Record nothing yet; without `settings` both commands are refused."""
         self._camera, self._settings, self._files, self._clock = camera, settings, files, clock
         self._here, self._free = here, free_bytes
         self._command_lock = threading.Lock()  # of commands, and of whoever looks
@@ -89,37 +69,32 @@ class RawFrames:
         self._probe: RawProbe | None = None
 
     def reading(self, source: FrameSource) -> FrameSource:
-        """Return the camera for the loop, all of whose frames are offered.
-
-        Without a folder, the camera itself.
-        """
+        """The camera for the loop, all of whose frames are offered."""
         if self._settings is None:
             return source
         self._probe = RawProbe(source, self.offer)
         return self._probe
 
     def offer(self, frame: Frame) -> None:
-        """Take a frame while something is recorded.
-
-        Called by the loop. Never waits, never raises.
-        """
-        if self._recorder is None:
+        """Take a frame while something is recorded. Never waits, never raises."""
+        idle = self._recorder is None
+        if idle:
             return
         with self._lock:
-            self._hand_over(frame, self._recorder)
+            recorder = self._recorder
+            if recorder is None or self._fault is not None:  # ended meanwhile, or about to be
+                return
+            try:
+                recorder.offer(frame)
+            except RecordingError as error:
+                self._fault = error
 
     def commands(self) -> dict[str, Callable[[str], dict[str, float]]]:
-        """Return the handler of each command verb.
-
-        Each takes the body and returns the metrics of the answer. Each may raise `PhalanxError`.
-        """
+        """Verb -> handler: takes the body, returns metrics, may raise `PhalanxError`."""
         return {"raw": self._raw, "raw_stop": self._raw_stop}
 
     def counts(self) -> dict[str, int]:
-        """Return the counts `raw.frames`, `raw.dropped` and `raw.ended`.
-
-        The first two are of the present recording, or the last one; `raw.ended` is how many ended by a fault.
-        """
+        """`raw.frames`, `raw.dropped` of the last recording; `raw.ended` by a fault."""
         if self._settings is None:
             return {}
         now = None if (last := self._last) is None else last.progress()
@@ -127,28 +102,19 @@ class RawFrames:
         return {"raw.frames": frames, "raw.dropped": dropped, "raw.ended": self._ended}
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics `raw.megabytes` and `raw.on`.
-
-        `raw.megabytes` is of the same recording; `raw.on`: whether frames are taken now.
-        """
+        """`raw.megabytes` of the last recording; `raw.on`: whether frames are taken now."""
         if self._settings is None:
             return {}
         written = 0 if (last := self._last) is None else last.progress().written_bytes
         return {"raw.megabytes": round(written * 1e-6, 3), "raw.on": float(self._recorder is not None)}
 
     def look(self) -> None:
-        """End recordings that failed, are unwanted, or have lost their master.
-
-        Called once a period. Unwanted: nobody asks for it any more.
-        """
+        """End a recording that failed, is unwanted, or has lost its master."""
         with self._command_lock:
             self._look()
 
     def close(self) -> None:
-        """End the recording because the slave ends, with the last frame that was read.
-
-        Safe to call twice.
-        """
+        """End the recording with the last frame that was read. Safe to call twice."""
         if self._probe is not None:
             self._probe.flush()
         with self._command_lock:
@@ -180,14 +146,6 @@ class RawFrames:
             self._end("raw_stop")
             self._join()
         return self.metrics()
-
-    def _hand_over(self, frame: Frame, recorder: Recorder | None) -> None:
-        if recorder is None or self._fault is not None:  # ended meanwhile, or about to be
-            return
-        try:
-            recorder.offer(frame)
-        except RecordingError as error:
-            self._fault = error
 
     def _wanted(self, verb: str) -> RawSettings:
         if self._settings is None:
@@ -254,10 +212,7 @@ class RawFrames:
             self._end("the master is gone")
 
     def _end(self, why: str) -> None:
-        """Stop taking frames and write what waits in a separate thread.
-
-        This thread has reports to send.
-        """
+        """Stop taking frames; a thread of its own writes what waits."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
         if recorder is None:
@@ -278,12 +233,7 @@ class RawFrames:
 
 
 class RawProbe:
-    """Camera that offers all of its frames to a recipient.
-
-    Each is offered when the loop comes back for the next one.
-
-    Holds the frame that the loop is at.
-    """
+    """Camera that offers each frame when the loop comes back for the next one."""
 
     def __init__(self, source: FrameSource, offer: Callable[[Frame], None]) -> None:
         self._source, self._offer = source, offer
@@ -296,10 +246,7 @@ class RawProbe:
         return self._last
 
     def flush(self) -> None:
-        """Offer the frame that the loop is at.
-
-        Called once the loop has ended, by whoever ended it.
-        """
+        """Offer the frame that the loop is at; called once the loop has ended."""
         last, self._last = self._last, None
         if last is not None:
             self._offer(last)

@@ -1,24 +1,13 @@
 """Reconnect a device that was unplugged, without restarting the slave.
 
-Reconnect a device that was unplugged, without restarting the slave.
+An error at the first opening is an error. Later, losing the device, whatever its driver raises, is an event: the
+driver is closed, and opened again after 0.2 s, 0.4 s ... with all settings, until the device is there or the slave
+ends. `seq` goes on behind a gap of as many items as fit into the absence. Only that several devices are there and
+none was selected goes on to the user.
 
-An error at the first opening is an error. Later, losing the device is an event: its driver is closed, and opened again
-after 0.2 s, 0.4 s ... until the device is there or the slave ends. Every opening asks who is there and writes all
-settings again. `seq` goes on behind a gap of as many items as fit into the absence, so that they count as dropped.
-
-Whatever a driver raises, also what is no error of ours, is a loss of its device. Only that several devices are there
-and none was selected is mended by no waiting: that error goes on to the user.
-
-Reconnect a camera that was lost, or that repeats one picture.
-
-Some cameras send one picture, or a few in turn, again and again with new stamps. Two pictures of a real sensor are
-never equal: of a million pixels the noise of reading changes many. So a picture that
-equals the one before, byte by byte, was not measured again. Nor was one that equals an earlier one, as where a driver
-hands the same buffers round: of those not the pictures are kept but check sums. Only a real camera can be judged so: a
-simulated scene without noise, or a recording, may well repeat itself.
-
-A picture without contrast is no evidence: behind a cap, or fully exposed, all values may be cut off at black or white.
-There is nothing to find in it either.
+Some cameras send one picture, or a few in turn, again and again with new stamps. The noise of reading a real sensor
+makes no two pictures equal, so one that equals an earlier one, byte by byte or by its check sum, was not measured
+again. A picture without contrast (a cap, full exposure) is no evidence; nor is a simulated scene or a recording.
 """
 
 import threading
@@ -45,22 +34,14 @@ ItemT = TypeVar("ItemT", Frame, ImuSample, TrackerPose)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backoff:
-    """How long to wait between two tries to open a device: twice as long each time.
-
-    Attributes:
-        first_s: The first wait [s].
-        longest_s: No wait is longer [s]: what is plugged in again tracks within two seconds.
-    """
+    """Waits between tries to open a device, twice as long each time."""
 
     first_s: float = 0.2
     longest_s: float = 1.0
 
 
 class ReconnectingDriver(Generic[ItemT]):
-    """A driver around one whose device can be lost.
-
-    Holds the open driver, if there is one, number and time of the last item, since when the device is away, and counts.
-    """
+    """A driver around one whose device can be lost."""
 
     def __init__(
         self,
@@ -74,20 +55,15 @@ class ReconnectingDriver(Generic[ItemT]):
         backoff: Backoff | None = None,
         prefix: str = "",
     ) -> None:
-        """Open the device.
+        """Open the device; `opener` is called again after each loss.
 
         Args:
             device: What log lines call it.
-            opener: Opens it; called again after each loss.
             clock: The clock of the items' times.
             stop: Set when the slave is to end; `read` then waits for the device no longer.
             connection_lost: Called when it is lost, and before each try to open it again.
             rate_hz: Counts the items of an absence; 0: numbers go on without a gap.
-            backoff: How long to wait between two tries.
             prefix: Stands before the names of its counts and metrics.
-
-        Raises:
-            PhalanxError: It is not there, or refused a setting.
         """
         self._device, self._open, self._clock, self._stop = device, opener, clock, stop
         self._connection_lost, self._prefix = connection_lost, prefix
@@ -105,13 +81,7 @@ class ReconnectingDriver(Generic[ItemT]):
         self._failures = Failures(device, clock.now_ns)
 
     def read(self) -> ItemT | None:
-        """Next item; waits for a lost device.
-
-        None at the end of the stream, when stopped, or once closed.
-
-        Raises:
-            TrackerChoiceError: As the driver.
-        """
+        """Next item, waiting for a lost device; None at the end, stopped or closed."""
         while not self._closed.is_set():
             source = self._source if self._source is not None else self._reconnected()
             if source is None:
@@ -138,19 +108,12 @@ class ReconnectingDriver(Generic[ItemT]):
         return None
 
     def close(self) -> None:
-        """Give the device back.
-
-        Safe to call twice, and from another thread that ends a wait.
-        """
+        """Give the device back. Safe to call twice, and from another thread."""
         self._closed.set()
         self._drop()
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often, of this device and of all drivers that were opened.
-
-        `lost`, `back`; `late`: items no later than the one before; `raised`: what a driver raised that is no error of
-        ours.
-        """
+        """`lost`, `back`; `late`: no later than the last item; `raised`: errors not ours."""
         own = {**self._counts, "raised": self._failures.raised}
         counts = Counter({self._prefix + event: count for event, count in own.items()})
         counts.update(self._closed_counts)
@@ -171,7 +134,7 @@ class ReconnectingDriver(Generic[ItemT]):
         return None
 
     def _is_measured(self, item: ItemT) -> bool:
-        """Whether an item is a new measurement; one no later than the last is not."""
+        """Whether an item is a new measurement: later than the last."""
         if self._last is not None and item.t_ns <= self._last[1]:
             self._counts["late"] += 1
             return False
@@ -234,10 +197,7 @@ class ReconnectingDriver(Generic[ItemT]):
 
 
 class ReconnectingTracker(ReconnectingDriver[TrackerPose]):
-    """Gives poses of NaN, four a second, while the tracker's system is away.
-
-    Holds its name.
-    """
+    """Gives poses of NaN, four a second, while the tracker's system is away."""
 
     def __init__(
         self,
@@ -250,16 +210,9 @@ class ReconnectingTracker(ReconnectingDriver[TrackerPose]):
         backoff: Backoff | None = None,
         absent_s: float = 0.25,
     ) -> None:
-        """Open the tracker; see `ReconnectingDriver`.
+        """Open the tracker `name`; from one pose of NaN to the next are `absent_s` [s].
 
-        Args:
-            name: Of the device, for poses of NaN.
-            opener, clock, stop, connection_lost: As there.
-            backoff: By default at most 10 s, as each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221).
-            absent_s: From one pose of NaN to the next [s].
-
-        Raises:
-            TrackerError: It is not there.
+        Tries are at most 10 s apart, as each leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221).
         """
         self._name, self._absent_s = name, absent_s
         backoff = backoff or Backoff(longest_s=10.0)
@@ -281,15 +234,9 @@ CONTRAST = 8  # levels in a channel, above what JPEG makes of an even picture
 
 
 class RepeatedPictures:
-    """Finds repeated pictures.
-
-    Holds the last picture, to which nobody writes any more, and check sums of those before.
-
-    The sums: shape, that of a few rows, and that of the whole where such rows had been there before.
-    """
+    """Finds repeated pictures by the last one and check sums of those before."""
 
     def __init__(self) -> None:
-        """There was none yet."""
         self._last: Image | None = None
         # A driver may hand eight buffers round: ours are asked for four and six
         self._sums: deque[tuple[tuple[int, ...], int, int | None]] = deque(maxlen=8)
@@ -322,11 +269,7 @@ def _has_contrast(image: Image) -> bool:
 
 
 class ReconnectingCamera(ReconnectingDriver[Frame]):
-    """A camera that is opened again with the settings it was given last.
-
-    A camera that repeats one picture with new stamps measures nothing: the copies are dropped, and after a second of
-    them it is opened again as one that is lost. Holds its settings, its pictures, and since when it repeats one.
-    """
+    """A camera that is opened again with its last settings, also where it is frozen."""
 
     def __init__(
         self,
@@ -339,17 +282,7 @@ class ReconnectingCamera(ReconnectingDriver[Frame]):
         backoff: Backoff | None = None,
         frozen_s: float = 1.0,
     ) -> None:
-        """Open the camera; see `ReconnectingDriver`.
-
-        Args:
-            opener: Opens the camera with these settings.
-            camera: Its settings at first. Its rate counts the frames of an absence.
-            clock, stop, connection_lost, backoff: As there.
-            frozen_s: One that repeats a picture for so long is lost [s].
-
-        Raises:
-            CameraError: The camera is not there or refused a setting.
-        """
+        """Open the camera; one that repeats a picture for `frozen_s` [s] is lost."""
         self._camera = camera
         super().__init__(
             "camera",
@@ -367,11 +300,7 @@ class ReconnectingCamera(ReconnectingDriver[Frame]):
         self._counts["frozen"] = 0  # frames that were copies of the one before
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change the settings of the camera, now and whenever it is opened again.
-
-        Raises:
-            CameraError: It is away, or did not take them.
-        """
+        """Change the settings of the camera, now and whenever it is opened again."""
         source = self._source
         if not isinstance(source, Tunable):
             raise CameraError(f"camera {camera.name!r} is away: its settings can be changed when it is back")
@@ -385,11 +314,7 @@ class ReconnectingCamera(ReconnectingDriver[Frame]):
         self._camera, self._rate_hz = camera, camera.frame_rate_hz
 
     def _is_measured(self, item: Frame) -> bool:
-        """Whether a frame has another picture than the one before.
-
-        Raises:
-            CameraError: All have had the same one for too long.
-        """
+        """Whether a frame is no copy; raises `CameraError` where all were for too long."""
         if not self._pictures.push(item.image):
             self._frozen_ns = None
             return True

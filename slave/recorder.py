@@ -1,20 +1,11 @@
 """Record the raw frames of one camera to disk, and show the progress.
 
-Length, counts and progress line of a recording.
-
-The length is what it was asked for; the line reports how far it is.
-
-Recorder of the raw frames of one camera to disk.
-
-The camera never waits for the disk.
-
     camera loop ── offer ──▶ bounded queue ──▶ encoders (PNG) ──▶ one writer: the file, then its row
                      │
                      └ queue full: dropped, counted, a gap in `seq`
 
-A frame is encoded by any of several threads and written by one, in the order of the camera. The disk is looked at
-before every frame: where less than a reserve would be left, where it is full or gone, the recording ends with what
-was complete, and `failure` states why.
+The camera never waits for the disk. The recording ends with what was complete where less than a reserve would be left
+on the disk, or it is full or gone, and `failure` states why.
 """
 
 import math
@@ -41,17 +32,10 @@ from slave.sources import Frame, FrameSource
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """Length of a recording.
+    """Length of a recording: until one of the two is reached, or until stopped."""
 
-    Until one of the two is reached, or, with neither, until stopped.
-
-    Attributes:
-        seconds: Between the first and the last frame [s], by the times of the frames.
-        frames: Frames recorded; dropped ones do not count.
-    """
-
-    seconds: float | None = None
-    frames: int | None = None
+    seconds: float | None = None  # between the first and the last frame [s], by the times of the frames
+    frames: int | None = None  # frames recorded; dropped ones do not count
 
     def expected(self, rate_hz: float) -> int | None:
         """How many frames that is at `rate_hz` frames per second; None: not known."""
@@ -70,50 +54,32 @@ class Length:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How a recording is.
+    """Progress of a recording."""
 
-    Attributes:
-        frames: Written: file and row.
-        dropped: Did not fit the queue, or came out of it after the end: the disk or the encoders were too slow.
-        lost: Gaps in the camera's own counter.
-        waiting: Frames in the queue, of `capacity`.
-        written_bytes: All files so far.
-        bytes_per_s: Over the last second.
-        free_bytes: Free on the disk.
-        seconds: From the first frame to the last that was taken [s].
-        left_s: Until the length asked for [s]; None: until stopped.
-        disk_s: Until the reserve of the disk is reached [s]; infinite while nothing is written.
-    """
-
-    frames: int
+    frames: int  # written: file and row
+    # did not fit the queue, or came out of it after the end: the disk or the encoders were too slow
     dropped: int
-    lost: int
-    waiting: int
+    lost: int  # gaps in the camera's own counter
+    waiting: int  # frames in the queue, of `capacity`
     capacity: int
     written_bytes: int
-    bytes_per_s: float
-    free_bytes: int
-    seconds: float
-    left_s: float | None
-    disk_s: float
+    bytes_per_s: float  # over the last second
+    free_bytes: int  # free on the disk
+    seconds: float  # from the first frame to the last that was taken [s]
+    left_s: float | None  # until the length asked for [s]; None: until stopped
+    disk_s: float  # until the reserve of the disk is reached [s]; infinite while nothing is written
 
 
 class ProgressDisplay:
-    """Display of the progress.
-
-    On a terminal in place at every call, elsewhere a line at every fifth.
-
-    Holds how often it was called.
-    """
+    """Shows the progress: on a terminal in place, elsewhere a line at every 5th call."""
 
     def __init__(self, name: str, stream: TextIO) -> None:
-        """Show the recording of camera `name` on `stream`."""
         self._name = name
         self._stream = stream
         self._calls = 0
 
     def show(self, progress: Progress) -> None:
-        """The recording goes on; called once a second."""
+        """Show the progress; called once a second."""
         self._calls += 1
         plain_every = 5  # calls, where no terminal shows the line in place
         if self._stream.isatty():
@@ -122,7 +88,7 @@ class ProgressDisplay:
             self._write(f"{self._name}: {progress_text(progress)}\n")
 
     def end(self, progress: Progress) -> None:
-        """The recording is over."""
+        """Show the end of the recording."""
         text = (
             f"{self._name}: {progress.frames} frames in {progress.seconds:.2f} s, {progress.dropped} dropped, "
             f"{progress.lost} lost by the camera, {megabytes(progress.written_bytes)}"
@@ -138,7 +104,7 @@ class ProgressDisplay:
 
 
 def progress_text(progress: Progress) -> str:
-    """One line for a person who waits."""
+    """The progress as one line."""
     parts = [f"{progress.frames} frames", f"{progress.dropped} dropped"]
     if progress.lost:
         parts.append(f"{progress.lost} lost by the camera")
@@ -172,12 +138,7 @@ class _Waiting(NamedTuple):
 
 
 class Recorder:
-    """Writer of the frames it is offered.
-
-    Holds the queue, its threads, and the counts, each written by one thread alone.
-
-    Memory: the queue, and beyond it one PNG and what the camera holds.
-    """
+    """Writer of the frames it is offered; each count is written by one thread alone."""
 
     def __init__(
         self,
@@ -193,19 +154,11 @@ class Recorder:
         encoders: int = ENCODERS,
         reserve_option: str = "--reserve-mb",
     ) -> None:
-        """Make the recording and start the threads.
+        """Make the recording in the new or empty `folder`, and start the threads.
 
-        Args:
-            folder: New or empty.
-            manifest: What is recorded; `cameras` has `camera`.
-            camera: Name of the camera.
-            length: When to end.
-            show: Called once a second, on a thread of its own.
-            reserve_bytes: Stays free on the disk.
-            queue_bytes: Memory for frames that wait; two fit in any case.
-            free_bytes: What is free on the disk of a folder.
-            encoders: So many threads at most encode, and one a core.
-            reserve_option: The option by which a user sets another reserve.
+        `show` is called once a second, on a thread of its own; `reserve_bytes` stay free on the disk; `queue_bytes`
+        are for frames that wait, of which two fit in any case; `encoders` at most, and one a core; `reserve_option`
+        is for errors.
 
         Raises:
             RecordingError: The folder holds something, or cannot be written.
@@ -238,9 +191,7 @@ class Recorder:
         return self.failure is None and self._left_s() != 0.0
 
     def offer(self, frame: Frame) -> None:
-        """Take a frame, or count it as dropped; never wait.
-
-        Whatever comes after the end is ignored.
+        """Take a frame, or count it as dropped; never wait. Ignored after the end.
 
         Raises:
             RecordingError: The image is not of the size given by the camera file.
@@ -267,7 +218,7 @@ class Recorder:
         self._taken += 1
 
     def progress(self) -> Progress:
-        """How it is now. Any thread may ask."""
+        """The progress now, from any thread."""
         try:
             free = self._free(self._folder)
         except OSError:
@@ -288,10 +239,7 @@ class Recorder:
         )
 
     def close(self) -> None:
-        """Write what waits and end the recording.
-
-        A recording without any frame is removed. Safe to call twice.
-        """
+        """Write what waits and end; one without any frame is removed. Safe to call twice."""
         if not self._closing.is_set():
             self._closing.set()
             self._waiting.put(None)
@@ -317,11 +265,7 @@ class Recorder:
                 self._unwritten += 1
 
     def _write(self, frame: _Waiting, png: bytes) -> None:
-        """Write one frame.
-
-        Raises:
-            RecordingError: No room for it, or, with the first one, for all that was asked for.
-        """
+        """Write one frame; `RecordingError`: no room, at first for all that is to come."""
         try:
             free = self._free(self._folder)
         except OSError as error:
@@ -353,27 +297,13 @@ class Recorder:
 
 
 def feed(source: FrameSource, recorder: Recorder, stop: threading.Event) -> None:
-    """Offer every frame to the recorder until an end condition is met.
-
-    Until the length is reached, the source ends, the recorder fails or `stop` is set.
-
-    Raises:
-        CameraError: The camera is gone.
-        RecordingError: Its images are of another size than by its file.
-    """
+    """Offer every frame until the length or the source ends, or `stop` is set."""
     while not stop.is_set() and recorder.wants_more and (frame := source.read()) is not None:
         recorder.offer(frame)
 
 
 def clock_of(clock: Clock, simulated: str = "") -> RecordedClock | None:
-    """Return the clock of the times of a recording.
-
-    It serves whoever joins the recording with others; None: this system cannot determine it.
-
-    Args:
-        clock: The slave's clock.
-        simulated: How it differs from the machine's; empty: it is the machine's.
-    """
+    """Clock of a recording; `simulated`: how it differs from the machine's."""
     try:
         boot = BOOT_ID.read_text().strip()
     except OSError:

@@ -1,13 +1,7 @@
-"""Count what a sender does, and report how the slave is.
+"""Count what a sender does, and report it: `Health` twice a second, on command.
 
-Report how the slave is: `Health` twice a second, and on command.
-
-The sender loop never waits for the bus: this thread opens it when the uplink has learned where the master's
-bus is, opens it anew when another master takes over, and lives on without it when there is none.
-
-Count what a sender does, for `Health`.
-
-Items, gaps, failures, what was detected, and what its device reports.
+The sender loop never waits for the bus: this thread opens it when the uplink has learned where the master's bus is,
+opens it anew when another master takes over, and lives on without it when there is none.
 """
 
 import logging
@@ -40,10 +34,9 @@ _LOG = logging.getLogger(__name__)
 
 
 class Reporter:
-    """Publishes `Health`, and answers commands.
+    """Publishes `Health`, and answers "report", "stop" and the commands of its parts.
 
-    These are "report", "stop", where there is a picture "preview" and "still", and those of the parts, which also look
-    after their files once a period. Holds the bus while a master is there, and the metrics of the last period.
+    Where there is a picture, also "preview" (shows it for 3 s) and "still" (the next frame whole).
     """
 
     def __init__(
@@ -59,19 +52,9 @@ class Reporter:
         previews: "Previews | None" = None,
         parts: "Sequence[CameraTuning | RawFrames]" = (),
     ) -> None:
-        """Start the thread.
+        """Start the thread; `connect` opens a bus to the endpoint that `uplink` learns.
 
-        Args:
-            name: Name of this slave on the bus.
-            uplink: Learns the endpoint of the bus.
-            counters: Counts of the loop.
-            clock: Clock of the reports' times.
-            connect: Opens a bus to an endpoint.
-            stop: Called on the command "stop".
-            period_s: Time between reports [s]: two of them make a judgement in the checklist of the master, which is to
-                be out within two seconds.
-            previews: Shows the camera's picture on the command "preview".
-            parts: Change the settings of the camera; keep raw frames.
+        Every `period_s` [s] a report: the checklist of the master judges by two of them, within two seconds.
         """
         self._name, self._uplink, self._counters, self._clock = name, uplink, counters, clock
         self._connect, self._stop, self._period_s = connect, stop, period_s
@@ -95,15 +78,7 @@ class Reporter:
         return Health(self._name, self._uplink.session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
-        """Obey a command.
-
-        "report" sends a report, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
-        the slave; the others are those of the camera and of raw frames.
-
-        Raises:
-            PhalanxError: It could not be done.
-            ValueError: Another verb; the asker reads which ones there are.
-        """
+        """Obey a command; another verb is a `ValueError` that names those there are."""
         plain: dict[str, Callable[[], None]] = {"report": lambda: None, "stop": self._stop}
         if (previews := self._previews) is not None:
             plain |= {"preview": lambda: previews.ask(command.body), "still": previews.ask_still}
@@ -190,10 +165,7 @@ def _why_alone(counts: Mapping[str, int]) -> str:
 
 
 class Counters:
-    """Counters of one sender: written by its loop, read by the thread of the reports.
-
-    Holds the counts since the start, whether the last item had anything in it, and where the last rate began.
-    """
+    """Counters of one sender: written by its loop, read by the thread of the reports."""
 
     def __init__(
         self,
@@ -204,15 +176,7 @@ class Counters:
         counts: Callable[[], Mapping[str, int]] = dict[str, int],
         metrics: Callable[[], Mapping[str, float]] = dict[str, float],
     ) -> None:
-        """Count from nothing.
-
-        Args:
-            items: What the items are called.
-            gaps: What their numbers leave out is called.
-            empty: What items without anything in them are called; empty: they are not counted.
-            counts: More counts, given out with these.
-            metrics: More metrics, likewise; those that are not numbers are omitted.
-        """
+        """Count `items`, `gaps` in their numbers, `empty` ones, and more that are finite."""
         self._items, self._gaps, self._empty = items, gaps, empty
         self._more_counts, self._more_metrics = counts, metrics
         self._lock = threading.Lock()
@@ -223,10 +187,7 @@ class Counters:
         self.found = False
 
     def item(self, seq: int, found: bool = True) -> None:
-        """Count one item, and what its number leaves out.
-
-        `found`: whether there is anything in it.
-        """
+        """Count an item, and what its number leaves out; `found`: it is not empty."""
         with self._lock:
             if self._last_seq is not None and seq > self._last_seq + 1:
                 self._missing += seq - self._last_seq - 1
@@ -236,10 +197,7 @@ class Counters:
             self.found = found
 
     def failed(self, seq: int, error: Exception) -> None:
-        """Count one item whose work raised an error, which is logged now and then.
-
-        An item that was not counted before is one that was dropped.
-        """
+        """Count and log an item whose work raised an error."""
         self._failures.log(f"nothing is made of {self._items.removesuffix('s')} {seq}", error)
         with self._lock:
             self._failed += 1
@@ -282,10 +240,7 @@ class Counters:
 
 
 class DetectionCounters(Counters):
-    """Counters of a camera: also what was detected, and how long that took.
-
-    Holds how often each marker or finger was seen, and mean and worst time of detection.
-    """
+    """Counters of a camera: also what was detected, and how long that took."""
 
     def __init__(
         self,
@@ -293,22 +248,13 @@ class DetectionCounters(Counters):
         counts: Callable[[], Mapping[str, int]] = dict[str, int],
         metrics: Callable[[], Mapping[str, float]] = dict[str, float],
     ) -> None:
-        """Count for the markers `names`, or other things; the rest as `Counters`."""
         super().__init__(counts=counts, metrics=metrics)
         self._names, self._seen = names, np.zeros(len(names), np.int64)
         self._searched = self._empty_frames = 0
         self._detect_us = self._worst_us = 0.0
 
     def frame(self, seq: int, detect_ns: int, uv: Float) -> None:
-        """Count one frame in which was searched.
-
-        One that is a part of a strobe cycle is counted by `item`.
-
-        Args:
-            seq: Camera's frame counter.
-            detect_ns: Time the detection took [ns].
-            uv: (M, 2) centroids [px], NaN row = not seen.
-        """
+        """Count one searched frame with its centroids `uv` (M, 2) [px], NaN = not seen."""
         seen = np.isfinite(uv[:, 0])
         took_us = detect_ns * 1e-3
         self.item(seq)
@@ -351,10 +297,7 @@ def imu_counters(source: object, orientation: OrientationFilter | None = None) -
 
 
 def pose_counters(source: object) -> Counters:
-    """Counters of poses, those of NaN as `nowhere`.
-
-    With what the tracker reports, and `tracked` (1: yes).
-    """
+    """Counters of poses, those of NaN as `nowhere`; `tracked` 1: yes."""
 
     def metrics() -> dict[str, float]:
         own = dict(source.metrics()) if isinstance(source, Reporting) else {}

@@ -4,7 +4,7 @@
 
 A camera that looks for markers sends of every frame, the camera of a wrist device of every strobe cycle, an IMU and a
 tracker every sample and pose. Whatever a pipeline raises costs its item alone; where all items fail, the watchdog is
-not fed, and the process begins anew.
+not fed, and the process begins anew. A device that is gone raises its `PhalanxError`.
 """
 
 import gc
@@ -47,10 +47,7 @@ def nothing(*_arguments: object) -> None:
 
 
 class Pipeline(Generic[ItemT]):
-    """What is done with an item: detect or orient, send, count.
-
-    Holds its counters.
-    """
+    """What is done with an item: detect or orient, send, count."""
 
     def __init__(self, session: int, send: Send, counters: Counters) -> None:
         """Send in the name of the process with id `session`; `send` never waits."""
@@ -65,10 +62,7 @@ class Pipeline(Generic[ItemT]):
 
 
 class MarkerPipeline(Pipeline[Frame]):
-    """Detects the markers of a frame and sends them, then its tags.
-
-    A frame without any marker is sent as well.
-    """
+    """Detects the markers of a frame and sends them, if any, then its tags."""
 
     def __init__(
         self,
@@ -82,14 +76,8 @@ class MarkerPipeline(Pipeline[Frame]):
     ) -> None:
         """Detect in the frames of one camera.
 
-        Args:
-            camera: Name of the camera.
-            session: Random id of this process.
-            send: Sends, or counts as unsent; never waits.
-            detect: Detects the markers of an image, taken at a time [ns].
-            counters: Counts them.
-            show: Is offered every frame after that; must not wait.
-            tags: Detects the tags of a frame in this session whose markers took so long [ns]; None: not searched.
+        `show` is offered every frame after that, and must not wait; `tags` takes a frame, the session and how long
+        its markers took [ns].
         """
         super().__init__(session, send, counters)
         self._camera, self._detect, self._detections = camera, detect, counters
@@ -123,12 +111,7 @@ class MarkerPipeline(Pipeline[Frame]):
 
 
 class WristPipeline(Pipeline[Frame]):
-    """Detects fingers where a frame completes a strobe cycle, and sends them.
-
-    A cycle without any finger is sent as well.
-
-    Holds how long the last frames took, and how many there were since the last cycle.
-    """
+    """Detects fingers where a frame completes a strobe cycle, and sends them, if any."""
 
     def __init__(
         self,
@@ -139,15 +122,11 @@ class WristPipeline(Pipeline[Frame]):
         counters: DetectionCounters,
         show: Callable[[Frame], None] = nothing,
     ) -> None:
-        """Detect in the frames of one camera; see `MarkerPipeline`.
-
-        `show` is offered the frame under the LEDs of every cycle, and every frame while there are none.
-        """
+        """Show the frame under the LEDs of every cycle; every frame while there are none."""
         super().__init__(session, send, counters)
         self._camera, self._detect, self._detections, self._show = camera, detect, counters, show
-        self._took_ns: deque[int] = deque(
-            maxlen=3
-        )  # of frames that may be a cycle; those before are none of it
+        # of frames that may be a cycle; those before are none of it
+        self._took_ns: deque[int] = deque(maxlen=3)
         self._parts = 0
 
     def push(self, item: Frame) -> None:
@@ -169,10 +148,7 @@ class WristPipeline(Pipeline[Frame]):
 
 
 class ImuPipeline(Pipeline[ImuSample]):
-    """Sends samples with the orientation of a filter, or the sensor's own.
-
-    Rates and forces stay as they were measured.
-    """
+    """Sends samples with the orientation of a filter; rates and forces as measured."""
 
     def __init__(
         self,
@@ -181,7 +157,6 @@ class ImuPipeline(Pipeline[ImuSample]):
         counters: Counters,
         orient: Callable[[ImuSample], ImuSample] | None = None,
     ) -> None:
-        """Orient by a filter; None: the sensor's own orientation is sent."""
         super().__init__(session, send, counters)
         self._orient = orient
 
@@ -212,15 +187,10 @@ def wait_for_start(
     alive: Callable[[], None] = nothing,
     skip: Callable[[], bool] | None = None,
 ) -> bool:
-    """Wait for the master as long as it takes.
+    """Wait for the master; False if stopped before, or the source has ended.
 
-    False if stopped before, or the source has ended.
-
-    Args:
-        started: Waits for the start at most so many seconds; whether it has come.
-        stop: Set when the slave is to end.
-        alive: Called every time round.
-        skip: Reads an item and forgets it; False at the end of the stream. None: nothing is read meanwhile.
+    `started` waits at most so many seconds for the start; `alive` is called every time round; `skip` reads an item
+    and forgets it, False at the end of the stream; None: nothing is read meanwhile.
     """
     wait_s = 0.2 if skip is None else 0.5e-3  # between two items
     while not stop.is_set():
@@ -233,11 +203,7 @@ def wait_for_start(
 
 
 def skip_one(source: Source[ItemT], pipeline: Pipeline[ItemT]) -> bool:
-    """Read an item before the start; False at the end of the stream.
-
-    Raises:
-        PhalanxError: The device is gone.
-    """
+    """Read an item before the start; False at the end of the stream."""
     item = source.read()
     if item is None:
         return False
@@ -254,15 +220,7 @@ def run(
     stop: threading.Event,
     alive: Callable[[], None] = nothing,
 ) -> None:
-    """Push every item until the source ends or `stop` is set.
-
-    `alive` is called after each.
-
-    What the pipeline raises costs that item alone; it is counted and logged.
-
-    Raises:
-        PhalanxError: The device is gone.
-    """
+    """Push every item until the end or `stop`; an error costs that item alone."""
     while not stop.is_set() and (item := source.read()) is not None:
         try:
             pipeline.push(item)
@@ -273,25 +231,15 @@ def run(
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """One sending process: its name, its link, and who stops and supervises it.
+    """One sending process: its name, its link, and who stops and supervises it."""
 
-    Attributes:
-        name: Camera, IMU or tracker, as the rig's files call it.
-        uplink: Where messages go.
-        clock: The slave's clock.
-        stop: Set by a signal handler, or by the command "stop" on the bus.
-        notify: Called with one line when it is ready, and one at the end.
-        service: Reports what it does to the system's service manager.
-        access: How it comes to the master's bus.
-    """
-
-    name: str
+    name: str  # camera, IMU or tracker, as the rig's files call it
     uplink: Uplink
     clock: Clock
-    stop: threading.Event
-    notify: Callable[[str], None]
-    service: Service
-    access: Access
+    stop: threading.Event  # set by a signal handler, or by the command "stop" on the bus
+    notify: Callable[[str], None]  # called with one line when it is ready, and one at the end
+    service: Service  # reports what it does to the system's service manager
+    access: Access  # how it comes to the master's bus
 
     def send(
         self,
@@ -304,22 +252,11 @@ class Sender:
         parts: "Sequence[CameraTuning | RawFrames]" = (),
         close: Sequence[Callable[[], None]] = (),
     ) -> None:
-        """Wait for the master, then push items; close source and uplink.
+        """Wait for the master, push items until `stop` or their end; close everything.
 
-        It ends when `stop` is set or the source ends.
-
-        Args:
-            source: The open device.
-            pipeline: What is done with its items.
-            skips: Whether items are read before the start, so that none grows old in a buffer. Drivers of cameras throw
-                old frames away themselves; of a recording nothing is to be missed.
-            reported: What the reports have in place of the counters.
-            previews: Shows the camera's picture.
-            parts: Change the camera's settings; keep raw frames.
-            close: What else ends with it.
-
-        Raises:
-            PhalanxError: The device is gone.
+        Where `skips`, items are read before the start, so that none grows old in a buffer: drivers of cameras throw
+        old frames away themselves; of a recording nothing is to be missed. `reported` stands in for the counters in
+        reports.
         """
         reporter = Reporter(
             self.name,
@@ -352,22 +289,14 @@ class Sender:
 
 
 def send_samples(sender: Sender, source: ImuSource, orientation: OrientationFilter | None) -> None:
-    """Send what an IMU measures, with a filter's orientation; None: its own.
-
-    Raises:
-        ImuError: The IMU is gone.
-    """
+    """Send what an IMU measures, with a filter's orientation; None: its own."""
     counters, uplink = imu_counters(source, orientation), sender.uplink
     orient = None if orientation is None else orientation.push
     sender.send(source, ImuPipeline(uplink.session, uplink.send, counters, orient), skips=True)
 
 
 def send_poses(sender: Sender, source: TrackerSource, recorded: bool = False) -> None:
-    """Send where a tracker is; a `recorded` source begins with the start.
-
-    Raises:
-        TrackerError: The tracking system is gone.
-    """
+    """Send where a tracker is; a `recorded` source begins with the start."""
     uplink = sender.uplink
     pipeline = PosePipeline(uplink.session, uplink.send, pose_counters(source))
     sender.send(source, pipeline, skips=not recorded)

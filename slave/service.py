@@ -1,19 +1,9 @@
 """Run as a service: notify the system's manager, and stop on its signals.
 
-Notifications from a slave to the system's service manager.
-
-Ready, what it does now, and that its loop goes round.
-
-The watchdog is fed by the loop itself, never by a thread that would live on while the loop hangs. A wait that may be
-long and is no hang reports so: for the master it comes round again and again; a lost camera asks for more patience
-(`WATCHDOG_USEC`), as does a slow start (`EXTEND_TIMEOUT_USEC`), and a hang in those is ended, too, only later.
-
-It is fed four times in a period, not twice: of a slave that is stopped for 3 s with a watchdog of 5 s, up to 3.75 s may
-have passed since it was asked to live, and it goes on; fed every 2.5 s it might be ended.
-
-Ctrl-C and a stop by the system as an event.
-
-For commands that run until they are requested to end.
+The watchdog is fed by the loop itself, never by a thread that would live on while the loop hangs. Waiting for the
+master the loop comes round; a lost camera asks for more patience (`WATCHDOG_USEC`), as does a slow start
+(`EXTEND_TIMEOUT_USEC`). It is fed four times in a period, not twice: of a slave that is stopped for 3 s with a
+watchdog of 5 s, up to 3.75 s may have passed since it was fed, and it goes on; fed every 2.5 s it might be ended.
 """
 
 import signal
@@ -25,19 +15,15 @@ from typing import Protocol
 
 from common.supervisor import WATCHDOG, ServiceManager, one_line
 
-LOST_PATIENCE_S = (
-    90.0  # opening a camera again, all settings checked, takes seconds; one that hangs is given up
-)
+# opening a camera again, all settings checked, takes seconds; one that hangs is given up
+LOST_PATIENCE_S = 90.0
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
 NEVER_NS = 2**63
 WAITING = "waits for the master"
 
 
 class ConnectionLost(Protocol):
-    """Callback for the loss of a device; `Service.connection_lost`.
-
-    Called before the device is given back and at each try to open it.
-    """
+    """Callback for the loss of a device, and for each try to open it again."""
 
     def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """`what` is lost; the next try may take so long [s]."""
@@ -49,11 +35,7 @@ def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
 
 
 class Service:
-    """Belongs to the thread of the loop.
-
-    Holds where to report it, the watchdog's period, how often the loop went round since last reported, and when it is
-    to be reported again.
-    """
+    """Notifications of one slave to the service manager; of the loop's thread alone."""
 
     def __init__(
         self,
@@ -61,13 +43,7 @@ class Service:
         now_ns: Callable[[], int] = time.monotonic_ns,
         noun: str = "frames",
     ) -> None:
-        """Find out who listens; nothing is sent yet.
-
-        Args:
-            environment: That of the process.
-            now_ns: The time [ns].
-            noun: What the loop goes round for.
-        """
+        """Find out who listens in the `environment`; `noun` is what the loop counts."""
         self._manager = ServiceManager(environment)
         self._send, self._period_us = self._manager.send, self._manager.watchdog_us
         self._now_ns, self._noun = now_ns, noun
@@ -79,19 +55,12 @@ class Service:
         self._due_ns = NEVER_NS
 
     def starting(self, patience_s: float, what: str = "compiles") -> None:
-        """Announce that becoming ready may take so long from now [s].
-
-        The manager waits, and so does an installer, by the status.
-        """
+        """Announce to manager and installer that becoming ready may take so long [s]."""
         status = f"{one_line(what)}: may take {patience_s:.0f} s"
         self._send(f"STATUS={status}\nEXTEND_TIMEOUT_USEC={round(patience_s * 1e6)}")
 
     def ready(self, linked: Callable[[], bool]) -> None:
-        """It is open, and waits for the master; from here on the loop is to come round.
-
-        Args:
-            linked: Whether anybody takes what the loop sends.
-        """
+        """Report that it waits for the master; `linked`: whether anybody takes its data."""
         self._ready, self._linked = True, linked
         self._begin(self._now_ns())
         self._send(f"READY=1\nSTATUS={WAITING}{self._fed()}", wait=True)
@@ -118,10 +87,7 @@ class Service:
         self._notify(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
 
     def connection_lost(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
-        """Announce that a device is lost or something else takes time.
-
-        The next round may be so late [s].
-        """
+        """Announce that a device is lost: the next round may be so late [s]."""
         if not self._ready:
             self.starting(patience_s, what)
             return
@@ -134,14 +100,11 @@ class Service:
         self._send("STOPPING=1\nSTATUS=ends")
 
     def failed(self, why: str) -> None:
-        """Report that the service ends because of an error.
-
-        The last line of status states which.
-        """
+        """Report the error that ends the service as the last line of status."""
         self._send(f"STATUS=failed: {one_line(why)}")
 
     def _notify(self, doing: str, now_ns: int) -> None:
-        """What it does; from now on with no more patience than usual."""
+        """Report what it does; from now on with no more patience than usual."""
         if self._send(f"STATUS={one_line(doing)}{self._fed(self._period_us if self._patient else 0)}"):
             self._patient = False
         self._begin(now_ns)
@@ -151,10 +114,7 @@ class Service:
         self._due_ns = now_ns + self._every_ns if self._manager.listens else NEVER_NS
 
     def _fed(self, period_us: int = 0) -> str:
-        """Return the message that feeds the watchdog.
-
-        It changes the watchdog's period where one is given [us]; empty where there is no watchdog.
-        """
+        """Message that feeds the watchdog, and sets its period [us]; empty without one."""
         if not self._period_us:
             return ""
         return f"\n{WATCHDOG}={period_us}\nWATCHDOG=1" if period_us else "\nWATCHDOG=1"
@@ -164,7 +124,7 @@ _NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that either sets, from now until the process ends."""
+    """An event that Ctrl-C and a stop by the system set, until the process ends."""
     stop = threading.Event()
     for number in _NUMBERS:
         signal.signal(number, lambda _number, _frame: stop.set())
@@ -173,7 +133,7 @@ def stop_on_signals() -> threading.Event:
 
 @contextmanager
 def stop_by_signal() -> Generator[threading.Event, None, None]:
-    """An event that either sets, for as long as the block runs."""
+    """As `stop_on_signals`, for as long as the block runs."""
     before = [signal.getsignal(number) for number in _NUMBERS]
     try:
         yield stop_on_signals()

@@ -1,17 +1,8 @@
 """State what a driver has to be, and log why a device or a frame failed.
 
-The seam between the slave and its devices: what a driver has to be.
-
-Nothing behind it can distinguish which device it is.
-
-A driver opens its device in its constructor. It may also have counts and metrics, and a camera settings that change.
-
-Log why a device or a frame failed, and go on.
-
-At most one line is written in ten seconds.
-
-A `PhalanxError` is logged by its own message. Whatever else a driver or a detector raises is a fault in a program:
-it is counted, and logged with its traceback.
+Nothing behind this seam can distinguish which device it is. A driver opens its device in its constructor. It may also
+have counts and metrics (`Reporting`), and a camera settings that change (`Tunable`). A `PhalanxError` is logged by
+its message; whatever else a driver raises is a fault in a program: counted, and logged with its traceback.
 """
 
 import logging
@@ -58,8 +49,8 @@ class Source(Protocol[ItemT_co]):
     def read(self) -> ItemT_co | None:
         """Block until the next item, or return None at the end of the stream.
 
-        `t_ns` is on the slave's clock; a gap in `seq` is an item that was dropped. `session` is 0: the sender fills it
-        in. A tracker that does not know where it is gives poses of NaN, a few in a second.
+        `t_ns` is on the slave's clock; a gap in `seq` is an item that was dropped. `session` is 0: the sender fills
+        it in. A tracker that does not know where it is gives poses of NaN, a few in a second.
 
         Raises:
             PhalanxError: The device is gone, or an item is broken. Never replaced by a fake one.
@@ -86,10 +77,7 @@ class Reporting(Protocol):
         ...
 
     def metrics(self) -> Mapping[str, float]:
-        """Quantity with its unit -> value now.
-
-        Settings of a camera have the names of `common.calibration.camera_settings`.
-        """
+        """Quantity with its unit -> value now; names of `calibration.camera_settings`."""
         ...
 
 
@@ -114,18 +102,9 @@ ValueT = TypeVar("ValueT", int, float)
 
 
 class Failures:
-    """Counts and logs the errors of one device or loop.
-
-    Holds how many were none of ours, when the last line was logged, how many were not logged, and if any is open.
-    """
+    """Counts and logs the errors `of` a device, one line in 10 s; `raised`: not ours."""
 
     def __init__(self, of: str, clock: Callable[[], int] = now_ns) -> None:
-        """Nothing failed yet.
-
-        Args:
-            of: Whose failures, as the lines begin.
-            clock: The time [ns].
-        """
         self._of, self._clock = of, clock
         self._logged_ns: int | None = None
         self._silent = 0
@@ -133,10 +112,7 @@ class Failures:
         self.raised = 0
 
     def log(self, event: str, error: Exception) -> str:
-        """Count an error, and log `event` with it; return the error in words.
-
-        Nothing is logged where a line is younger than ten seconds.
-        """
+        """Count an error, log `event` with it if a line is due; the error in words."""
         ours = isinstance(error, PhalanxError)
         why = str(error) if ours else f"{type(error).__name__}: {error}"
         self.raised += not ours
@@ -149,10 +125,7 @@ class Failures:
         return why
 
     def ask(self, query: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
-        """Query a driver for its state.
-
-        Nothing where it raises, so that the reports go on.
-        """
+        """Query a driver for its state; nothing where it raises: the reports go on."""
         try:
             return dict(query())
         except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure

@@ -1,22 +1,15 @@
 """Change the camera settings of a running slave without a restart.
 
-What `Health` reports of the camera file in use.
-
-Size, a number for the colours of each marker, and ranges that overlap.
-
-Change of the camera settings of a running slave without a restart.
-
-On command, or because its files were changed.
-
     settings    report what the camera has, and which colours are in use
     set         other exposure, gains, rate, margin, colours (body: `common.calibration.camera_settings.CameraSettings`)
     pick        the colour of a marker, from a pixel on it (body: `common.calibration.camera_settings.ColourPick`)
     load        another content of the camera file (body: the file): exposure, gains, rate, colours of the markers
     save        write the content in use to the slave's own camera file
 
-Everything is checked before anything is changed. What the camera did not take is given back, and the answer is an
-error that names it. The camera loop is never waited for by this, nor does it wait: the settings are read back from
-the frames that it reads, and the new colours take over between two frames.
+Changed files are applied as well. Everything is checked before anything is changed; what the camera did not take is
+given back, and the answer is an error that names it. The camera loop is never waited for, nor does it wait: settings
+are read back from the frames that it reads, and new colours take over between two frames. What is wrong or needs a
+restart raises `CalibrationError`.
 """
 
 import logging
@@ -50,13 +43,9 @@ _NAME = 64  # characters of a name in `Health`
 
 
 def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, float]:
-    """Return metrics of the camera file in use.
+    """Metrics of the camera file in use, for the rig's `markers`.
 
     width_px, height_px; colour.<marker>, another number for another range; overlap.<one>..<other> [hues].
-
-    Args:
-        camera: The content in use.
-        markers: Those of the rig; what the file knows of others does not matter here.
     """
     ranges = {name: colour for name in markers if (colour := (camera.markers or {}).get(name)) is not None}
     found = {"width_px": float(camera.width_px), "height_px": float(camera.height_px)}
@@ -68,10 +57,7 @@ def in_use(camera: CameraCalibration, markers: tuple[str, ...]) -> dict[str, flo
 
 
 def overlap(one: HsvRange, other: HsvRange) -> int:
-    """Return how many hues two colour ranges share.
-
-    0 where their saturations or values have none in common.
-    """
+    """How many hues two ranges share; 0 where saturations or values have none."""
     for axis in (1, 2):
         if one.hsv_low[axis] > other.hsv_high[axis] or other.hsv_low[axis] > one.hsv_high[axis]:
             return 0
@@ -99,14 +85,7 @@ MARKERS = "markers"
 
 @dataclass(frozen=True, slots=True)
 class CameraFiles:
-    """Files a slave was started with, and their content.
-
-    Attributes:
-        camera_path, rig_path: The camera file and the rig file.
-        camera, rig: Their content.
-        hand_path, hand: The same of the hand, of which only the slave of a wrist device needs to know; else None.
-        objects: Content of the files of the rig's objects, which lie beside it.
-    """
+    """Files a slave was started with, their content, and that of the rig's objects."""
 
     camera_path: Path
     rig_path: Path
@@ -123,11 +102,7 @@ class CameraFiles:
         return (self.camera_path, self.rig_path, *hand, *object_paths(self.rig_path, self.rig))
 
     def read_again(self) -> "CameraFiles":
-        """The same files, as they are now.
-
-        Raises:
-            CalibrationError: One is broken or gone.
-        """
+        """The same files, as they are now; `CalibrationError`: one is broken or gone."""
         rig = load(self.rig_path, RigCalibration)
         return replace(
             self,
@@ -153,11 +128,7 @@ Sample: TypeAlias = Callable[[ColourPick, CameraCalibration], tuple[CameraCalibr
 
 
 class CameraTuning:
-    """Answers commands about the camera, and follows its files.
-
-    Holds the content in use, that which the files had when last read, and how often a change of them was applied and
-    refused. Its methods are called on several threads and take turns.
-    """
+    """Answers commands about the camera, and follows its files; from any thread."""
 
     def __init__(
         self,
@@ -167,14 +138,10 @@ class CameraTuning:
         running: Callable[[], bool],
         sample: Sample | None = None,
     ) -> None:
-        """Tune a camera.
+        """Tune a camera; a `source` that is no `Tunable` keeps its settings.
 
-        Args:
-            files: What the slave was started with.
-            source: The camera; a `Tunable`, or nothing can be changed but what senses.
-            prepare: Makes what senses for other files; None: nobody senses.
-            running: Whether frames are read: before, no change can be verified.
-            sample: Makes a colour of a click; None: no markers are sought.
+        `running`: whether frames are read, as before no change can be verified; without `prepare` nothing senses,
+        without `sample` no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
@@ -189,12 +156,7 @@ class CameraTuning:
         return self._used
 
     def commands(self) -> dict[str, Callable[[str], Mapping[str, float]]]:
-        """Return the handler of each command verb.
-
-        Each takes the body and returns the metrics of the answer.
-
-        Each raises `PhalanxError` where the body is wrong, or the camera did not take it.
-        """
+        """Verb -> handler: takes the body, returns metrics, may raise `PhalanxError`."""
         return {
             "settings": self._settings,
             "set": self._set,
@@ -204,28 +166,19 @@ class CameraTuning:
         }
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of changed files and the events of the camera.
-
-        `reload.applied`, `reload.refused`: changed files.
-        """
+        """`reload.applied`, `reload.refused` of changed files; events of the camera."""
         own = {"reload.applied": self._applied, "reload.refused": self._refused}
         return own if self._source is None else {**own, **self._source.counts()}
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics of the camera and of the content in use.
-
-        What the camera has and does now, and what the content in use specifies of settings, size and colours.
-        """
+        """What the camera has and does now, and what the content in use specifies."""
         used = self._used
         stated = {WANTED + name: value for name, value in figures(used.camera).items()}
         stated |= in_use(used.camera, used.rig.markers)
         return stated if self._source is None else {**self._source.metrics(), **stated}
 
     def look(self) -> None:
-        """Apply the files if they were changed.
-
-        Where that fails, log so once and go on as before.
-        """
+        """Apply the files if they were changed; if that fails, log so once and go on."""
         with self._lock:
             if not self._running() or not self._monitored.changed(self._used.paths):
                 return
@@ -288,13 +241,9 @@ class CameraTuning:
         return self._settings("")
 
     def _apply(self, new: CameraFiles, *, forget: bool = False) -> bool:
-        """Put these files in use, wholly or not at all.
+        """Put these files in use, wholly or not at all; False if they are in use.
 
-        False if they are in use. Only to `forget` may they lack colours.
-
-        Raises:
-            CalibrationError: They need a restart, or lack colours.
-            CameraError: The camera did not take its settings.
+        Only to `forget` may they lack colours.
         """
         old = self._used
         _refuse_restart(old, new)
@@ -315,11 +264,9 @@ class CameraTuning:
 
 
 def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibration) -> CameraCalibration:
-    """Merge a changed camera file into the one in use.
+    """Merge a file that changed from `was` to `now` into the one in use.
 
-    The file has changed from `was` to `now`; what it left unchanged stays as in use.
-
-    That holds of its settings together, and of its colours: a lens that was calibrated meanwhile takes nothing back.
+    Settings, or colours, that it left unchanged stay as in use.
     """
     kept: dict[str, object] = {}
     if all(getattr(was, key) == getattr(now, key) for key in SETTINGS):
@@ -332,7 +279,7 @@ def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibrat
 
 
 def _with_provenance(camera: CameraCalibration, verb: str, markers: Iterable[str]) -> CameraCalibration:
-    """Return the camera file with a record of when and how its colours were made."""
+    """The camera file with a record of when and how its colours were made."""
     note = "picked in the running slave" if verb == "pick" else "ranges set by hand in the running slave"
     tool, before = f"phalanx-slave {verb}", camera.provenance.get(MARKERS)
     others = before.data if before is not None and before.tool == tool else ()
@@ -352,12 +299,9 @@ def _refuse_lost(old: CameraFiles, new: CameraFiles) -> None:
     was, now = (files.camera.markers or {} for files in (old, new))
     if lost := [name for name in new.rig.markers if name in was and name not in now]:
         raise CalibrationError(
-            f"camera {new.camera.name!r}: markers: no HSV range for {', '.join(lost)}, which {_has(lost)} one in use"
+            f"camera {new.camera.name!r}: markers: no HSV range for {', '.join(lost)}, which "
+            f"{'has' if len(lost) == 1 else 'have'} one in use"
         )
-
-
-def _has(names: list[str]) -> str:
-    return "has" if len(names) == 1 else "have"
 
 
 def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:

@@ -1,10 +1,7 @@
-"""Slave's end of the connection to the master.
+"""Connect to the master: wait for its start, then send without ever waiting.
 
-It waits for the master's start, then sends without ever waiting.
-
-A socket around `slave.link`: one thread receives the beacons, one what the master sends to this
-slave. The camera loop calls `send`; a datagram that cannot go now is counted and forgotten,
-because the next frame is worth more than this one.
+Sockets around `slave.link`: one thread receives the beacons, one what the master sends to this slave. A datagram that
+cannot go now is counted and forgotten, because the next frame matters more.
 """
 
 import logging
@@ -28,10 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Uplink:
-    """Datagrams from one slave to whichever master is there.
-
-    Holds two sockets, two threads, and the link's state behind a lock.
-    """
+    """Datagrams from one slave to whichever master is there."""
 
     def __init__(
         self,
@@ -47,10 +41,8 @@ class Uplink:
         Args:
             name: Camera or IMU, as the rig's file calls it.
             key: Rig key (32 bytes), alone or with this device's secret.
-            clock: The clock of all times that this slave sends.
             beacon_port: UDP port of the beacons; several slaves of one machine share it.
             bind: Where to receive: 0.0.0.0 for every network, or an address of this machine.
-            random: Source of nonces.
 
         Raises:
             BusError: The port or address cannot be bound.
@@ -82,10 +74,7 @@ class Uplink:
 
     @property
     def started(self) -> bool:
-        """Return whether a master has sent start and is still there.
-
-        Else what is sent is dropped.
-        """
+        """Whether a master has sent start and is still there; else nothing is sent."""
         with self._lock:
             return self._link.started
 
@@ -103,19 +92,13 @@ class Uplink:
 
     @property
     def wrong(self) -> str | None:
-        """Return why no master accepts this slave, where that is known.
-
-        A duplicate sender, another wire version, another secret.
-        """
+        """Why no master accepts this slave, if known; see `SlaveLink.wrong`."""
         with self._lock:
             return self._link.wrong
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return the event counts.
-
-        Event -> how often: sent, unsent (no start), would_block, send_failed, refused.<reason>.
-        """
+        """sent, unsent (no start), would_block, send_failed, refused.<reason>."""
         with self._lock:
             counts = {
                 "sent": self._sent,
@@ -126,10 +109,7 @@ class Uplink:
             return counts | {f"refused.{reason}": n for reason, n in self._link.refused.items()}
 
     def wait_for_start(self, timeout_s: float) -> bool:
-        """Wait until the master has sent start and its start time is reached.
-
-        False after `timeout_s`.
-        """
+        """Wait until the start time that the master has sent; False after `timeout_s`."""
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while (now_ns := self._clock.now_ns()) < deadline_ns and not self._closing.is_set():
             start_t_ns = self.start_t_ns if self.started else None
@@ -140,11 +120,7 @@ class Uplink:
         return False
 
     def send(self, message: Message) -> None:
-        """Send `message` to the master, or count it as unsent; never waits.
-
-        Raises:
-            ValueError: The message does not fit into a datagram.
-        """
+        """Send `message`, which must fit a datagram, or count it as unsent; never wait."""
         with self._lock:
             sealed = self._link.seal(message)
             if sealed is None:
@@ -179,23 +155,14 @@ class Uplink:
 
 
 class News:
-    """Filter of repeated messages for the log.
-
-    A line passes if it differs from the last one, at least `LOG_NS` after it.
-
-    Whoever has the rig key can send this slave something else with each datagram; its log is not filled by that.
-    """
+    """Filter of the log, as any datagram may change it: other lines, a second apart."""
 
     def __init__(self) -> None:
-        """Begin without any logged line."""
         self._line: str | None = None
         self._logged_ns: int | None = None
 
     def is_new(self, line: str | None, t_ns: int) -> bool:
-        """Return whether to log `line` at `t_ns` [ns].
-
-        None: there is nothing to log, and whatever comes next is new.
-        """
+        """Whether to log `line` at `t_ns` [ns]; after None whatever comes next is new."""
         if line is None or line == self._line:
             self._line = line
             return False
@@ -206,10 +173,10 @@ class News:
 
 
 def _hosts(bind: str) -> tuple[str, str]:
-    """Return where to bind for beacons and for data.
+    """Where to bind for beacons and for data; raises `BusError`.
 
-    A socket bound to one address of the machine receives no broadcast (Linux, ip(7)), hence the
-    loopback's broadcast address for a loopback address, and every network for any other.
+    A socket bound to one address of the machine receives no broadcast (Linux, ip(7)), hence the loopback's broadcast
+    address for a loopback address, and every network for any other.
     """
     try:
         address = IPv4Address(bind)

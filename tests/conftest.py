@@ -39,6 +39,7 @@ OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py
 
 _KERNELS = (
     "common/kernels.py",
+    "common/records.py",
     "common/hand/skin.py",
     "master/fabrik/*.py",
     "master/estimator/*.py",

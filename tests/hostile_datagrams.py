@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
-from bench.rigs.faults import FaultRig
-from bench.rigs.poses import Judged
+from bench.rigs.faults import FaultRig, Judged
 from common.link.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
 from common.link.handshake import RigKeys
 from common.messages import WIRE_VERSION

@@ -1,16 +1,10 @@
 """Message bus: messages and commands over reliable links.
 
-One interface with two implementations.
-
-`LoopbackBus` joins the parts of one process, `common.bus.zenoh_bus.ZenohBus` joins processes; the
-same tests run against both. Streams with the path DATAGRAM never come here.
-
-A subscription holds at most `depth` messages and drops the oldest: who reads too slowly sees
-what is new, and how much was dropped. A message is encoded and decoded by either bus, so
-receivers never share objects and never see one that `common.messages` would refuse.
-Of what devices send, so much is accepted of each per second (`common.messages.streams`), before it is
-decoded: a sender of more
-costs nobody's time.
+One interface, two implementations: `LoopbackBus` joins the parts of one process, `common.bus.zenoh_bus.ZenohBus` joins
+processes; the same tests run against both. Streams with the path DATAGRAM never come here. A subscription holds at
+most `depth` messages and drops the oldest. Either bus encodes and decodes, so receivers never share objects and never
+see a message that `common.messages` would refuse. A device's messages above the rate of its stream are dropped
+undecoded.
 """
 
 import threading
@@ -53,9 +47,7 @@ class Bus(Protocol):
     """Publish and subscribe, ask and serve, and who is alive."""
 
     def publish(self, stream: str, name: str, message: Message) -> None:
-        """Publish `message` of `stream` under the sender's `name`.
-
-        Never waits for a receiver.
+        """Publish `message` of `stream` under the sender's `name`; never waits.
 
         Raises:
             ValueError: Unknown stream, a datagram stream, a message of another type.
@@ -88,10 +80,7 @@ class Bus(Protocol):
         ...
 
     def announce(self, name: str) -> None:
-        """List this process as `name` in everybody's `alive`.
-
-        The entry lasts until this bus closes or the process dies.
-        """
+        """List this process as `name` in everybody's `alive` until it leaves or dies."""
         ...
 
     def alive(self) -> frozenset[str]:
@@ -104,21 +93,14 @@ class Bus(Protocol):
 
 
 class Inbox:
-    """Bounded queue behind every subscription.
+    """Bounded queue of a subscription: full, it drops the oldest; decodes on reading.
 
-    It drops the oldest message when full, and decodes on reading.
-
-    Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
-    under which name is up to the bus, so no message can be another's. Besides, how many of each name
-    may come now.
+    Holds encoded messages of the type `kind`, each with the name under which it came, and the rate of each name. Who
+    may send under which name is up to the bus, so no message can be another's.
     """
 
     def __init__(self, stream: str, depth: int, on_close: Callable[["Inbox"], None]) -> None:
-        """Create the queue for `stream`; `on_close` is called once, by `close`.
-
-        Raises:
-            ValueError: `depth` is below 1.
-        """
+        """Queue for `stream`; `close` calls `on_close` once. `depth` is at least 1."""
         if depth < 1:
             raise ValueError(f"depth={depth}: must be at least 1")
         self._kind, self._most_hz = STREAMS[stream].message, STREAMS[stream].most_hz
@@ -207,11 +189,7 @@ def stream_key(stream: str, name: str) -> str:
 
 
 def payload_of(stream: str, message: Message) -> bytes:
-    """Return `message` encoded.
-
-    Raises:
-        ValueError: `message` is not of the stream's type.
-    """
+    """Return `message` encoded; raises ValueError if it is not of the stream's type."""
     kind = STREAMS[stream].message
     if not isinstance(message, kind):
         raise ValueError(f"stream {stream!r} carries {kind.__name__}, not {type(message).__name__}")
@@ -219,10 +197,7 @@ def payload_of(stream: str, message: Message) -> bytes:
 
 
 class _Hub:
-    """Shared state of the ends of one loopback bus.
-
-    Subscriptions by key, handlers and names.
-    """
+    """Shared state of the ends of one loopback bus."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -232,10 +207,7 @@ class _Hub:
 
 
 class LoopbackBus:
-    """The bus inside one process, for tests and for parts that live together.
-
-    Holds one end; `join` gives another end of the same bus, which can close by itself.
-    """
+    """One end of a bus inside one process; `join` gives another."""
 
     def __init__(self, hub: _Hub | None = None) -> None:
         """Open a new bus, or (by `join`) another end of an open one."""

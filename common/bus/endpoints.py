@@ -1,15 +1,8 @@
 """Endpoints say where a bus is, and a diagnosis says why one refuses.
 
-Bus endpoints: which may leave the machine, and which one a program uses.
-
-Also where a listener can be reached.
-
 `tls/HOST:PORT` (or `quic/`) is encrypted, and both sides prove who they are. `tcp/` is neither: it stays on a loopback
-address, which other machines cannot reach, unless `--open` is given.
-
-Diagnosis of why an encrypted bus cannot be established.
-
-zenoh does not report that a certificate was refused.
+address, which other machines cannot reach, unless `--open` is given. zenoh does not report that a certificate was
+refused, so a handshake by hand finds the cause.
 """
 
 import logging
@@ -79,10 +72,7 @@ def port_of(endpoint: str) -> int:
 
 
 def default_bus(environment: Mapping[str, str]) -> str:
-    """Return the bus of a program that was given none.
-
-    Encrypted where there are keys, on this machine in any case.
-    """
+    """The bus of a program that was given none: on this machine, encrypted if keyed."""
     port = 47802
     return f"{'tcp' if keys_folder(environment) is None else 'tls'}/127.0.0.1:{port}"
 
@@ -106,16 +96,10 @@ _LOG = logging.getLogger(__name__)
 
 
 def why_refused(endpoint: str, identity: Identity) -> str:
-    """Try a handshake by hand and return what went wrong, as text for the user.
-
-    Empty: nothing went wrong.
+    """Try a handshake by hand; what went wrong, as text for the user, or empty.
 
     Takes up to a second. An answer that comes after the handshake is read, too: with TLS 1.3 the side that listens
-    refuses a certificate only then.
-
-    Args:
-        endpoint: As `tls/192.168.1.2:47802`; for `quic/` no cause can be determined.
-        identity: Own certificate.
+    refuses a certificate only then. For `quic/` no cause can be determined.
     """
     if not endpoint.startswith("tls/"):
         return ""
@@ -159,10 +143,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
 
 
 def _why_invalid(endpoint: str, identity: Identity) -> str:
-    """Return which certificate is not valid by the clock of this machine.
-
-    It is that of the rig, or that of who listens.
-    """
+    """Which certificate, the rig's or the listener's, our clock takes for invalid."""
     now = datetime.now(UTC)
     named = {"the certificate of this rig (ca.pem)": shown(identity.authority.read_bytes())}
     if (there := _shown_there(endpoint)) is not None:
@@ -176,10 +157,7 @@ def _why_invalid(endpoint: str, identity: Identity) -> str:
 
 
 def _why_expired_there(identity: Identity) -> str:
-    """Return why the listener refused our certificate as not valid now.
-
-    By our clock it is not valid either, or the clock there is wrong.
-    """
+    """Why the listener refused our certificate: invalid now, or a clock is wrong."""
     now, own = datetime.now(UTC), shown(identity.certificate.read_bytes())
     whose = f"the certificate of {identity.name!r}"
     if fault := own.invalid_at(now, whose):
@@ -192,10 +170,7 @@ def _why_expired_there(identity: Identity) -> str:
 
 
 def _shown_there(endpoint: str) -> Shown | None:
-    """The certificate of who listens, whatever its validity.
-
-    None: it could not be read.
-    """
+    """The listener's certificate, whatever its validity; None: it cannot be read."""
     try:
         pem = ssl.get_server_certificate((host_of(endpoint), port_of(endpoint)), timeout=_PATIENCE_S)
         return shown(pem.encode("ascii"))
@@ -206,9 +181,7 @@ def _shown_there(endpoint: str) -> Shown | None:
 def log_why_alone(
     peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
 ) -> threading.Thread:
-    """Log, on a thread, why no peer is connected.
-
-    It logs once this has lasted two seconds, and again when the reason changes.
+    """Log, on a thread, why no peer is connected, after 2 s and at each new reason.
 
     Args:
         peers: How many are connected.

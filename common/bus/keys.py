@@ -1,27 +1,17 @@
 """Keys and certificates are the credentials by which a process joins a rig.
 
-Certificates of a rig: which processes may join its bus.
+The rig key of the datagrams is 32 random bytes that all processes of a rig share, written as 64 hexadecimal digits. It
+is in a file that only its owner can read, or in the environment variable PHALANX_RIG_KEY; never on a command line,
+where every user of the machine could see it.
 
-The rig is its own certificate authority, which signs nothing outside the rig.
+On the bus each process proves who it is by a certificate whose common name is its role (`master`, `operator`) or, of a
+device, its name. The rig is its own certificate authority. Only the master's may be shown by the side that listens
+(extended key usage serverAuth): whoever steals a camera's key cannot play the master before the other cameras.
+Certificates are valid from 1970 on, because a Raspberry Pi has no clock battery: without network time it starts at the
+time of its last shutdown or of its system image, and would refuse each certificate that is younger. They end after ten
+years: `phalanx fleet keys --renew` makes new ones.
 
-Each process proves who it is by a certificate whose common name is its role (`master`, `operator`) or, of a device, its
-name on the bus. Only the master's may be shown by the side that listens (extended key usage serverAuth): whoever steals
-a camera's key cannot play the master before the other cameras.
-
-They are valid from 1970 on, because a Raspberry Pi has no clock battery: where the network does not provide the time,
-it starts at the time of its last shutdown or of its system image, and would refuse each certificate that is younger.
-They end ten years after they were made: `phalanx fleet keys --renew` makes new ones.
-
-Credentials of a process, and where they come from.
-
-The rig key of the datagrams, and a certificate on the bus.
-
-The rig key is 32 random bytes that all processes of a rig share, written as 64 hexadecimal digits. It is in a file that
-only its owner can read, or in the environment variable PHALANX_RIG_KEY; never on a command line, where every user of
-the machine could see it.
-
-A *keys folder* has all that processes need; `--keys DIR` or the variable PHALANX_KEYS names it. `phalanx fleet keys
-make` makes it (docs/keys.md):
+A *keys folder* has all that processes need; `--keys DIR` or the variable PHALANX_KEYS names it (docs/keys.md):
 
 | file | what |
 |---|---|
@@ -32,8 +22,8 @@ make` makes it (docs/keys.md):
 | `devices/NAME.pem`, `.key` | of each device; on the device itself `device-NAME.pem`, or `device.pem` if it is alone |
 | `devices/NAME.secret` | of each device, for its datagrams; on the device `device-NAME.secret` or `device.secret` |
 
-Who is given the rig key alone has the secrets that follow from it. Who is given a folder needs what is in it: an older
-one, without secrets, is refused with the command that adds them, and does not make the rig weaker in silence.
+Who is given the rig key alone has the secrets that follow from it. A folder without secrets is refused with the
+command that adds them, and does not make the rig weaker in silence.
 """
 
 import secrets
@@ -62,22 +52,14 @@ CLOCK_FIX = (
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """A certificate and its private key, both as PEM.
-
-    Attributes:
-        certificate: May be shown to everybody.
-        key: Must not.
-    """
+    """A certificate, for everybody, and its private key, for its owner; both as PEM."""
 
     certificate: bytes
     key: bytes
 
 
 def new_authority(now: datetime) -> KeyPair:
-    """Return a new certificate authority (ECDSA P-256).
-
-    It may sign certificates of processes, but no other authority.
-    """
+    """Return a new certificate authority (ECDSA P-256) that signs processes only."""
     private = ec.generate_private_key(ec.SECP256R1())
     name = _named("Phalanx rig")
     draft = _draft(name, name, private.public_key(), now).add_extension(
@@ -88,9 +70,7 @@ def new_authority(now: datetime) -> KeyPair:
 
 
 def issue(authority: KeyPair, name: str, now: datetime) -> KeyPair:
-    """Return a new certificate for the process or device `name`.
-
-    Only the certificate of `MASTER` may listen.
+    """Return a new certificate for a process or device; only `MASTER`'s may listen.
 
     Raises:
         PhalanxError: The authority's PEM is broken.
@@ -126,8 +106,7 @@ class Shown:
     Attributes:
         name: Role or device.
         listens: Whether it may be shown by the side that listens.
-        since: Beginning of its validity.
-        until: End of its validity.
+        since, until: Validity.
         fingerprint: First 16 hexadecimal digits of its SHA-256, to distinguish two of one name.
     """
 
@@ -138,13 +117,9 @@ class Shown:
     fingerprint: str
 
     def invalid_at(self, now: datetime, whose: str) -> str:
-        """Return why the certificate is not valid at `now`, with its validity period.
+        """Why the certificate is not valid at `now` (with its zone); empty: it is valid.
 
-        Empty: it is valid.
-
-        Args:
-            now: Time of the clock of this machine, with its zone.
-            whose: Subject of the sentence, for example `the certificate of 'left'`.
+        `whose`: subject of the sentence, for example `the certificate of 'left'`.
         """
         if self.since <= now <= self.until:
             return ""
@@ -156,11 +131,7 @@ class Shown:
 
 
 def shown(pem: bytes) -> Shown:
-    """Read a certificate.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Read a certificate; raises ValueError if it is none."""
     certificate = x509.load_pem_x509_certificate(pem)
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     try:
@@ -219,9 +190,7 @@ def _signed(
     return KeyPair(
         certificate.public_bytes(serialization.Encoding.PEM),
         private.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         ),
     )
 
@@ -263,14 +232,10 @@ def link_key(
     keys: Path | None = None,
     device: str | None = None,
 ) -> LinkKey:
-    """Return what a process seals its datagrams with.
-
-    The rig key as `rig_key` finds it, and its secrets.
+    """Return what a process seals its datagrams with: the rig key, and its secrets.
 
     Args:
-        environment: As of `rig_key`.
-        key_file: File that has the rig key alone.
-        keys: Keys folder.
+        environment, key_file, keys: As of `rig_key`; the file has the rig key alone.
         device: Name of the device that the process is; None: the master, who knows the secrets of all.
 
     Raises:
@@ -292,11 +257,7 @@ def link_key(
 
 
 def secret_of(folder: Path, device: str) -> Path:
-    """Where a keys folder has the secret of a device.
-
-    Raises:
-        PhalanxError: Nowhere.
-    """
+    """Where a keys folder has the secret of a device; raises PhalanxError if nowhere."""
     places = [place.with_name(f"{place.name}.secret") for place in _places(folder, device)]
     if (found := next((path for path in places if path.exists()), None)) is not None:
         return found
@@ -318,9 +279,7 @@ def keys_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def _others_read(path: Path, what: str, environment: Mapping[str, str]) -> str | None:
-    """Return why a private file, which has `what`, is not private.
-
-    Others than its owner can read it; None: all is well.
+    """Why others than the owner can read a private file, which has `what`, or None.
 
     In the folder of a service's credentials the mask of an access-control list stands where the group's bits are.
     """
@@ -410,10 +369,7 @@ class Access:
 def access_of(
     environment: Mapping[str, str], role: str, keys: Path | None = None, open_bus: bool = False
 ) -> Access:
-    """Return how a process of `role` accesses the bus.
-
-    From its options `--keys` and `--open` or its environment.
-    """
+    """How a process of `role` accesses the bus, by its options or environment."""
     return Access(
         role, keys or keys_folder(environment), open_bus or environment.get(OPEN) == "1", environment
     )

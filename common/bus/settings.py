@@ -1,11 +1,9 @@
 """Settings configure zenoh for one process, with the bus's access rules.
 
-Access rules of an encrypted bus: which process may send what.
-
-Uses zenoh's access control, by the common names of certificates.
-
-Nothing is allowed that is not named here. What a device sends goes to whoever listens; it receives only what the
-master passes on:
+Everything that is not safe or fast by default is set here. zenoh's access control goes by the common names of
+certificates; nothing is allowed that is not named. The same table is in force on both sides: the master applies it to
+each that connects, and a device takes from its link nothing but commands to itself, from whoever has a certificate of
+the name `master`.
 
 | who | may |
 |---|---|
@@ -15,13 +13,6 @@ master passes on:
 
 A program of an operator reports its health, that it is alive, and takes commands; it sends no poses, and never acts as
 the master or a device.
-
-The same table is in force on both sides: the master applies it to each that connects, and a device takes from its link
-nothing but commands to itself, from whoever has a certificate of the name `master`.
-
-zenoh's configuration for one process.
-
-Everything that is not safe or fast by default is set here. Pure.
 """
 
 from collections.abc import Iterable, Sequence
@@ -40,11 +31,7 @@ Rule = dict[str, object]
 
 
 def rules_of_master(devices: Iterable[str]) -> dict[str, object]:
-    """zenoh's `access_control` for the side that listens.
-
-    Args:
-        devices: Names of the devices that may connect; messages of others are dropped.
-    """
+    """zenoh's `access_control` for the listener; other devices' messages are dropped."""
     names = sorted(set(devices))
     program = [key_of("health", "*"), key_of("command", "*"), ALIVE_KEY.format(name="*")]
     taken = [key for name in (MASTER, *names) for key in _own(name)]
@@ -69,11 +56,7 @@ def rules_of_master(devices: Iterable[str]) -> dict[str, object]:
 
 
 def rules_of_device(name: str) -> dict[str, object]:
-    """Return zenoh's `access_control` for a device.
-
-    From its link the device accepts commands addressed to itself, and the subscriptions of those who ask for its
-    data.
-    """
+    """zenoh's `access_control` for a device: commands to itself, its subscribers."""
     rules = [
         _rule("is told", "ingress", ("query",), [key_of("command", name)]),
         _rule("is asked for", "ingress", ("declare_subscriber", "liveliness_query"), _EVERYTHING),
@@ -83,20 +66,14 @@ def rules_of_device(name: str) -> dict[str, object]:
 
 
 def rules_of_router() -> dict[str, object]:
-    """Return zenoh's `access_control` for a router.
-
-    Processes that may run or read a rig pass; devices do not.
-    """
+    """zenoh's `access_control` for a router: masters and operators, no device."""
     rules = [_rule("in", "ingress", _ALL, ["**"]), _rule("out", "egress", _ALL, ["**"])]
     policies = [_policy(["in", "out"], name) for name in (MASTER, OPERATOR)]
     return _access(rules, [MASTER, OPERATOR], policies)
 
 
 def _of_device(name: str) -> list[str]:
-    """Return all keys under which a device publishes.
-
-    The reader of a message compares the name inside it with its key.
-    """
+    """Keys under which a device publishes; readers compare names inside messages."""
     return [*(key_of(stream, name) for stream in _PUBLISHED_BY_DEVICES), ALIVE_KEY.format(name=name)]
 
 
@@ -107,10 +84,9 @@ def _own(name: str) -> list[str]:
 
 
 def _rule(name: str, flow: str, messages: Iterable[str], keys: list[str], *, allow: bool = True) -> Rule:
-    permission = "allow" if allow else "deny"
     return {
         "id": name,
-        "permission": permission,
+        "permission": "allow" if allow else "deny",
         "flows": [flow],
         "messages": list(messages),
         "key_exprs": keys,
@@ -164,8 +140,7 @@ def settings(
         "tx": {"lease": lease_ms, "queue": {"size": LINK_QUEUE}},
         "rx": {"max_message_size": max_message_bytes},
     }
-    # a viewer tries a master that is not there for so long, then reports that it waits
-    client_timeout_ms = 500
+    client_timeout_ms = 500  # a viewer tries an absent master for so long, then reports that it waits
     made: dict[str, object] = {
         "mode": mode,
         "listen": {"endpoints": [listen] if listen else [], "exit_on_failure": True},
@@ -192,10 +167,7 @@ def settings(
 
 
 def _tls(identity: Identity) -> dict[str, object]:
-    """Return the TLS settings; both sides present a certificate.
-
-    The listener needs a certificate issued for that use, so its address need not be the name in it.
-    """
+    """TLS settings; the listener's certificate is issued for that use, any address."""
     pair = str(identity.certificate), str(identity.key)
     return {
         "root_ca_certificate": str(identity.authority),

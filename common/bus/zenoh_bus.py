@@ -1,13 +1,10 @@
 """The bus between processes, over zenoh: the only file that knows zenoh.
 
-The master listens, everybody else connects to it; there is no router and no discovery, so a
-process sees only the one it is connected to (and, on the master, everybody). What zenoh does by
-default and must not do here: listen on every interface, join any peer of the network by multicast
-or gossip, notice a pulled cable after 10 s, come back to a restarted master after 4 s, take
-messages of 1 GiB. Links are reliable (tcp, tls, quic): on bare udp its handshake can stay silent.
-
-Samples and commands are read from zenoh's fifo by one thread each, never in a callback on
-zenoh's own threads.
+The master listens, everybody else connects to it; there is no router and no discovery, so a process sees only the one
+it is connected to (and, on the master, everybody). What zenoh does by default and must not do here: listen on every
+interface, join any peer of the network by multicast or gossip, notice a pulled cable after 10 s, come back to a
+restarted master after 4 s, take messages of 1 GiB. Links are reliable (tcp, tls, quic): on bare udp its handshake can
+stay silent. zenoh's fifos are read by one thread each, never in a callback on zenoh's own threads.
 """
 
 import atexit
@@ -43,9 +40,8 @@ _LOG = logging.getLogger(__name__)
 class ZenohBus:
     """One process on the bus (see `common.bus.bus.Bus`).
 
-    Holds the zenoh session and everything declared on it. An unreachable peer does not delay the
-    constructor by more than half a second; zenoh goes on trying, and everything declared here
-    holds again once the peer is back. `open` states whether it leaves this machine as plain text.
+    An unreachable peer does not delay the constructor by more than half a second; zenoh goes on trying, and everything
+    declared here holds again once the peer is back. `open` states whether it leaves this machine as plain text.
     """
 
     def __init__(
@@ -59,19 +55,15 @@ class ZenohBus:
         router: bool = False,
         namespace: str | None = None,
     ) -> None:
-        """Listen on an endpoint, connect to one, or both.
-
-        For example `tls/127.0.0.1:47802`.
-
-        With `beyond`, this process sees and asks also those that are connected to the one it connects to:
-        a viewer at the master reaches the slaves. It is a client then, listens nowhere, and that one must be there.
+        """Listen on an endpoint, connect to one (`tls/127.0.0.1:47802`), or both.
 
         Args:
             listen: Endpoint where others connect to; needs the master's certificate if it is encrypted.
             connect: Endpoint of who listens; of several only for a router.
             access: Certificates, and whether plain text may leave the machine; None: as the variables PHALANX_KEYS and
                 PHALANX_OPEN define them, for a master if it listens, else for an operator.
-            beyond: See above.
+            beyond: See and ask also those that are connected to the one it connects to: a viewer at the master reaches
+                the slaves. It is a client then, listens nowhere, and that one must be there.
             devices: Names that may connect, beside those whose certificates are in the keys folder.
             router: Pass everything on between all that are connected, in place of being one of them.
             namespace: Site whose keys these are, at a router of several.
@@ -202,10 +194,7 @@ class ZenohBus:
             self._undeclare.append(_quietly(queryable))
 
     def ask(self, command: Command, timeout_s: float) -> Health:
-        """Ask, waiting for the target to appear until `timeout_s` is over.
-
-        See `Bus.ask`.
-        """
+        """Ask, waiting for the target to appear until `timeout_s` is over. See `Bus.ask`."""
         self._check_open()
         deadline = time.monotonic() + timeout_s
         key = key_of("command", command.target)
@@ -310,10 +299,7 @@ def _plain(error: zenoh.ZError) -> str:
 
 
 def _start(name: str, step: Callable[[], None], ended: Callable[[], bool]) -> threading.Thread:
-    """Repeat `step` on a thread until zenoh closes what it reads from.
-
-    That is a failure unless `ended` reports that it was meant to.
-    """
+    """Repeat `step` on a thread until zenoh ends its source: a fault unless `ended`."""
 
     def run() -> None:
         try:

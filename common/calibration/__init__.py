@@ -1,10 +1,7 @@
 """Typed files of calib_json: JSON enters, checked values leave, or an error.
 
-Typed files of calib_json: load, validate, save atomically.
-An unknown key is refused with file and key.
-
-A rig is a JSON file, not a class: cameras, markers, depth model and hand are data. Units stand in the key
-names where they are not SI. The JSON schema of each file is exported to docs/ from these types.
+A rig is a JSON file, not a class: cameras, markers, depth model and hand are data. Units stand in the key names where
+they are not SI; an unknown key is refused with file and key. docs/schema has the JSON schema of each file type.
 """
 
 import inspect
@@ -105,24 +102,14 @@ def load(path: Path, kind: type[StructT]) -> StructT:
 
 
 def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
-    """Decode JSON bytes as `kind`; `where` names the source in errors.
-
-    Raises:
-        CalibrationError: As `load`.
-    """
+    """Decode JSON bytes as `kind`, as `load`; `where` names the source in errors."""
     value = decode_json(raw, kind, where)
     check(value, where)
     return value
 
 
 def check(value: Struct, where: str) -> None:
-    """Refuse parts of one file that contradict each other.
-
-    The types alone cannot detect this.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse contradictions within a file: CalibrationError with `where` and the key."""
     if isinstance(value, RigCalibration):
         check_rig(value, where)
     elif isinstance(value, ObjectProfile):
@@ -140,15 +127,12 @@ def check(value: Struct, where: str) -> None:
 def save(path: Path, value: Struct) -> None:
     """Write a calibration file atomically.
 
-    A reader sees the old file or the new one, never half of one.
-
     Raises:
         CalibrationError: The folder is missing, read-only or full, or the value would not come back
             as it is (a NaN, a number out of range); the old file is untouched.
     """
-    text = (
-        compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()).encode() + b"\n"
-    )
+    formatted = msgspec.json.format(msgspec.json.encode(value), indent=1).decode()
+    text = compact_numbers(formatted).encode() + b"\n"
     if parse(text, type(value), str(path)) != value:
         raise CalibrationError(f"{path}: a NaN, or a list in place of a tuple, would not come back as it is")
     try:
@@ -162,10 +146,7 @@ _STRING_OR_NUMBERS = re.compile(r'"(?:[^"\\]|\\.)*"|\[[\s\d.,eE+-]+\]')
 
 
 def compact_numbers(text: str) -> str:
-    """Put arrays of plain numbers on one line; strings are unchanged.
-
-    This keeps a calibration file readable.
-    """
+    """Put arrays of plain numbers on one line, for people; strings are unchanged."""
 
     def compact(found: re.Match[str]) -> str:
         part = found[0]
@@ -175,10 +156,7 @@ def compact_numbers(text: str) -> str:
 
 
 def schema(kind: type[Struct]) -> bytes:
-    """Return the formatted JSON schema of one file type.
-
-    The bytes are the same on every Python version.
-    """
+    """The formatted JSON schema of a file type, the same on every Python version."""
     content = msgspec.json.schema(kind)
     for part in content["$defs"].values():
         # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.

@@ -44,10 +44,8 @@ class Intrinsics(Part, frozen=True):
 class HsvRange(Part, frozen=True):
     """Colour range of one marker in OpenCV's HSV (H 0-179).
 
-    hsv_low[0] > hsv_high[0] wraps through 0.
-
-    `reference_bgr_linear` is the mean marker colour in linear light, blue first, 1 = white, at calibration; with
-    it a slave follows changes of the light.
+    hsv_low[0] > hsv_high[0] wraps through 0. `reference_bgr_linear` is the mean marker colour in linear light, blue
+    first, 1 = white, at calibration; with it a slave follows changes of the light.
     """
 
     hsv_low: Hsv
@@ -79,12 +77,7 @@ class CameraCalibration(Part, frozen=True):
 
 
 def check_camera(camera: CameraCalibration, where: str) -> None:
-    """Refuse what the types alone cannot.
-
-    Raises:
-        CalibrationError: The colours of a marker are an empty range, or the lens does not fit the picture; with
-            `where` and the key.
-    """
+    """Refuse an empty colour range, and what `check_lens` refuses (CalibrationError)."""
     if camera.intrinsics is not None:
         check_lens(camera.intrinsics, (camera.width_px, camera.height_px), where)
     for name, colour in (camera.markers or {}).items():

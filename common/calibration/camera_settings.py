@@ -1,10 +1,8 @@
 """Camera settings that can change while the camera runs.
 
-Defines the bodies of the commands "set" and "pick", and what a slave answers.
-
-A slave answers every command about its camera with a `Health` whose metrics are what the camera has now, read back, by
-the names of `figures`, and, with the prefix `WANTED`, values of the camera file in use; beside them the colour ranges
-in use, by `range_figures`.
+Bodies of the commands "set" and "pick". A slave answers every command about its camera with a `Health` whose metrics
+are what the camera has now, read back, by the names of `figures`, and, with the prefix `WANTED`, values of the camera
+file in use; beside them the colour ranges in use, by `range_figures`.
 """
 
 from collections.abc import Iterable
@@ -23,9 +21,7 @@ _OF_CAMERA = ("exposure_us", "analogue_gain", "colour_gains", "frame_rate_hz", "
 
 
 class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """Body of the command "set".
-
-    Keys and units are those of the camera file; absent settings stay unchanged.
+    """Body of the command "set", keys and units of the camera file, else unchanged.
 
     Of `markers` those that are named are replaced; null forgets a colour. A range without `reference_bgr_linear` keeps
     the one that the marker has.
@@ -39,11 +35,7 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     markers: dict[Name, HsvRange | None] | None = None
 
     def over(self, camera: CameraCalibration) -> CameraCalibration:
-        """The camera file with these settings in place of its own.
-
-        Raises:
-            CalibrationError: A range contradicts itself.
-        """
+        """The camera file with these settings; CalibrationError for a bad range."""
         given = {name: value for name, value in msgspec.structs.asdict(self).items() if value is not None}
         if self.markers is not None:
             given["markers"] = self._ranges(camera.markers or {}) or None
@@ -68,7 +60,6 @@ class ColourPick(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, 
     """Body of the command "pick": the marker, and a pixel of its colour.
 
     Attributes:
-        marker: A marker of the rig.
         uv: Pixel [px] of the whole frame.
         t_ns: Time of the preview clicked on [ns], by its stamp; the frame is kept for a second. Without it, or
             later, the newest frame is taken, in which a moving hand is elsewhere.
@@ -85,10 +76,7 @@ def same_exposed(a: CameraCalibration, b: CameraCalibration) -> bool:
 
 
 def figures(camera: CameraCalibration) -> dict[str, float]:
-    """Return the settings of a camera file by the names of metrics.
-
-    The gains of red and blue are relative to green.
-    """
+    """Settings of a camera file by names of metrics; gains relative to green."""
     red, blue = camera.colour_gains
     return {
         "exposure_us": camera.exposure_us,
@@ -100,10 +88,7 @@ def figures(camera: CameraCalibration) -> dict[str, float]:
 
 
 def range_figures(camera: CameraCalibration, markers: Iterable[str]) -> dict[str, float]:
-    """Return `roi_margin` and the HSV bounds of the markers that have a colour.
-
-    The bounds are named `marker.NAME.h_low` ... `.v_high`.
-    """
+    """`roi_margin` and HSV bounds of markers: `marker.NAME.h_low` ... `.v_high`."""
     found = {"roi_margin": camera.roi_margin}
     for name in markers:
         if (colour := (camera.markers or {}).get(name)) is not None:
@@ -113,11 +98,7 @@ def range_figures(camera: CameraCalibration, markers: Iterable[str]) -> dict[str
 
 
 def refuse_strange(markers: Iterable[str], known: Iterable[str], where: str) -> None:
-    """Refuse markers that the rig has not.
-
-    Raises:
-        CalibrationError: With `where`, their names and those that there are.
-    """
+    """Refuse markers that the rig has not: CalibrationError with `where`."""
     there = tuple(known)
     if strange := [name for name in markers if name not in there]:
         raise CalibrationError(f"{where}: the rig has no {', '.join(strange)}; it has {', '.join(there)}")

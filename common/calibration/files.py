@@ -1,27 +1,8 @@
 """Calibration files have one base type, are read in bounds, replaced whole.
 
-Building blocks of the calibration file types.
-
-Their base class, and numbers with their bounds.
-
-Read and check JSON files: the only way in for them.
-
-A file is bounded in size and nesting, has no key twice and no NaN, and every value has its type.
-
-msgspec decodes and checks the types. Of two equal keys it keeps the last, and a file of a million brackets ends in a
-RecursionError: the first is looked for after it by a second, untyped pass, the second before it.
-
-Atomic file replacement: a file is replaced whole or not at all.
-
-A reader sees the old one or the new one, also after a power cut.
-
-Plain names: those that can stand as a part of a path.
-
-So a name out of a file leads nowhere else.
-
-File change monitor: detects changes since the last check.
-
-A check costs one `stat` per file.
+A file is bounded in size and nesting, has no key twice and no NaN, and every value has its type. msgspec decodes and
+checks the types. Of two equal keys it keeps the last, and a file of a million brackets ends in a RecursionError: the
+first is looked for after it by a second, untyped pass, the second before it.
 """
 
 import hashlib
@@ -52,14 +33,12 @@ Length = Annotated[float, Meta(ge=1e-6, le=100.0)]  # [m] from noise under a mac
 Distance = Annotated[float, Meta(ge=0.0, le=100.0)]  # [m] a length that may be nothing
 Angle = Annotated[float, Meta(ge=1e-6, le=6.2832)]  # [rad] up to a turn
 Rate = Annotated[float, Meta(ge=0.1, le=1e5)]  # [Hz] of samples: an IMU gives up to 32 kHz
-Frequency = Annotated[
-    float, Meta(ge=1e-3, le=1e6)
-]  # [Hz] cut-off of a filter; above the rate it does nothing
+# [Hz] cut-off of a filter; above the rate it does nothing
+Frequency = Annotated[float, Meta(ge=1e-3, le=1e6)]
 Duration = Annotated[float, Meta(ge=0.0, le=3600.0)]  # [s]
 StampOffset = Annotated[float, Meta(ge=-1e6, le=1e6)]  # [us] a second: more is another frame, not its stamp
-UnitComponent = Annotated[
-    float, Meta(ge=-1.01, le=1.01)
-]  # of a unit vector or quaternion, as rounding leaves it
+# of a unit vector or quaternion, as rounding leaves it
+UnitComponent = Annotated[float, Meta(ge=-1.01, le=1.01)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Direction = tuple[UnitComponent, UnitComponent, UnitComponent]
 Quaternion = tuple[UnitComponent, UnitComponent, UnitComponent, UnitComponent]
@@ -72,11 +51,9 @@ class Part(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_d
 
 
 class Provenance(Part, frozen=True):
-    """Provenance of a measured part of a file.
+    """Provenance of a measured part of a file: when, by what and from which data.
 
-    When and by what it was measured, from which data, and how well the fit agrees.
-
-    `residual`: quantity with its unit -> value, such as rms_px.
+    `residual`: quantity with its unit -> value, such as rms_px: how well the fit agrees.
     """
 
     date: Annotated[str, Meta(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ(?!\n)$")]
@@ -104,18 +81,12 @@ _STEPS[list(b"]}")] = -1
 
 
 def read_json(path: Path, kind: type[T]) -> T:
-    """Read one JSON file as `kind`.
-
-    Raises:
-        CalibrationError: It cannot be read, is too large, or as of `decode_json`; the text names the file.
-    """
+    """Read one JSON file as `kind`; raises as `read_bytes` and `decode_json`."""
     return decode_json(read_bytes(path), kind, str(path))
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the bytes of a file that is meant to be JSON.
-
-    Its size is looked at before anything is read.
+    """Read the bytes of a file that is meant to be JSON; its size is looked at first.
 
     Raises:
         CalibrationError: It cannot be read, or is too large.
@@ -178,10 +149,7 @@ def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _duplicate(value: object) -> str | None:
-    """Path of the first key that stands twice in what `_object` made.
-
-    None: no key does.
-    """
+    """Path of the first key that stands twice in what `_object` made, or None."""
     if isinstance(value, _Repeating):
         return _step(value.key)
     if isinstance(value, dict):
@@ -223,10 +191,7 @@ def _with_keys(text: str, raw: bytes, kind: type[object]) -> str:
 
 
 def _culprit(root: list[object], holder: list[object], at: object, kind: type[object], text: str) -> str:
-    """Key of the map at `holder[at]` whose value gives the error `text`.
-
-    It is found by halving; the map is left with it alone.
-    """
+    """Key of the map at `holder[at]` whose value gives `text`; only it is left there."""
     parts = cast(dict[object, dict[str, object]], holder)
     value = parts[at]
     keys = list(value)
@@ -251,10 +216,7 @@ def _step(key: str) -> str:
 
 
 def _printable(text: str) -> str:
-    """Make a text fit for one line of a terminal.
-
-    Control characters become escapes, the middle of a long text is left out.
-    """
+    """Escape control characters and cut the middle of a long text, for one line."""
     max_text = 600  # of an error: keys of a file may be as long as the file
     text = "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * max_text]
@@ -266,7 +228,7 @@ def _printable(text: str) -> str:
 def replacing(path: Path) -> Generator[IO[bytes], None, None]:
     """Open a new file beside `path` that replaces it at the end of the block.
 
-    It is deleted if the block fails.
+    A reader sees the old file or the new one, also after a power cut. It is deleted if the block fails.
 
     Raises:
         OSError: The folder is missing, read-only or full; the old file is untouched.
@@ -304,21 +266,16 @@ class _Look:
 
 
 class MonitoredFiles:
-    """Set of monitored files and their state at the last check.
-
-    Empty before the first check.
-    """
+    """Files and their content at the last check; a check costs one `stat` per file."""
 
     def __init__(self) -> None:
-        """Nothing was looked at yet."""
         self._seen: dict[Path, _Look | None] = {}
 
     def changed(self, paths: Iterable[Path]) -> bool:
-        """Check whether file content is new, or a file has appeared or disappeared.
+        """Whether a file's content is new, or a file has appeared or disappeared.
 
-        Each change is reported once.
-
-        The first look at a file reports a change: whoever read the file before may have read another content.
+        Each change is reported once. The first look at a file reports a change: whoever read it before may have read
+        another content.
         """
         found = False
         for path in paths:

@@ -1,19 +1,10 @@
 """gestures/<name>.json defines what counts as which gesture.
 
-Action settings of a gestures file: pinch, dial, thumb tap and pointing.
-
-They define what counts as a pinch, a turned dial, a tap of the thumb and a pointing finger.
-
-All distances are between skins, of round cones about the bones as the hand's profile has them: 0 is touch, and what is
-beyond it presses. Every threshold comes in a pair, one to begin and one to end, so that nothing flickers between.
-
-gestures/<name>.json: what counts as which gesture.
-
-The defaults here are those of calib_json/gestures/default.json.
-
-A pose is a set of ranges, each of one measured quantity of the hand with a soft border. Inside its range a quantity
-fits; outside, its residual is z = distance to range / border, and the pose fits by exp(-1/2 sum z^2). What the file
-states is thus what is required, quantity by quantity, and a pose recorded as a template is written in the same words.
+A pose is a set of ranges, each of one measured quantity of the hand with a soft border: outside, its residual is z =
+distance to range / border, and the pose fits by exp(-1/2 sum z^2). A template is written in the same words. All
+distances of actions are between skins, of round cones about the bones as the hand's profile has them: 0 is touch, and
+what is beyond it presses. Thresholds come in pairs, to begin and to end, so that nothing flickers between. The
+defaults are those of calib_json/gestures/default.json.
 """
 
 import math
@@ -92,20 +83,18 @@ class DialSettings(Part, frozen=True):
 
 
 class TapSettings(Part, frozen=True):
-    """Settings of taps of the thumb's tip on a finger segment.
-
-    Twelve keys, while the fingers lie side by side as a pad.
+    """Taps of the thumb's tip on finger segments: twelve keys on adjacent fingers.
 
     Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
     `touch_gap_m`, `leave_gap_m`: between the skins of thumb and finger at which it touches and leaves; it leaves
     earlier where it has gone away by `rise_m` from where it was nearest. `down_gap_m`: as near as this it comes at
-    least, or has only passed. `pressed_m`: deeper than flesh gives way is
-    no tap but a hand that closes. `approach_s`: within so long it comes from beyond `leave_gap_m`; slower is no tap.
-    `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between two taps. `level_rad`: how differently
-    the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of 0..1, how far at most. `quiet_rad`:
-    how far the four may bend together from when the thumb comes until it goes: more is a hand that closes.
-    `nearer_m`: how much nearer the thumb is to the finger of this key than to another, over the whole touch; less is
-    none. `sigma_most_m`, `place_sigma_m`: of the gap, and of the finger's PIP, above which nothing is reported.
+    least, or has only passed. `pressed_m`: deeper than flesh gives way is no tap but a hand that closes. `approach_s`:
+    within so long it comes from beyond `leave_gap_m`; slower is no tap. `shortest_s`, `longest_s`: how long a touch is
+    a tap. `apart_s`: between two taps. `level_rad`: how differently the fingers of a pad are bent at most, MCP and PIP
+    together; `curl_most`: of 0..1, how far at most. `quiet_rad`: how far the four may bend together from when the
+    thumb comes until it goes: more is a hand that closes. `nearer_m`: how much nearer the thumb is to the finger of
+    this key than to another, over the whole touch; less is none. `sigma_most_m`, `place_sigma_m`: of the gap, and of
+    the finger's PIP, above which nothing is reported.
     """
 
     touch_gap_m: Length = 0.005
@@ -145,11 +134,7 @@ class PointSettings(Part, frozen=True):
 def check_actions(
     pinch: PinchSettings, dial: DialSettings, tap: TapSettings, point: PointSettings, where: str
 ) -> None:
-    """Refuse thresholds that contradict each other.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse thresholds that contradict each other: CalibrationError with the key."""
     rising = (
         ("pinch.end_gap_m", pinch.begin_gap_m, pinch.end_gap_m, "begin_gap_m"),
         ("pinch.away_m", pinch.clear_m, pinch.away_m, "clear_m"),
@@ -188,10 +173,7 @@ Score = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Span(Part, frozen=True):
-    """Admissible range of a quantity, with soft bounds.
-
-    From `low` to `high` without loss, beyond with one standard deviation per `soft`.
-    """
+    """Admissible range of a quantity; outside, `soft` is one standard deviation."""
 
     low: Measured
     high: Measured
@@ -212,12 +194,12 @@ class PoseShape(Part, frozen=True):
 class HoldSettings(Part, frozen=True):
     """When a pose begins and ends.
 
-    It begins at a confidence of `begin` that has lasted `begin_s` (`uncertain_s` where fewer than three fingers
-    are known), while the fingers turn by no more than `still_deg_s`
-    (a hand on its way through a pose does not hold it), or, at any speed, that has lasted `slow_s`. It ends below `end`
-    that has lasted `end_s`, when another begins, `lost_s` after the hand was last known, or, where nothing that is seen
-    speaks against it but too much of the hand hides, `hidden_s` after it was last confident.
-    `known_share`: of the weight of a pose's quantities, how much must be known.
+    It begins at a confidence of `begin` that has lasted `begin_s` (`uncertain_s` where fewer than three fingers are
+    known), while the fingers turn by no more than `still_deg_s` (a hand on its way through a pose does not hold it),
+    or, at any speed, that has lasted `slow_s`. It ends below `end` that has lasted `end_s`, when another begins,
+    `lost_s` after the hand was last known, or, where nothing that is seen speaks against it but too much of the hand
+    hides, `hidden_s` after it was last confident. `known_share`: of the weight of a pose's quantities, how much must
+    be known.
     """
 
     begin: Score = 0.45
@@ -247,73 +229,43 @@ def _between(low: float, high: float, soft: float) -> Span:
 def study_poses() -> dict[Name, PoseShape]:
     """The six poses of the Digits study (Kim et al., UIST 2012, A to F)."""
     return {
-        "open_palm": PoseShape(
-            ranges={
-                "index_bend_deg": _most(18.0, 9.0),
-                "middle_bend_deg": _most(18.0, 9.0),
-                "ring_bend_deg": _most(18.0, 9.0),
-                "little_bend_deg": _most(18.0, 9.0),
-                "fingers_bend_deg": _most(15.0, 3.0),
-                "thumb_across": _between(0.4, 3.0, 0.1),
-            }
-        ),
-        "counting_two": PoseShape(
-            ranges={
-                "index_mcp_deg": _most(40.0, 12.0),
-                "index_pip_deg": _most(30.0, 10.0),
-                "middle_mcp_deg": _most(40.0, 12.0),
-                "middle_pip_deg": _most(30.0, 10.0),
-                "ring_bend_deg": _least(115.0, 12.0),
-                "little_bend_deg": _least(110.0, 12.0),
-                "thumb_across": _between(-2.0, 0.5, 0.1),
-            },
-        ),
-        "pointing": PoseShape(
-            ranges={
-                "index_mcp_deg": _most(40.0, 12.0),
-                "index_pip_deg": _most(30.0, 10.0),
-                "middle_bend_deg": _least(115.0, 12.0),
-                "ring_bend_deg": _least(115.0, 12.0),
-                "little_bend_deg": _least(110.0, 12.0),
-            },
-        ),
-        "small_grasp": PoseShape(
-            ranges={
-                "index_bend_deg": _least(102.0, 8.0),
-                "middle_bend_deg": _least(102.0, 8.0),
-                "ring_bend_deg": _least(102.0, 8.0),
-                "little_bend_deg": _least(102.0, 8.0),
-                "thumb_across": _between(-2.0, 0.4, 0.08),
-            },
-        ),
-        "large_grasp": PoseShape(
-            ranges={
-                "index_bend_deg": _between(55.0, 95.0, 8.0),
-                "middle_bend_deg": _between(55.0, 95.0, 8.0),
-                "ring_bend_deg": _between(55.0, 95.0, 8.0),
-                "little_bend_deg": _between(55.0, 95.0, 8.0),
-                "index_pip_deg": _between(22.0, 65.0, 8.0),
-                "middle_pip_deg": _between(22.0, 65.0, 8.0),
-                "thumb_index_gap_mm": _least(45.0, 8.0),
-            },
-        ),
-        "pinch": PoseShape(
-            ranges={
-                "index_bend_deg": _between(65.0, 135.0, 10.0),
-                "index_ahead_deg": _least(25.0, 10.0),
-                "thumb_index_gap_mm": _most(42.0, 6.0),
-                "middle_bend_deg": _most(66.0, 12.0),
-                "ring_bend_deg": _most(66.0, 12.0),
-                "little_bend_deg": _most(66.0, 12.0),
-            },
-        ),
-    }
+        "open_palm": PoseShape(ranges={
+            "index_bend_deg": _most(18.0, 9.0), "middle_bend_deg": _most(18.0, 9.0),
+            "ring_bend_deg": _most(18.0, 9.0), "little_bend_deg": _most(18.0, 9.0),
+            "fingers_bend_deg": _most(15.0, 3.0), "thumb_across": _between(0.4, 3.0, 0.1),
+        }),
+        "counting_two": PoseShape(ranges={
+            "index_mcp_deg": _most(40.0, 12.0), "index_pip_deg": _most(30.0, 10.0),
+            "middle_mcp_deg": _most(40.0, 12.0), "middle_pip_deg": _most(30.0, 10.0),
+            "ring_bend_deg": _least(115.0, 12.0), "little_bend_deg": _least(110.0, 12.0),
+            "thumb_across": _between(-2.0, 0.5, 0.1),
+        }),
+        "pointing": PoseShape(ranges={
+            "index_mcp_deg": _most(40.0, 12.0), "index_pip_deg": _most(30.0, 10.0),
+            "middle_bend_deg": _least(115.0, 12.0), "ring_bend_deg": _least(115.0, 12.0),
+            "little_bend_deg": _least(110.0, 12.0),
+        }),
+        "small_grasp": PoseShape(ranges={
+            "index_bend_deg": _least(102.0, 8.0), "middle_bend_deg": _least(102.0, 8.0),
+            "ring_bend_deg": _least(102.0, 8.0), "little_bend_deg": _least(102.0, 8.0),
+            "thumb_across": _between(-2.0, 0.4, 0.08),
+        }),
+        "large_grasp": PoseShape(ranges={
+            "index_bend_deg": _between(55.0, 95.0, 8.0), "middle_bend_deg": _between(55.0, 95.0, 8.0),
+            "ring_bend_deg": _between(55.0, 95.0, 8.0), "little_bend_deg": _between(55.0, 95.0, 8.0),
+            "index_pip_deg": _between(22.0, 65.0, 8.0), "middle_pip_deg": _between(22.0, 65.0, 8.0),
+            "thumb_index_gap_mm": _least(45.0, 8.0),
+        }),
+        "pinch": PoseShape(ranges={
+            "index_bend_deg": _between(65.0, 135.0, 10.0), "index_ahead_deg": _least(25.0, 10.0),
+            "thumb_index_gap_mm": _most(42.0, 6.0), "middle_bend_deg": _most(66.0, 12.0),
+            "ring_bend_deg": _most(66.0, 12.0), "little_bend_deg": _most(66.0, 12.0),
+        }),
+    }  # fmt: skip
 
 
 class GestureSettings(Part, frozen=True):
-    """Contents of gestures/<name>.json.
-
-    The poses of a hand, by name, how they are held, and the thresholds of the actions.
+    """gestures/<name>.json: poses by name, how they are held, thresholds of actions.
 
     Of a template pose the provenance states, under its name, from what it was recorded.
     """
@@ -335,11 +287,7 @@ def default_gestures() -> GestureSettings:
 
 
 def check_gestures(settings: GestureSettings, where: str) -> None:
-    """Refuse what the types alone cannot.
-
-    Raises:
-        CalibrationError: A range is empty, or thresholds contradict each other. The text has `where` and the key.
-    """
+    """Refuse empty ranges and contradictory thresholds: CalibrationError."""
     for name, pose in settings.poses.items():
         for quantity, span in pose.ranges.items():
             if span.low > span.high:

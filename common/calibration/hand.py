@@ -16,20 +16,14 @@ Thickness = Annotated[float, Meta(ge=5e-4, le=0.2)]  # [m] radius at a joint, pa
 
 
 class RestJoint(Part, frozen=True):
-    """One joint of the flat hand, in the palm frame.
-
-    OpenXR axes: -z along the bone to the tip, +y dorsal.
-    """
+    """One joint of the flat hand, palm frame: -z along the bone to the tip, y dorsal."""
 
     position_m: HandPlace
     orientation_wxyz: Quaternion
 
 
 class MarkerMount(Part, frozen=True):
-    """Mounting of a painted cap: its joint, its centroid and its painted length.
-
-    The joint is the one it is fixed to (or palm_frame); the centroid is in that frame.
-    """
+    """Mounting of a painted cap: its joint (or palm_frame), centroid in that frame."""
 
     joint: str
     offset_m: HandPlace
@@ -44,13 +38,11 @@ Tolerance = Annotated[float, Meta(ge=0.0, le=1.0)]  # [rad]
 
 
 class FingerLimits(Part, frozen=True):
-    """Lower and upper limits of the four angles of a finger [rad].
+    """Lower and upper limits of a finger's four angles [rad], zero in the rest pose.
 
-    Zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
-
-    `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
-    1: the range stays. `tolerance_rad`: standard deviation by which people differ from these limits, for each angle; 0:
-    a wall.
+    Of the thumb: CMC, CMC, MCP, IP. `spread_at_full_flexion`: share of the abduction range that is left at the highest
+    flexion, less on the way there; 1: the range stays. `tolerance_rad`: standard deviation by which people differ from
+    these limits, for each angle; 0: a wall.
     """
 
     abduction_rad: Span
@@ -74,8 +66,6 @@ class Limits(Part, frozen=True):
 class Couplings(Part, frozen=True):
     """Natural joint couplings between the angles of index ... little.
 
-    Each can be switched off.
-
     `dip_per_pip` None: the DIP is free. `dip_spread_rad`: standard deviation of the DIP about that ratio; 0: it is
     kept exactly. `mcp_per_pip` None: no natural flexion. `neighbours`: fingers side by side tend to bend alike.
     """
@@ -90,9 +80,7 @@ Variance = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad^2] or covariance
 
 
 class Posture(Part, frozen=True):
-    """Posture prior of a person: a normal distribution of the 20 angles of the hand.
-
-    Fitted to motion.
+    """Posture prior of a person, fitted to motion: a normal distribution of angles.
 
     Attributes:
         mean_rad: Abduction, flexion, PIP, DIP (thumb CMC, CMC, MCP, IP) of thumb ... little, columns of `HandModel`.
@@ -112,9 +100,7 @@ PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
 
 
 class HandProfile(Part, frozen=True):
-    """Contents of hands/<name>.json: bones and markers of one hand.
-
-    Optionally radii, skin, limits and couplings.
+    """hands/<name>.json: bones, markers, and optionally skin, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
     `posture`: how this person holds the fingers, in place of the couplings' prior; DIPs are free then.
@@ -136,11 +122,7 @@ class HandProfile(Part, frozen=True):
 
 
 def check_hand(hand: HandProfile, where: str) -> None:
-    """Refuse what the types alone cannot.
-
-    Raises:
-        CalibrationError: An orientation is no rotation, or two joints lie in one place; with `where` and the key.
-    """
+    """Refuse orientations that are no rotation and coinciding joints."""
     for name, joint in hand.rest_joints.items():
         length = math.hypot(*joint.orientation_wxyz)
         unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one

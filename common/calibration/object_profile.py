@@ -1,7 +1,4 @@
-"""objects/<name>.json: a rigid object that is tracked.
-
-By painted markers, by fiducial tags, or by a tracker on it.
-"""
+"""objects/<name>.json: a rigid object, tracked by markers, tags, or a tracker."""
 
 from typing import Annotated, Literal, TypeAlias
 
@@ -28,9 +25,7 @@ class Bead(Part, frozen=True):
 
 
 class Tag(Part, frozen=True):
-    """Fiducial tag of an object.
-
-    Its number, the edge of its black square, its frame on the object.
+    """Fiducial tag of an object: number, edge of its black square, frame.
 
     Tag frame: origin in its middle, x to the right and y up as it is printed, z out of the paper.
     """
@@ -73,9 +68,7 @@ Shape: TypeAlias = BoxShape | CylinderShape | SphereShape
 
 
 class ObjectProfile(Part, frozen=True):
-    """Contents of objects/<name>.json: visible features and surface of an object.
-
-    Lengths are in the object's own frame.
+    """objects/<name>.json: visible features and surface in the object's own frame.
 
     `markers`: three or more, not in one line; the rig lists their names in `free_markers`, the camera files have their
     colours. `tracker`: name of a device that tracks itself and sits on the object at `T_object_tracker`, which
@@ -124,11 +117,7 @@ def check_object(profile: ObjectProfile, where: str) -> None:
 
 
 def check_pose(pose: Float, where: str) -> None:
-    """Refuse a matrix (4, 4) that is no rotation and shift.
-
-    Raises:
-        CalibrationError: With `where`.
-    """
+    """Refuse a matrix (4, 4) that is no rotation and shift (CalibrationError)."""
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise CalibrationError(f"{where}: upper left 3x3 is not a rotation")
@@ -137,9 +126,6 @@ def check_pose(pose: Float, where: str) -> None:
 
 
 def tag_corners(edge_m: float) -> Float:
-    """Return the corners (4, 3) [m] of a tag in its own frame.
-
-    As printed: top left, top right, bottom right, bottom left.
-    """
+    """Corners (4, 3) [m] of a tag, its frame, clockwise as printed from the top left."""
     half = 0.5 * edge_m
     return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])

@@ -1,9 +1,7 @@
 """outputs/<name>.json: which live outputs are on, and where each sends to.
 
-The defaults here are those of calib_json/outputs/default.json.
-
-Everything is off until somebody switches it on, and everything stays on this machine until somebody names another:
-hands and gestures of a person are that person's.
+Everything is off until somebody switches it on, and stays on this machine until somebody names another: hands and
+gestures of a person are that person's. The defaults here are those of calib_json/outputs/default.json.
 """
 
 import math
@@ -23,10 +21,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class OscOutput(Part, frozen=True):
-    """Open Sound Control output over UDP to `host`:`port`.
-
-    Hands, objects, contact and gestures, in the rig frame.
-    """
+    """Open Sound Control over UDP: hands, objects, contact and gestures, rig frame."""
 
     on: bool = False
     host: Host = LOOPBACK
@@ -34,9 +29,7 @@ class OscOutput(Part, frozen=True):
 
 
 class VmcOutput(Part, frozen=True):
-    """Output by the Virtual Motion Capture protocol (OSC over UDP).
-
-    Bones of the hands of a VRM avatar.
+    """Virtual Motion Capture protocol (OSC over UDP): hand bones of a VRM avatar.
 
     `hand`: how the bone of the hand itself is turned: as the palm lies in the room, behind an arm that is kept in the
     T-pose (palm), as the wrist is bent against the forearm, where a device on the forearm gives it (bend), or not at
@@ -54,10 +47,7 @@ class VmcOutput(Part, frozen=True):
 
 
 class Ros2Output(Part, frozen=True):
-    """ROS 2 topics as rmw_zenoh publishes them, by the zenoh router at `router`.
-
-    No ROS is needed here.
-    """
+    """ROS 2 topics as rmw_zenoh publishes them, by its router; needs no ROS."""
 
     on: bool = False
     router: Host = "tcp/127.0.0.1:7447"
@@ -77,10 +67,7 @@ class LslOutput(Part, frozen=True):
 
 
 class WebOutput(Part, frozen=True):
-    """WebSocket output with JSON in the joint order of WebXR.
-
-    The page that shows it is served as well, at `host`:`port`.
-    """
+    """WebSocket with JSON in the joint order of WebXR, and the page that shows it."""
 
     on: bool = False
     host: Host = LOOPBACK
@@ -108,11 +95,7 @@ def default_outputs(name: str = "default") -> OutputSettings:
 
 
 def check_outputs(settings: OutputSettings, where: str) -> None:
-    """Refuse what the types alone cannot.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse a quaternion that is not of length 1: CalibrationError with the key."""
     length = math.hypot(*settings.vmc.q_avatar_rig)
     unit_within = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
     if abs(length - 1.0) > unit_within:

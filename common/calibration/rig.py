@@ -1,16 +1,6 @@
 """A rig file places its cameras, IMU and wrist device.
 
-Calibration of a wrist device, in the frame of its camera (OpenCV axes).
-
-These are parts of its rig file.
-
-Typed files of rigs.
-
-Which cameras, where, which markers, which depth model, whose hand, and what else observes it.
-
-Flat field of a wrist device's LEDs as a function of image position.
-
-It is the polynomial that `FlatField` describes.
+What belongs to a wrist device is in the frame of its camera (OpenCV axes).
 """
 
 import math
@@ -66,12 +56,10 @@ class Laser(Part, frozen=True):
 
 
 class FlatField(Part, frozen=True):
-    """Relative brightness across the image of a uniformly white surface.
+    """Relative brightness of a uniformly white surface across the image; axis: 1.
 
-    The surface is at one distance, seen along its normal; 1 on the axis.
-
-    A polynomial in the normalised image point (x, y) = (X / Z, Y / Z); `coefficients` of 1, x, y, x^2, x y, y^2, x^3,
-    x^2 y, ..., every degree whole.
+    The surface is at one distance, seen along its normal. A polynomial in the normalised image point
+    (x, y) = (X / Z, Y / Z); `coefficients` of 1, x, y, x^2, x y, y^2, x^3, x^2 y, ..., every degree whole.
     """
 
     coefficients: Annotated[tuple[Coefficient, ...], Meta(min_length=1, max_length=FLAT_FIELD_TERMS[-1])]
@@ -80,11 +68,9 @@ class FlatField(Part, frozen=True):
 class FingerLine(Part, frozen=True):
     """Line along which the laser point of one finger moves during flexion.
 
-    It is the principal axis of motion.
-
     Attributes:
         origin_m: A point of the line, where the finger is straightest.
-        direction: Unit vector, towards what a bent finger reflects.
+        direction: Unit vector, the principal axis of motion, towards what a bent finger reflects.
         range_m: How far along it the finger's points lie, from the straightest to the most bent.
         residual_m: RMS distance of the points from the line.
     """
@@ -98,18 +84,13 @@ class FingerLine(Part, frozen=True):
 def check_wrist(
     plane: LaserPlane | None, laser: Laser | None, lines: Mapping[str, FingerLine], where: str
 ) -> None:
-    """Refuse what the types alone cannot see.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse what the types alone cannot: CalibrationError with `where` and the key."""
     directions = {
         "laser_plane.normal": None if plane is None else plane.normal,
         "laser.forward": None if laser is None else laser.forward,
         "laser.right": None if laser is None else laser.right,
     }
-    # of the laser's plane from the camera: nearer, it is seen along itself, and measures no depth
-    min_offset_m = 1e-3
+    min_offset_m = 1e-3  # of the laser's plane from the camera: nearer, it measures no depth
     if plane is not None and abs(plane.offset_m) < min_offset_m:
         raise CalibrationError(
             f"{where}: laser_plane.offset_m: {plane.offset_m:g}, the plane runs through the camera, which then sees no"
@@ -122,8 +103,7 @@ def check_wrist(
         if way is None or plane is None or not key.startswith("laser."):
             continue
         leaves = abs(sum(a * b for a, b in zip(plane.normal, way, strict=True)))
-        # of a direction that should lie in a plane: 12 degrees, far more than a line laser is bent
-        across = 0.2
+        across = 0.2  # 12 degrees, far more than a line laser is bent
         if leaves > across:
             raise CalibrationError(f"{where}: {key}: leaves laser_plane by {leaves:.2f} of its length")
     for finger, line in lines.items():
@@ -137,11 +117,7 @@ def check_wrist(
 
 
 def check_flat_field(field: FlatField | None, where: str) -> None:
-    """Refuse a flat field whose polynomial is not whole.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse a polynomial that is not whole: CalibrationError with `where`, the key."""
     if field is not None and len(field.coefficients) not in FLAT_FIELD_TERMS:
         raise CalibrationError(
             f"{where}: flat_field.coefficients: {len(field.coefficients)} of them; a polynomial of whole degrees has"
@@ -175,9 +151,8 @@ class AffineDisparityCalibration(Part, frozen=True):
 class FilterCalibration(Part, frozen=True):
     """1 € filter of the hand and its markers.
 
-    Cut-off at rest, its rise per speed [Hz per m/s], and the cut-off of the speed.
-
-    `jitter_m`: what may be left of the noise of each signal at rest; noisier ones are filtered more.
+    Cut-off at rest, its rise per speed [Hz per m/s], and the cut-off of the speed. `jitter_m`: what may be left of the
+    noise of each signal at rest; noisier ones are filtered more.
     """
 
     min_cutoff_hz: Frequency = 10.0
@@ -194,9 +169,7 @@ class Volume(Part, frozen=True):
 
 
 class ImuCalibration(Part, frozen=True):
-    """IMU fixed to the palm, as far as known.
-
-    Its orientation is used where mounting and world are known.
+    """IMU fixed to the palm; its orientation is used if mounting and world are known.
 
     `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
     frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
@@ -215,14 +188,12 @@ class ImuCalibration(Part, frozen=True):
 
     @property
     def placed(self) -> bool:
-        """Return whether its orientation determines that of the palm in the rig."""
+        """Whether its orientation determines that of the palm in the rig."""
         return self.q_palm_imu is not None and self.q_rig_world is not None
 
 
 class RigCalibration(Part, frozen=True):
-    """Contents of rigs/<name>.json.
-
-    Which cameras, where, which markers, which depth model, whose hand.
+    """rigs/<name>.json: which cameras, where, which markers, depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
     `objects`: files of the objects that are tracked; their markers are free ones. `T_rig_tracking`: where the frame of
@@ -273,9 +244,7 @@ class RigCalibration(Part, frozen=True):
     strobe: StrobeCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
-        """Return `T_rig_camera` (4, 4) [m] of one camera.
-
-        The frame of a wrist rig is that of its camera.
+        """`T_rig_camera` (4, 4) [m]; the frame of a wrist rig is its camera's.
 
         Raises:
             CalibrationError: The rig's places are not measured yet.
@@ -291,11 +260,7 @@ class RigCalibration(Part, frozen=True):
 
 
 def check_rig(rig: RigCalibration, where: str) -> None:
-    """Refuse what the types alone cannot: keys that contradict each other.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Refuse keys that contradict each other: CalibrationError with `where`, the key."""
     if len(set(rig.cameras)) != len(rig.cameras):
         raise CalibrationError(f"{where}: cameras: a name stands twice")
     if len(set(rig.markers)) != len(rig.markers):
@@ -345,17 +310,10 @@ def check_rig(rig: RigCalibration, where: str) -> None:
 
 
 def check_places(rig: RigCalibration, where: str) -> None:
-    """Refuse two cameras in one place.
-
-    Rays from one point have no intersection that determines a depth.
-
-    Raises:
-        CalibrationError: With `where` and both cameras.
-    """
+    """Refuse cameras in one place, whose rays have no depth (CalibrationError)."""
     centres = [(name, rig.camera_pose(name)[:3, 3]) for name in rig.cameras if name in rig.T_rig_camera]
     for (one, a), (other, b) in combinations(centres, 2):
-        # of two cameras: nothing can be triangulated from one place, and no two lenses fit into less
-        min_baseline_m = 1e-3
+        min_baseline_m = 1e-3  # no two lenses fit into less
         if (apart := math.dist(a, b)) < min_baseline_m:
             raise CalibrationError(
                 f"{where}: T_rig_camera.{other}: {1e3 * apart:.2g} mm from camera {one!r}; two cameras are at least"
@@ -376,10 +334,7 @@ def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> Non
 
 
 def terms_of(xy: Float, degree: int) -> Float:
-    """Return the polynomial terms (..., T) at normalised image points (..., 2).
-
-    Ordered as `FlatField.coefficients`.
-    """
+    """Polynomial terms (..., T) at normalised image points (..., 2), see `FlatField`."""
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([x ** (d - k) * y**k for d in range(degree + 1) for k in range(d + 1)], axis=-1)
 
@@ -390,9 +345,6 @@ def field_at(field: FlatField, xy: Float) -> Float:
 
 
 def flat_of(field: FlatField, xy: Float) -> Float:
-    """Return the flat field (...) at normalised image points (..., 2).
-
-    Never less than a fiftieth of the value on the axis.
-    """
+    """Flat field (...) at normalised image points (..., 2), 0.02 or more."""
     least = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
     return np.maximum(field_at(field, xy), least)

@@ -1,17 +1,9 @@
 """A strobe's laser and LEDs keep to the limits of parts and of eye safety.
 
-Eye safety limits of light: laser class 1 and infrared lamps.
-
-Laser class 1 by IEC 60825-1, infrared lamps of the exempt group by IEC 62471.
-
-Only what a wrist device needs: one wavelength between 700 and 1050 nm, and sources taken as points where that is the
-stricter case. IEC 60825-1 is edition 3 (2014) unless stated otherwise, IEC 62471 is edition 1 (2006). All in SI units.
-
-Laser and LEDs of a wrist device and their limits: the key `strobe` of a rig.
-
-The limits on pulse and duty are the user's; here they are held against those of the eye
-(`common.calibration.strobe`) and of
-the supply. `docs/safety.md` states what that covers, and what not. It is no certificate.
+The key `strobe` of a rig. Laser class 1 by IEC 60825-1 (edition 3, 2014, unless stated otherwise), infrared lamps of
+the exempt group by IEC 62471 (edition 1, 2006), for one wavelength between 700 and 1050 nm and sources taken as points
+where that is the stricter case. SI units. The limits on pulse and duty are the user's; here they are held against
+those of the eye and of the supply. `docs/safety.md` states what that covers, and what not. It is no certificate.
 """
 
 from dataclasses import dataclass
@@ -30,50 +22,40 @@ _ALPHA_LONG, _ALPHA_SHORT = 0.011, 0.0017  # rad; IEC 62471, 4.2.2
 
 
 def laser_c4(wavelength_nm: float) -> float:
-    """Return correction C4 of the retinal limits, 700 to 1050 nm.
-
-    10^(0.002 (wavelength - 700)) (IEC 60825-1, table 9).
-    """
+    """Correction C4, 700-1050 nm: 10^(0.002 (wavelength - 700)) (60825-1, table 9)."""
     return 10.0 ** (0.002 * (wavelength_nm - 700.0))
 
 
 def class_1_energy_j(wavelength_nm: float, duration_s: float) -> float:
-    """Return the class 1 energy limit [J] of one pulse of a point source.
+    """Class 1 energy limit [J] of one pulse of a point source, through the pupil.
 
-    Through the pupil: 7e-4 t^0.75 C4 (IEC 60825-1, table 3).
-
-    From 5 us to 10 s; a shorter pulse may have as much as one of 5 us.
+    7e-4 t^0.75 C4 (IEC 60825-1, table 3), from 5 us to 10 s; a shorter pulse may have as much as one of 5 us.
     """
     ramp_s = 5e-6  # below, the energy limit no longer falls with the duration (IEC 60825-1, table 3)
     return 7e-4 * min(max(duration_s, ramp_s), LONG_S) ** 0.75 * laser_c4(wavelength_nm)
 
 
 def class_1_power_w(wavelength_nm: float) -> float:
-    """Return the class 1 power limit [W] of a point source, longer than 10 s.
+    """Class 1 power limit [W] of a point source, longer than 10 s, through the pupil.
 
-    Through the pupil: 3.9e-4 C4 C7.
-
-    IEC 60825-1, table 3; C7 is 1 up to 1150 nm (table 9).
+    3.9e-4 C4 C7 (IEC 60825-1, table 3); C7 is 1 up to 1150 nm (table 9).
     """
     return 3.9e-4 * laser_c4(wavelength_nm)
 
 
 def train_c5(pulses: float) -> float:
-    """Return the factor on the single-pulse limit for a train of pulses.
+    """Factor on the single-pulse limit for N pulses within 10 s: N^-0.25.
 
-    For N pulses within 10 s: N^-0.25 (IEC 60825-1:2007, 8.3 f).
-
-    Edition 3 lets pulses longer than 5 us of a small source have 1 (4.3 f); the stricter rule is kept here.
+    IEC 60825-1:2007, 8.3 f. Edition 3 lets pulses longer than 5 us of a small source have 1 (4.3 f); the stricter rule
+    is kept here.
     """
     return max(pulses, 1.0) ** -0.25
 
 
 def share_of_fan(fan_rad: float, peak_over_mean: float) -> float:
-    """Return the share of a line laser's power that enters the pupil.
+    """Share of a line laser's power that enters the pupil.
 
-    The pupil covers 7 mm of the line, where it is brightest.
-
-    Across the line all of it enters.
+    The pupil covers 7 mm of the line, where it is brightest; across the line all of it enters.
 
     Args:
         fan_rad: Angle over which the line spreads [rad].
@@ -85,20 +67,15 @@ def share_of_fan(fan_rad: float, peak_over_mean: float) -> float:
 
 
 def lamp_irradiance_w_m2(intensity_w_sr: float) -> float:
-    """Return the irradiance [W/m^2] of an eye 200 mm in front of a lamp.
-
-    From its radiant intensity on the axis [W/sr]: I / d^2.
-    """
+    """Irradiance [W/m^2] 200 mm before a lamp: I / d^2, I on the axis [W/sr]."""
     return intensity_w_sr / LAMP_AT_M**2
 
 
 def retina_w_m2_sr(intensity_w_sr: float, emitter_m: float, wavelength_nm: float, pulsed: bool) -> float:
-    """Return the burn-hazard weighted radiance of one emitter [W/(m^2 sr)].
+    """Burn-hazard weighted radiance of one emitter [W/(m^2 sr)] at 200 mm.
 
-    At 200 mm: R L (IEC 62471, 4.3.5, 4.3.6).
-
-    R(wavelength) = 10^((700 - wavelength) / 500) (table 4.2). The radiance is the mean over the smallest field that
-    the eye's movements leave: 1.7 mrad for a pulse, 11 mrad for long (4.2.2).
+    R L (IEC 62471, 4.3.5, 4.3.6) with R(wavelength) = 10^((700 - wavelength) / 500) (table 4.2). The radiance is the
+    mean over the smallest field that the eye's movements leave: 1.7 mrad for a pulse, 11 mrad for long (4.2.2).
 
     Args:
         intensity_w_sr: Of one emitter, on its axis [W/sr].
@@ -112,7 +89,7 @@ def retina_w_m2_sr(intensity_w_sr: float, emitter_m: float, wavelength_nm: float
 
 
 def retina_pulse_limit_w_m2_sr(emitter_m: float, duration_s: float) -> float:
-    """Return the limit of the weighted radiance of one pulse [W/(m^2 sr)].
+    """Limit of the weighted radiance of one pulse [W/(m^2 sr)].
 
     50000 / (alpha t^0.25) (IEC 62471, 4.3.5).
     """
@@ -120,18 +97,12 @@ def retina_pulse_limit_w_m2_sr(emitter_m: float, duration_s: float) -> float:
 
 
 def retina_weak_limit_w_m2_sr(emitter_m: float) -> float:
-    """Return the weighted radiance limit of a weak visual stimulus, beyond 10 s.
-
-    For light that is hardly seen: 6000 / alpha (IEC 62471, 4.3.6).
-    """
+    """Weighted radiance limit of faint light > 10 s: 6000 / alpha (IEC 62471, 4.3.6)."""
     return 6e3 / _alpha(emitter_m, _ALPHA_LONG)
 
 
 def _alpha(emitter_m: float, least_rad: float) -> float:
-    """Return the angle subtended by an emitter at 200 mm [rad].
-
-    Clipped to the range for which the limits are defined.
-    """
+    """Angle subtended by an emitter at 200 mm [rad], clipped to the limits' range."""
     alpha_large = 0.1  # rad; IEC 62471, 4.2.2
     return min(max(emitter_m / LAMP_AT_M, least_rad), alpha_large)
 
@@ -147,7 +118,6 @@ class LaserLight(Part, frozen=True):
 
     Attributes:
         power_w: Optical power of the whole line while it is on [W].
-        wavelength_nm: Wavelength [nm].
         peak_over_mean: How much brighter the brightest part of the line is than its mean; 1.6 for a Gaussian one
             whose fan ends at 1/e^2.
         electrical_w: What it draws from the supply while it is on [W].
@@ -165,10 +135,8 @@ class LedLight(Part, frozen=True):
     """The LEDs beside the lens, all alike and on together.
 
     Attributes:
-        count: How many.
         intensity_w_sr: Radiant intensity of one, on its axis, while it is on [W/sr].
         emitter_m: Diameter of what shines of one, its diffuser where there is one [m].
-        wavelength_nm: Wavelength [nm].
         electrical_w: What all of them draw while they are on [W].
         current_a: As of the laser, of all of them.
     """
@@ -206,7 +174,6 @@ class Limit:
     """One limit and how much of it is used.
 
     Attributes:
-        name: What is limited.
         key: The keys of the rig file that decide it.
         value, bound: In `unit`.
         source: Where the bound is from.
@@ -228,10 +195,7 @@ class Limit:
 
 
 def limits_of(strobe: StrobeCalibration, fan_rad: float) -> tuple[Limit, ...]:
-    """Return every limit at the longest pulse and highest duty that the file allows.
-
-    The line spreads by `fan_rad`.
-    """
+    """Every limit at the longest pulse and highest duty, for the fan of the laser."""
     pulse_s, duty = strobe.max_pulse_us * 1e-6, strobe.max_duty
     laser = _laser(strobe.laser, fan_rad, pulse_s, duty)
     return (*laser, *_leds(strobe.led, pulse_s, duty), _electrical(strobe))
@@ -264,26 +228,16 @@ def _laser(laser: LaserLight, fan_rad: float, pulse_s: float, duty: float) -> tu
     trained_j = single_j * train_c5(duty * LONG_S / pulse_s)
     hardware_timeout_s = 0.010  # of the flash driver that `--lights i2c` talks to: a pulse that nobody ends
     cut_j = class_1_energy_j(laser.wavelength_nm, hardware_timeout_s)
-    pulse, both = "laser.power_w, max_pulse_us", "laser.power_w, max_pulse_us, max_duty"
-    energy_j = enters_w * pulse_s
+    power = "laser.power_w"
+    pulse, both = f"{power}, max_pulse_us", f"{power}, max_pulse_us, max_duty"
+    energy_j, long = enters_w * pulse_s, "table 3, > 10 s"
+    train, cut_by = "table 3 and C5 of IEC 60825-1:2007", "laser, pulse cut by the flash driver"
     return (
         Limit("laser, one pulse", pulse, energy_j, single_j, "J", "IEC 60825-1 table 3, class 1"),
-        Limit(
-            "laser, pulse of a train", both, energy_j, trained_j, "J", "table 3 and C5 of IEC 60825-1:2007"
-        ),
-        Limit(
-            "laser, mean power", "laser.power_w, max_duty", enters_w * duty, long_w, "W", "table 3, > 10 s"
-        ),
-        Limit(
-            "laser, pulse cut by the flash driver",
-            "laser.power_w",
-            enters_w * hardware_timeout_s,
-            cut_j,
-            "J",
-            "table 3, 10 ms",
-            fault=True,
-        ),
-        Limit("laser, never off", "laser.power_w", enters_w, long_w, "W", "table 3, > 10 s", fault=True),
+        Limit("laser, pulse of a train", both, energy_j, trained_j, "J", train),
+        Limit("laser, mean power", f"{power}, max_duty", enters_w * duty, long_w, "W", long),
+        Limit(cut_by, power, enters_w * hardware_timeout_s, cut_j, "J", "table 3, 10 ms", fault=True),
+        Limit("laser, never off", power, enters_w, long_w, "W", long, fault=True),
     )
 
 

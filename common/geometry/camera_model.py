@@ -1,7 +1,4 @@
-"""Geometric camera model: point -> pixel and pixel -> ray.
-
-With OpenCV's distortion k1, k2, p1, p2, k3.
-"""
+"""Geometric camera model: point -> pixel and pixel -> ray, OpenCV's distortion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,10 +23,8 @@ class CameraModel:
     Attributes:
         matrix: Camera matrix (3, 3) [px].
         distortion: k1, k2, p1, p2, k3 (5,).
-        T_rig_camera: Camera frame -> rig frame (4, 4) [m].
-        width_px, height_px: Image size.
+        T_rig_camera, T_camera_rig: Camera frame -> rig frame (4, 4) [m], and its inverse.
         row_time_ns: Time from one row to the next [ns] (rolling shutter; 0: global).
-        T_camera_rig: The inverse of `T_rig_camera`.
         steep: The lens, where OpenCV's iteration does not find the way back from all of the picture (it does not
             converge where the distortion rises steeply, as at the corners of some wide-angle lenses); else None.
     """
@@ -54,11 +49,7 @@ class CameraModel:
 
     @classmethod
     def of(cls, camera: CameraCalibration, T_rig_camera: Float) -> "CameraModel":
-        """Build from a camera file and the camera's place in the rig.
-
-        Raises:
-            CalibrationError: The camera file has no intrinsics yet.
-        """
+        """Build from a camera file, which must have intrinsics, else CalibrationError."""
         k = camera.intrinsics
         if k is None:
             raise CalibrationError(
@@ -113,10 +104,7 @@ class CameraModel:
         return np.where(np.isnan(uv), np.nan, points.reshape(uv.shape))
 
     def ray(self, uv: Float) -> Float:
-        """Return unit ray directions (..., 3) through pixels (..., 2).
-
-        In the rig frame; NaN stays NaN.
-        """
+        """Unit ray directions (..., 3) through pixels (..., 2), rig frame; NaN stays NaN."""
         xy = self.undistort(uv)
         direction = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -124,10 +112,7 @@ class CameraModel:
 
 
 def _undistort(uv: Float, matrix: Float, distortion: Float) -> Float:
-    """Run `cv2.undistortPoints` to convergence.
-
-    OpenCV 5 merged into it what OpenCV 4 calls `undistortPointsIter`.
-    """
+    """Run `cv2.undistortPoints` to convergence (OpenCV 4: `undistortPointsIter`)."""
     of_opencv_4 = cast(Callable[..., Float] | None, getattr(cv2, "undistortPointsIter", None))
     if of_opencv_4 is not None:
         return of_opencv_4(uv, matrix, distortion, None, None, _CRITERIA)

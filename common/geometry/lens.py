@@ -1,6 +1,6 @@
 """OpenCV's distortion as a map of normalised points: its fold and its inverse.
 
-It is a polynomial, and beyond some radius it may turn back. There two directions have one pixel, and no pixel beyond
+It is a polynomial, and beyond some radius it may turn back: there two directions have one pixel, and no pixel beyond
 has a direction at all. The map (x, y) -> (x', y') can be inverted as far from the axis as its Jacobian, a symmetric
 matrix, stays positive definite; along each direction from the axis that must be so until the picture is left. Its
 least eigenvalue is how much a small thing is shrunk against one on the axis.
@@ -32,10 +32,7 @@ class Lens(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """Where a lens turns back.
-
-    The pixel, and its distance from the principal point [px].
-    """
+    """Pixel where a lens turns back, and its distance from the principal point [px]."""
 
     u: float
     v: float
@@ -128,12 +125,10 @@ def _newton(lens: Lens, seen: Float, start: Float, steps: int, tolerance_px: flo
 
 
 def contraction(lens: Lens) -> float:
-    """Largest share of an error that one step of the usual iteration leaves.
-
-    Inside the picture; from 1 on the iteration diverges.
+    """Largest share of an error in the picture that an iteration step leaves.
 
     With x' = g(r) x + t(x), the iteration x <- (x' - t(x)) / g(r) of `cv2.undistortPoints` multiplies an error by
-    1 - J / g, where J is the Jacobian of the distortion, tangential terms t among it.
+    1 - J / g, where J is the Jacobian of the distortion, tangential terms t among it. From 1 on it diverges.
     """
     coarse = 48  # directions and radii where what is looked for has a wide margin
     angles = np.linspace(0.0, math.tau, coarse, endpoint=False)
@@ -164,10 +159,7 @@ def _reach(lens: Lens) -> float:
 
 
 def _within(points: Float, low: Float, high: Float) -> Bool:
-    """Whether points (N, 2) lie in the picture, or between it and the axis.
-
-    For a point between, the picture is further out on its ray.
-    """
+    """Whether points (N, 2) lie in the picture, or between it and the axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = low / points, high / points
     near, far = np.fmin(a, b), np.fmax(a, b)
@@ -193,10 +185,7 @@ def distorted(lens: Lens, xy: Float) -> Float:
 
 
 def _jacobian(lens: Lens, xy: Float) -> tuple[Float, Float, Float]:
-    """Derivatives (...) of `distorted` at points (..., 2).
-
-    x' by x, y' by y, and x' by y, which is y' by x.
-    """
+    """Derivatives (...) of `distorted` at (..., 2): x' by x, y' by y, x' by y."""
     k1, k2, p1, p2, k3 = lens.distortion
     x, y = xy[..., 0], xy[..., 1]
     s = x * x + y * y

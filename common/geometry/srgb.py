@@ -1,7 +1,4 @@
-"""sRGB curve between image bytes and light.
-
-Light adds and scales linearly, bytes do not.
-"""
+"""sRGB curve between image bytes and light: light adds and scales linearly."""
 
 import numpy as np
 import numpy.typing as npt
@@ -21,15 +18,9 @@ def to_linear(srgb: Float) -> Float:
 
 
 def gain_tables(gains: npt.ArrayLike) -> Image:
-    """Return lookup tables that apply a gain to the light of each channel.
+    """Lookup tables (K, 256) that multiply the light of each channel by gains (K,).
 
-    One table per channel gives what every byte becomes when the light of its channel is multiplied.
-
-    Args:
-        gains: (K,) factors in linear light, in the order of the image's channels.
-
-    Returns:
-        (K, 256) bytes; light above 1 is clipped, as a sensor clips it. Gains of 1 change nothing.
+    Light above 1 is clipped, as a sensor clips it. Gains of 1 change nothing.
     """
     light = to_linear(np.arange(256) / 255.0)
     return np.round(255.0 * to_srgb(np.asarray(gains, np.float64)[:, None] * light)).astype(np.uint8)

@@ -1,10 +1,8 @@
 """Codes of fiducial tags as printed: which cell of which tag is white.
 
-They are the same under every OpenCV.
-
 OpenCV 4 and the first of 5 hold the AprilTag families turned by half a turn against the pictures that their authors
-publish and everybody prints; a later 5 mends that (opencv/opencv pull request 28823). Who asks here gets the published
-ones under either. The ArUco families are OpenCV's own.
+publish and everybody prints; a later 5 mends that (opencv/opencv pull request 28823). Here they are as published under
+either. The ArUco families are OpenCV's own.
 """
 
 from collections.abc import Sequence
@@ -39,9 +37,7 @@ PUBLISHED = ("110101", "011101", "011000", "101000", "010110", "000100")
 
 
 def tag_bits(family: TagFamily, number: int) -> Image:
-    """Return the code of a tag as printed, without its border.
-
-    Shape (cells, cells), 1 = white, row 0 on top. Around it is a black border of one cell.
+    """Code of a tag as printed, (cells, cells), 1 = white, row 0 on top, no border.
 
     Raises:
         ValueError: The family has no such tag.
@@ -54,7 +50,7 @@ def tag_bits(family: TagFamily, number: int) -> Image:
 
 
 def tag_image(family: TagFamily, number: int, margin: int = 0) -> Image:
-    """Return the image of a whole tag, one byte (0 or 255) a cell.
+    """Image of a whole tag, one byte (0 or 255) a cell.
 
     Code, black border, `margin` cells of white paper around it.
 
@@ -66,9 +62,7 @@ def tag_image(family: TagFamily, number: int, margin: int = 0) -> Image:
 
 
 def dictionary(family: TagFamily, numbers: Sequence[int]) -> cv2.aruco.Dictionary:
-    """Return the OpenCV dictionary that detects these tags.
-
-    The first of `numbers` is its 0, and so on; corners as printed.
+    """OpenCV dictionary that detects these tags, the first as 0; corners as printed.
 
     Raises:
         ValueError: The family has no such tag.

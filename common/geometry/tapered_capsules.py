@@ -1,6 +1,4 @@
-"""Intersection of rays with round cones.
-
-A round cone is two spheres and the cone that touches both, which flesh on a bone nearly is.
+"""Intersection of rays with round cones: two spheres and the cone about both.
 
 A ray o + t d (d of unit length) meets the side where k2 t^2 + 2 k1 t + k0 = 0 with a foot between the spheres, or else
 one of the two spheres; the body is convex and holds both, so the first of all hits is its surface. (The quadric is
@@ -40,10 +38,7 @@ class Capsules:
         )
 
     def normals(self, body: Int, points: Real) -> Real:
-        """Return the outward unit normals at surface points of bodies.
-
-        Normals (N, 3) at points (N, 3) [m] of the bodies `body` (N,), as exact as these points.
-        """
+        """Outward unit normals (N, 3) at surface points (N, 3) of bodies `body` (N,)."""
         kind = points.dtype
         axis = self.stop_m - self.start_m
         narrowing = self.start_radius_m - self.stop_radius_m
@@ -60,10 +55,7 @@ class Capsules:
 
 
 def terms(capsules: Capsules, origin: Float, kind: type[np.float32] | type[np.float64]) -> Any:
-    """Return the terms of each body that `first_hits` needs.
-
-    Seen from the rays' origin (3,) [m]: (12, ..., B) of a kind.
-    """
+    """Terms (12, ..., B) that `first_hits` needs, for rays from one origin (3,)."""
     axis = capsules.stop_m - capsules.start_m
     r1, narrowing = capsules.start_radius_m, capsules.start_radius_m - capsules.stop_radius_m
     away, beyond = origin - capsules.start_m, origin - capsules.stop_m
@@ -76,16 +68,11 @@ def terms(capsules: Capsules, origin: Float, kind: type[np.float32] | type[np.fl
 
 
 def first_hits(known: Any, directions: Real) -> Real:
-    """Return how far along rays their body begins.
-
-    Rays (3, ...) of unit length, each with its own body or all with the same one.
+    """How far along unit rays (3, ...) their body begins, (...) [m]; inf: not hit.
 
     Args:
         known: `terms` of one body (12,), or of the body of each ray (12, ...), or what fits the rays by broadcasting.
         directions: The rays, from the origin of the terms.
-
-    Returns:
-        (...) [m], in the precision of both; inf: not hit.
     """
     ax, ay, az, wx, wy, wz, d2, k0, lean, shift, c1, c2 = known
     dx, dy, dz = directions
@@ -105,10 +92,7 @@ def first_hits(known: Any, directions: Real) -> Real:
 
 
 def distances(capsules: Capsules, origin: Float, directions: Float) -> Float:
-    """Return the distance along each ray at which each body begins.
-
-    Rays (N, 3) from one origin, distances (N, B) [m]; inf: not hit.
-    """
+    """Distance (N, B) [m] along rays (N, 3) at which each body begins; inf: not hit."""
     middle = 0.5 * (capsules.start_m + capsules.stop_m) - origin
     half = 0.5 * np.linalg.norm(capsules.stop_m - capsules.start_m, axis=1)
     radius = half + np.maximum(capsules.start_radius_m, capsules.stop_radius_m)

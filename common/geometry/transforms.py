@@ -1,7 +1,4 @@
-"""Rigid transforms, quaternions (wxyz) and small fits.
-
-`T_a_b` maps coordinates in b to coordinates in a.
-"""
+"""Rigid transforms, quaternions (wxyz) and small fits; `T_a_b` maps b to a."""
 
 import numpy as np
 
@@ -11,14 +8,10 @@ Wxyz = tuple[float, float, float, float]  # one quaternion, as plain numbers
 
 _EYE = np.eye(3)
 _SKEW: Float = np.cross(_EYE[:, None], _EYE[None]).swapaxes(1, 2).reshape(3, 9)
-_UNSKEW: Float = 0.5 * _SKEW.T
 
 
 def _shepperd() -> Float:
-    """Return the linear map (9, 16) from a rotation to Shepperd's quaternion forms.
-
-    It maps a rotation's elements to the four forms of its quaternion, each times 4 q[k] q.
-    """
+    """Linear map (9, 16) from a rotation to the forms 4 q[k] q of its quaternion q."""
     out = np.zeros((3, 3, 4, 4))
     for i, signs in enumerate(((1, 1, -1, -1), (1, -1, 1, -1), (1, -1, -1, 1))):
         out[i, i] = np.diag(signs)
@@ -46,10 +39,7 @@ def quaternion_to_matrix(q_wxyz: Float) -> Float:
 
 
 def quaternion_product(p: Wxyz, q: Wxyz) -> Wxyz:
-    """Return the product of two quaternions: the rotation p after q.
-
-    For one pair, plain numbers are ten times faster than arrays.
-    """
+    """The rotation p after q; for one pair, ten times faster than arrays."""
     a, b, c, d = p
     w, x, y, z = q
     return (
@@ -77,8 +67,7 @@ def matrix_of(q: Wxyz) -> Float:
 def matrix_to_quaternion(rotation: Float) -> Float:
     """Unit quaternions (..., 4) wxyz with w >= 0 of rotation matrices (..., 3, 3).
 
-    Takes the numerically largest of the four classic forms (Shepperd, 1978), so it is
-    exact also near half turns.
+    Takes the numerically largest of the four classic forms (Shepperd, 1978): exact also near half turns.
     """
     m = np.asarray(rotation, dtype=np.float64).reshape(-1, 9)
     # A quarter of each of the four forms is a row of a symmetric matrix that is linear in the rotation's elements.
@@ -90,10 +79,7 @@ def matrix_to_quaternion(rotation: Float) -> Float:
 
 
 def rotation_vector_to_matrix(vector: Float) -> Float:
-    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad].
-
-    By Rodrigues' formula.
-    """
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
     # A turn too small to be distinguished from none is taken as this small, not divided by.
     angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-9)[..., None, None]
     k = skew(vector)
@@ -101,10 +87,7 @@ def rotation_vector_to_matrix(vector: Float) -> Float:
 
 
 def matrix_to_rotation_vector(rotation: Float) -> Float:
-    """Return rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3).
-
-    Each is at most half a turn.
-    """
+    """Rotation vectors (..., 3) [rad], at most half a turn, of matrices (..., 3, 3)."""
     q = matrix_to_quaternion(rotation)
     sine = np.sqrt(np.vecdot(q[..., 1:], q[..., 1:]))
     half = np.arctan2(sine, q[..., 0])
@@ -116,19 +99,8 @@ def skew(vector: Float) -> Float:
     return (vector @ _SKEW).reshape(*vector.shape, 3)
 
 
-def unskew(matrix: Float) -> Float:
-    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3).
-
-    `unskew(skew(a)) == a`.
-    """
-    return matrix.reshape(*matrix.shape[:-2], 9) @ _UNSKEW
-
-
 def cross(a: Float, b: Float) -> Float:
-    """Return cross products of (..., 3) arrays.
-
-    Several times faster than numpy's for small ones.
-    """
+    """Cross products of (..., 3) arrays, for small ones much faster than numpy's."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
@@ -168,14 +140,9 @@ def rigid(rotation: Float, translation: Float) -> Float:
 
 
 def fit_rigid(points_a: Float, points_b: Float, weight: Float | None = None) -> Float:
-    """Fit `T_a_b` (..., 4, 4) in least squares: points_a ~ T_a_b points_b.
+    """Fit `T_a_b` (..., 4, 4) by least squares to points_a ~ T_a_b points_b.
 
-    Both are (..., N, 3) (Kabsch, 1976).
-
-    Args:
-        points_a: Points in frame a.
-        points_b: The same points in frame b.
-        weight: (N,) non-negative weights; None: all one.
+    Kabsch, 1976. Points are (..., N, 3), `weight` (N,) non-negative; None: all one.
     """
     count = points_a.shape[-2]
     w = np.full(count, 1.0 / count) if weight is None else weight / weight.sum()
@@ -191,16 +158,10 @@ def fit_rigid(points_a: Float, points_b: Float, weight: Float | None = None) -> 
 
 
 def intersect_plane(origin: Float, direction: Float, normal: Float, offset: float) -> Float:
-    """Where rays meet the plane `normal . X = offset`.
+    """Points (..., 3) [m] where rays meet the plane `normal . X = offset`.
 
-    Args:
-        origin: Ray origins (..., 3) [m].
-        direction: Ray directions (..., 3), any length.
-        normal: Plane normal (3,).
-        offset: Plane offset along the normal [m].
-
-    Returns:
-        Points (..., 3) [m]; NaN where the ray is parallel to the plane or meets it behind its origin.
+    Origins (..., 3) [m], directions (..., 3) of any length; NaN where the ray is parallel to the plane or meets it
+    behind its origin.
     """
     along = direction @ normal
     with np.errstate(divide="ignore", invalid="ignore"):

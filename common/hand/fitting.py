@@ -1,43 +1,29 @@
 """A fit adapts a hand profile and its posture prior to recorded joints.
 
-Posture prior of a person.
+The posture prior is one normal distribution of all 20 angles, for fingers move together. A recording is one sample of
+how a person moves, so it is shrunk towards a wide prior as if that had been seen in `prior_samples` independent frames
+(the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data Analysis", 3rd edition 2013, section 3.6). Of T frames
+T (1 - r) / (1 + r) are independent, with r the correlation of one frame with the next.
 
-Joint angles of recorded joints, and a normal distribution fitted to them.
-
-It is one distribution of all 20 angles, for fingers move together: four that each had their own would count four times
-how the palm is turned. A recording is one sample of how a person moves, so it is shrunk towards a wide prior as if that
-had been seen in `_PRIOR_SAMPLES` independent frames (the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data
-Analysis", 3rd edition 2013, section 3.6). How many independent frames there are follows from the correlation of one
-frame with the next: T (1 - r) / (1 + r).
-
-Fit of a hand profile to joints recorded by another tracker (Leap, WebXR).
-
-The hand can then be tracked by this project.
-
-Two ways. A tracker that reports joint *frames* (WebXR) shows the rest pose itself in one flat hand. One that reports
-joint *places* shows it in a motion: bones are the mean distances, the palm the median places of the roots, and the
-hinges follow from the planes in which fingers bend. With n the normal of that plane, from a finger's bones,
+The profile comes from another tracker (Leap, WebXR). One that reports joint *frames* (WebXR) shows the rest pose
+itself in one flat hand. One that reports joint *places* shows it in a motion: bones are the mean distances, the palm
+the median places of the roots, and the hinges follow from the planes in which fingers bend. With n the normal of that
+plane,
 
     finger   n = R_y(abduction) n_rest: its height in the palm is the same in every frame and gives the hinge's roll
     thumb    n = R_rest R_y(abduction) x: all n lie in one plane, whose normal is the abduction's axis
 
 A finger's rest heading is the median of where its first bone points in the palm's plane, less what the roll of its
-hinge turns it by at its flexion: so abduction is zero in the middle of the motion. At rest all bones of a finger are in
-one line. What is left is how far our joints (`docs/frames.md`) differ from the recorded ones:
-abduction turns about the palm's y for every finger, and other hands lean that axis by 10 to 20 degrees.
+hinge turns it by at its flexion: so abduction is zero in the middle of the motion. At rest all bones of a finger are
+in one line. What is left is how far our joints (`docs/frames.md`) differ from the recorded ones: abduction turns about
+the palm's y for every finger, and other hands lean that axis by 10 to 20 degrees.
 
-Three back-of-hand markers instead of one, which constrain palm orientation.
-
-The three markers rotate with the palm.
-
-They lie above metacarpals, where skin moves least: one near the wrist, one each behind the knuckles of index and little
-finger. So they span a triangle as large as the back of a hand allows: noise of 1 mm turns one with sides of 4 to 5 cm
-by a degree or two.
+Three back markers lie above metacarpals, where skin moves least, and span a triangle as large as the back of a hand
+allows: noise of 1 mm turns one with sides of 4 to 5 cm by a degree or two.
 """
 
 import logging
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 
@@ -67,12 +53,8 @@ _LEAST_RAD = np.radians(0.5)  # no angle is known better by the others, whatever
 def joint_angles(model: HandModel, fingers_m: Float) -> Float:
     """Angles (T, 5, 4) [rad] of recorded joints, regardless of limits.
 
-    Args:
-        model: The hand.
-        fingers_m: (T, 5, 4, 3) [m] joints of `CHAINS`, palm frame.
-
-    Returns:
-        Flexions by the hinges of the model; an abduction is 0 where a finger points straight down or up: it shows none.
+    `fingers_m` (T, 5, 4, 3) [m]: joints of `CHAINS`, palm frame. Flexions are about the hinges of the model; an
+    abduction is 0 where a finger points straight down or up: it shows none.
     """
     bones = np.diff(fingers_m, axis=2)
     bones = bones / np.linalg.norm(bones, axis=3, keepdims=True)
@@ -103,10 +85,7 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
 
 
 def _hinge(rest: Float, angle: Float, thumb: bool) -> Float:
-    """Return the flexion axis (T, 3) of a joint, in the palm frame.
-
-    It is -x of the joint, at abduction angles (T,).
-    """
+    """Flexion axis (T, 3), palm frame: -x of the joint at abduction angles (T,)."""
     about = np.zeros((len(angle), 3, 3))
     about[:, 0, 0] = about[:, 2, 2] = np.cos(angle)
     about[:, 0, 2], about[:, 2, 0], about[:, 1, 1] = np.sin(angle), -np.sin(angle), 1.0
@@ -114,10 +93,7 @@ def _hinge(rest: Float, angle: Float, thumb: bool) -> Float:
 
 
 def fit_posture(angles_rad: Float) -> Posture:
-    """Fit the posture prior to a motion, shrunk as its length demands.
-
-    Args:
-        angles_rad: (T, 5, 4) [rad], evenly spaced in time.
+    """Fit the posture prior to a motion (T, 5, 4) [rad], evenly spaced in time.
 
     Raises:
         CalibrationError: There are fewer than 20 frames.
@@ -146,12 +122,7 @@ def _prior_cov() -> Float:
 
 
 def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
-    """The limits, moved out to where a motion went for a hundredth of its time.
-
-    Args:
-        limits: Those of a preset.
-        angles_rad: (T, 5, 4) [rad].
-    """
+    """Limits, moved out to where a motion (T, 5, 4) [rad] went for 1 % of its time."""
     low, high = np.percentile(angles_rad, [1.0, 99.0], axis=0)
     fingers: dict[str, FingerLimits] = {}
     for f, name in enumerate(FINGERS):
@@ -165,10 +136,7 @@ def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
 
 
 def _independent(samples: Float) -> float:
-    """Return the effective number of independent samples of a motion (T, K).
-
-    From the correlation of neighbours.
-    """
+    """Effective number of independent samples of a motion (T, K)."""
     off = samples - samples.mean(axis=0)
     correlation = np.clip(
         (off[1:] * off[:-1]).sum(axis=0) / np.maximum((off * off).sum(axis=0), 1e-12), 0.0, 0.9999
@@ -203,8 +171,7 @@ def profile_from_rest(
         side: "left" or "right".
         position_m: (25, 3) [m] WebXR joints, in the frame of the wrist joint (OpenXR: -z to the fingers, +y dorsal).
         rotation: (25, 3, 3) their frames in that one.
-        limits: Of the angles; None: the default.
-        couplings: None: the default.
+        limits, couplings: None: the default.
 
     Raises:
         CalibrationError: The side is neither.
@@ -235,11 +202,7 @@ def profile_from_rest(
 
 
 def profile_from_joints(
-    name: str,
-    side: str,
-    fingers_m: Float,
-    limits: Limits | None = None,
-    couplings: Couplings | None = None,
+    name: str, side: str, fingers_m: Float, limits: Limits | None = None, couplings: Couplings | None = None
 ) -> HandProfile:
     """The profile of a hand whose joints were recorded in motion.
 
@@ -290,10 +253,7 @@ def profile_from_joints(
 
 
 def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
-    """Warn about fingers that the profile does not follow.
-
-    Also about those whose rest heading is not that of the motion.
-    """
+    """Warn of fingers that the profile does not follow, or rests unlike the motion."""
     off = np.linalg.norm(model.chains(angles).position_m - fingers_m, axis=3).mean(axis=(0, 2))
     steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
     flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)
@@ -337,10 +297,7 @@ def _with_posture(profile: HandProfile, angles: Float) -> HandProfile:
 
 
 def _finger_rest(bones: Float, normals: Float) -> Float:
-    """Return the rest frame (3, 3) of a finger in the palm frame.
-
-    From its unit bones (T, 3, 3) and flexion normals (T, 3).
-    """
+    """Rest frame (3, 3) of a finger, of unit bones (T, 3, 3) and normals (T, 3)."""
     height = normals[:, 1].sum() / np.linalg.norm(normals, axis=1).sum()
     level = np.sqrt(1.0 - height * height)  # cosine of the roll of the hinge, `height` its sine
     # The proximal bone at flexion a: -level sin a above the palm, and ahead and aside of the rest heading in it.
@@ -372,10 +329,7 @@ def _thumb_rest(bones: Float, normals: Float, right: bool) -> Float:
 
 
 def _extended(bones: Float) -> Int:
-    """Return the tenth of the frames in which a finger (T, 3, 3) is most extended.
-
-    That is, straightest and nearest the palm's plane.
-    """
+    """The tenth of the frames in which a finger (T, 3, 3) is straightest and level."""
     straight = (bones[:, 0] * bones[:, 1]).sum(axis=1)
     level = 1.0 - np.abs(bones[:, 0, 1])
     extended = 0.1  # share of the frames that counts as most extended, of a thumb
@@ -401,9 +355,7 @@ _PLACES = {
 
 
 def with_three_back_markers(profile: HandProfile, name: str) -> HandProfile:
-    """Return the hand under another name with three markers on its back.
-
-    The markers are `back`, `back2` and `back3`; an existing `back` is moved.
+    """The hand under another name with markers `back` (moved), `back2` and `back3`.
 
     Raises:
         CalibrationError: The profile is broken.
@@ -412,10 +364,10 @@ def with_three_back_markers(profile: HandProfile, name: str) -> HandProfile:
     mounts = {
         marker: MarkerMount(joint=PALM_FRAME, offset_m=_above(model, *at)) for marker, at in _PLACES.items()
     }
-    return msgspec.structs.replace(profile, name=name, markers=profile.markers | mounts)
+    return replace(profile, name=name, markers=profile.markers | mounts)
 
 
-def _above(model: HandModel, near: str, far: str, share: float) -> tuple[float, float, float]:
+def _above(model: HandModel, near: str, far: str, share: float) -> Vector3:
     """Place (3,) [m], palm frame, on the skin above a metacarpal."""
     a, b = (JOINTS.index(joint) for joint in (near, far))
     middle: Float = (1.0 - share) * model.rest_position_m[a] + share * model.rest_position_m[b]

@@ -1,31 +1,20 @@
 """The hand model computes joints and fingertips from bones and angles.
 
-Hand model: 26 OpenXR joints, bones, limits, couplings, forward kinematics.
-
-Starts from a profile's rest pose.
-
-Angles (5, 4) [rad] are zero in the rest pose; fingers thumb, index, middle, ring, little; columns abduction,
-flexion (MCP; thumb CMC), PIP (thumb MCP), DIP (thumb IP). A flexion by a is a rotation by -a about the
-joint's own +x; an abduction is a rotation about the palm's +y, positive towards the thumb:
+26 OpenXR joints, from a profile's rest pose. Angles (5, 4) [rad] are zero in it; fingers thumb, index, middle, ring,
+little; columns abduction, flexion (MCP; thumb CMC), PIP (thumb MCP), DIP (thumb IP). A flexion by a is a rotation by
+-a about the joint's own +x; an abduction is a rotation about the palm's +y, positive towards the thumb:
 
     fingers   R_MCP = R_y(s a_abd) R_rest R_x(-a_flex)          s = +1 right hand, -1 left hand
     thumb     R_CMC = R_rest R_y(s a_abd) R_x(-a_flex)          in the joint's own frame, no twist
 
-All five fingers are the same chain of four joints (root, two hinges, tip), so forward kinematics is four
-stacked products and no loop over fingers.
+All five fingers are the same chain of four joints (root, two hinges, tip): forward kinematics is four stacked
+products. Limits are per angle, but the abduction's narrow with flexion (`common.hand.profiles`).
 
-Limits are per angle, but the abduction's narrow with flexion (`common.hand.profiles`).
-
-Position of a fingertip.
-
-It is the outermost point of the skin along the finger's last bone.
-
-The last joint of a hand file lies inside the fingertip. OpenXR defines its radius as the distance from there to the
-skin (XR_EXT_hand_tracking), so where the file gives radii the tip is that far beyond the joint. If it gives none, the
-reach is that of a hand of this size, in shares of the distance between the knuckles of index and little finger,
-measured like the rest of the skin (`common.hand.skin`) on the generic hand of the WebXR Input
-Profiles (MIT). The
-outermost point of such a fingertip lies a little towards the nail; that of a sphere does not.
+A fingertip is the outermost point of the skin along the last bone. OpenXR defines the radius of the last joint as the
+distance from there to the skin (XR_EXT_hand_tracking), so where the file gives radii the tip is that far beyond it.
+Otherwise it is that of a hand of this size, in shares of the distance between the knuckles of index and little finger,
+measured like the rest of the skin (`common.hand.skin`) on the generic hand of the WebXR Input Profiles (MIT); the
+outermost point of such a fingertip lies a little towards the nail.
 """
 
 from dataclasses import dataclass
@@ -94,7 +83,7 @@ class Chains:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandJoints:
-    """Where the joints are.
+    """Poses of the joints.
 
     Attributes:
         position_m: (..., 26, 3) [m], rig frame.
@@ -109,9 +98,9 @@ class HandJoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """Mounting of a marker: joint index, centroid (3,) [m] and painted length [m].
+    """Mounting of a marker: joint index (None: palm frame), centroid, painted length.
 
-    Index None: the palm frame. The centroid is in the frame of that joint.
+    The centroid (3,) [m] is in the frame of that joint.
     """
 
     joint: int | None
@@ -132,7 +121,6 @@ class HandModel:
     """A hand profile as arrays, checked.
 
     Attributes:
-        profile: The file it was built from.
         rest_position_m: (26, 3) [m], palm frame.
         rest_rotation: (26, 3, 3), joint frame -> palm frame.
         radius_m: (26,) [m].
@@ -144,7 +132,6 @@ class HandModel:
         mcp_per_pip: Natural flexion, a prior only, or None where there is none.
         neighbours: Whether fingers side by side tend to bend alike, a prior only.
         posture: Mean (20,) [rad] and covariance (20, 20) [rad^2] of the angles of this person, or None.
-        mounts: Marker name -> where it sits.
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
         link_rotation: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
@@ -171,10 +158,7 @@ class HandModel:
     swing: Float
 
     def __post_init__(self) -> None:
-        """Make the radii read-only.
-
-        Poses adopt them, and kernels take a read-only array for another type.
-        """
+        """Freeze the radii: poses adopt them, kernels take read-only for another type."""
         self.radius_m.setflags(write=False)
 
     @classmethod
@@ -220,10 +204,7 @@ class HandModel:
         )
 
     def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
-        """Return the joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad].
-
-        Any matching leading axes.
-        """
+        """Joint poses of palm poses (..., 4, 4) and angles (..., 5, 4) [rad]."""
         chains = self.chains(np.asarray(angles_rad, dtype=np.float64))
         return self.joints(np.asarray(T_rig_palm, dtype=np.float64), chains)
 
@@ -255,11 +236,7 @@ class HandModel:
         return Chains(position.cumsum(axis=-2), rotation)
 
     def marker_points(self, joints: HandJoints, names: tuple[str, ...]) -> Float:
-        """Cap centroids (..., M, 3) [m] in the rig frame.
-
-        Raises:
-            CalibrationError: The profile mounts no marker of that name.
-        """
+        """Cap centroids (..., M, 3) [m], rig frame; raises as `mount`."""
         points: list[Float] = []
         for name in names:
             mount = self.mount(name)
@@ -271,11 +248,7 @@ class HandModel:
         return np.stack(points, axis=-2)
 
     def mount(self, name: str) -> Mount:
-        """Where marker `name` sits.
-
-        Raises:
-            CalibrationError: The profile does not know it.
-        """
+        """Where marker `name` sits; CalibrationError if the profile does not know it."""
         if name not in self.mounts:
             known = ", ".join(self.mounts)
             raise CalibrationError(
@@ -284,10 +257,7 @@ class HandModel:
         return self.mounts[name]
 
     def abduction_limits_rad(self, flexion_rad: Float) -> tuple[Float, Float]:
-        """Return the abduction limits (..., 5) [rad] at flexions (..., 5) [rad].
-
-        Low and high; NaN where the flexion is NaN.
-        """
+        """Low and high (..., 5) [rad] of the abduction at flexions; NaN stays NaN."""
         most = self.limits_rad[:, FLEXION, 1]
         flexed = np.minimum(np.maximum(flexion_rad, 0.0), most) / np.where(most > 0.0, most, 1.0)
         left = spread_left(np.maximum(flexed, 0.0), self.spread_at_full_flexion)
@@ -301,18 +271,12 @@ class HandModel:
         return low, high
 
     def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
-        """Return whether each of the angles (..., 5, 4) is inside its limits.
-
-        The abduction must be inside the limits at its flexion.
-        """
+        """Whether each angle (..., 5, 4) is inside its limits at its finger's flexion."""
         low, high = self.limits_at(angles_rad[..., FLEXION])
         return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
 
     def clamp(self, angles_rad: Float) -> Float:
-        """Clamp angles (..., 5, 4) to their limits.
-
-        The abduction is clamped to the limits at the clamped flexion.
-        """
+        """Clamp angles (..., 5, 4) to limits, the abduction's at the clamped flexion."""
         legal = np.minimum(np.maximum(angles_rad, self.limits_rad[..., 0]), self.limits_rad[..., 1])
         low, high = self.abduction_limits_rad(legal[..., FLEXION])
         legal[..., ABDUCTION] = np.minimum(np.maximum(angles_rad[..., ABDUCTION], low), high)
@@ -330,10 +294,7 @@ def _swing(root: Float, link_rotation: Float, side_sign: float) -> Float:
 
 
 def _about(axis: int, sign: float) -> Float:
-    """Return the rotation by sign * a about axis 0 or 1 as three terms (3, 3, 3).
-
-    Coordinate axis. The terms: constant, times cos a, times sin a.
-    """
+    """Rotation by sign * a about axis 0 or 1 as terms (3, 3, 3) of 1, cos a, sin a."""
     parts = np.zeros((3, 3, 3))
     i, j = (axis + 1) % 3, (axis + 2) % 3
     parts[0, axis, axis] = parts[1, i, i] = parts[1, j, j] = 1.0
@@ -382,11 +343,7 @@ def _posture(profile: HandProfile, where: str) -> tuple[Float, Float] | None:
 
 
 def couplings_of(profile: HandProfile) -> Couplings:
-    """The couplings of a profile, spelled out where it names a preset or nothing.
-
-    Raises:
-        CalibrationError: They contradict each other.
-    """
+    """The couplings of a profile, spelled out; CalibrationError if contradictory."""
     couplings = profile.couplings or "K"
     couplings = preset_couplings(couplings) if isinstance(couplings, str) else couplings
     if couplings.dip_per_pip is None and couplings.dip_spread_rad > 0.0:

@@ -1,36 +1,21 @@
 """Profiles describe a hand; its length, presets and limits fill what is open.
 
-Hand profiles generated from one number, the length of the hand.
-
-A quick start before a hand is measured.
-
-Bone lengths are the shares of hand length published by Buchholz, Armstrong & Goldstein (1992); the layout of
-the palm is a plain fan. Left profiles are the exact mirror image of right ones.
-
-Joint limits of a hand: a range per angle.
-
-The range of abduction narrows with flexion.
+Bone lengths are the shares of hand length published by Buchholz, Armstrong & Goldstein (1992); the layout of the palm
+is a plain fan. Left profiles are the exact mirror image of right ones. Presets have the limits and couplings of the
+two papers, Kalbfleisch (K) and Digits (D).
 
 Spread fingers cannot stay spread in a fist: the collateral ligaments of the MCP tighten, because the head of the
 metacarpal is a cam. With f the flexion, F the highest and s what is left there, the range of the abduction is
-multiplied by
+multiplied by the parabolic limit Kalbfleisch wished for,
 
     1 - (1 - s) (min(max(f, 0), F) / F)^2
 
-the parabolic limit Kalbfleisch wished for. It narrows towards 0, so 0 lies in the range.
-
-Defaults for what a hand profile may omit.
-
-Joint limits and couplings as given in the two papers, and radii.
-
-How far abduction narrows in a fist is in neither paper. Fingers pushed aside by a known force give way by 24
-degrees at a straight MCP and by 15 at 90 degrees of flexion, the mean of all fingers of 100 people (Lutsky, Matzon,
-Walinchus, Ross & Beredjiklian, J. Hand Surg. Am. 39, 2014). Their ratio is taken: a limit is where the ligaments
-stop a finger. Of their own force people spread a fist even less.
-
-Nor do the papers state how people differ from their limits. Active ranges of young adults have standard deviations
-of 5 to 12 degrees, and knuckles reach 20 degrees beyond the straight finger (Mallon, Brown & Nunley, "Digital ranges
-of motion: normal values in young adults", J. Hand Surg. Am. 16, 1991). So a preset is a prior with a width.
+It narrows towards 0, so 0 lies in the range. s is in neither paper: fingers pushed aside by a known force give way by
+24 degrees at a straight MCP and by 15 at 90 degrees of flexion, the mean of all fingers of 100 people (Lutsky, Matzon,
+Walinchus, Ross & Beredjiklian, J. Hand Surg. Am. 39, 2014); their ratio is taken. Active ranges of young adults have
+standard deviations of 5 to 12 degrees, and knuckles reach 20 degrees beyond the straight finger (Mallon, Brown &
+Nunley, "Digital ranges of motion: normal values in young adults", J. Hand Surg. Am. 16, 1991): so a preset is a prior
+with a width.
 """
 
 from math import radians
@@ -83,9 +68,9 @@ _MARKER_JOINT = {
 
 
 def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> HandProfile:
-    """Return a right or left profile scaled from the length of the hand.
+    """Return a profile scaled from the length of the hand [m].
 
-    The length is from wrist crease to middle finger end [m].
+    The length is from wrist crease to middle finger end.
 
     Raises:
         ValueError: The side is neither "left" nor "right", or the length is no hand's (0.1 to 0.25 m).
@@ -130,10 +115,7 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
 
 
 def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
-    """Return the hand profile scaled by `factor`.
-
-    Positions, offsets, radii and painted lengths are multiplied by `factor`.
-    """
+    """The profile with all lengths multiplied by `factor`."""
 
     def scaled(vector: Vector3) -> Vector3:
         return _vector(factor * np.array(vector))
@@ -155,10 +137,7 @@ def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
 
 
 def mirrored_profile(profile: HandProfile) -> HandProfile:
-    """Return the other hand of the same person, under the same name.
-
-    Mirrored in the palm's x.
-    """
+    """The other hand of the same person, mirrored in the palm's x; the same name."""
 
     def mirrored(vector: Vector3) -> Vector3:
         x, y, z = vector
@@ -185,10 +164,7 @@ def _vector(value: Float) -> Vector3:
 
 
 def joint_frame(heading: Float, dorsal: Float) -> Float:
-    """Return the joint frame (3, 3) in the frame of its arguments.
-
-    -z is along heading (3,), +y as near to dorsal (3,) as possible.
-    """
+    """Joint frame (3, 3): -z along heading (3,), +y nearest to dorsal (3,)."""
     z = -heading / np.linalg.norm(heading)
     y = dorsal - (dorsal @ z) * z
     y = y / np.linalg.norm(y)
@@ -238,23 +214,12 @@ FloatOrArray = TypeVar("FloatOrArray", float, Float)
 
 
 def spread_left(flexed: FloatOrArray, at_full_flexion: FloatOrArray) -> FloatOrArray:
-    """Return the share of the abduction range that remains at a flexion.
-
-    A parabola from 1 down to `at_full_flexion`.
-
-    Args:
-        flexed: Flexion as a share of the highest, 0 ... 1.
-        at_full_flexion: Share left where `flexed` is 1.
-    """
+    """Share of the abduction range left at a flexion (0 ... 1: share of the highest)."""
     return 1.0 - (1.0 - at_full_flexion) * flexed * flexed
 
 
 def limit_table(limits: Limits, where: str) -> Float:
-    """Low and high (5, 4, 2) [rad] of every angle, where nothing narrows them.
-
-    Raises:
-        CalibrationError: A low is above its high.
-    """
+    """Low and high (5, 4, 2) [rad] of every angle; CalibrationError if crossed."""
     table = np.array(
         [[getattr(getattr(limits, finger), f"{angle}_rad") for angle in _ANGLES] for finger in _FINGERS]
     )
@@ -330,10 +295,7 @@ def without_tolerance(limits: Limits) -> Limits:
 
 
 def preset_couplings(preset: Preset) -> Couplings:
-    """Return the couplings of a preset.
-
-    DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion.
-    """
+    """DIP per PIP: 2/3 (K), 0.84 (D, Kamper's ratio); MCP = 0.54 PIP: natural (D)."""
     return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
 
 

@@ -1,11 +1,8 @@
-"""Guided routine by which a hand is measured.
+"""Guided routine by which a hand is measured: postures and instructions of 20 s.
 
-The order of the postures, in 20 s, and the instruction for each step.
-
-Only some ways of bending constrain lengths. A straight finger that bends at the knuckle alone draws a circle about the
-knuckle; one that curls while the knuckle is held draws the arc of its two farther bones. The postures (flat, tabletop,
-hook, fist) are those of the tendon-gliding exercises of hand therapy (Wehbe & Hunter, 1985). Repetition separates it
-from what wanders meanwhile, and all fingers at once use the time four times.
+A straight finger that bends at the knuckle alone draws a circle about the knuckle; one that curls while the knuckle is
+held draws the arc of its two farther bones. The postures (flat, tabletop, hook, fist) are those of the tendon-gliding
+exercises of hand therapy (Wehbe & Hunter, 1985). Repetition separates lengths from what drifts meanwhile.
 """
 
 from collections.abc import Iterator
@@ -49,10 +46,7 @@ class Move:
         return np.maximum(self.before[:, 2], self.after[:, 2]) < straight_deg
 
     def posture(self, share: float) -> Float:
-        """Return the posture (5, 3) [deg] after `share` (0 ... 1) of its time.
-
-        Smooth, at rest at both ends.
-        """
+        """Posture (5, 3) [deg] after `share` (0 ... 1) of its time, at rest at both ends."""
         s = min(max(share, 0.0), 1.0)
         return self.before + (self.after - self.before) * (s * s * s * (s * (6.0 * s - 15.0) + 10.0))
 
@@ -114,10 +108,7 @@ ROUTINE_S = MOVES[-1].stop_s
 
 
 def move_at(t_s: float) -> Move:
-    """Return the move at routine time `t_s` [s].
-
-    The first before the beginning, the last after the end.
-    """
+    """The move at routine time `t_s` [s]; before and after it the first and last."""
     return next((move for move in MOVES if t_s < move.stop_s), MOVES[-1])
 
 

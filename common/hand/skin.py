@@ -1,34 +1,23 @@
 """Round cones model the skin of fingers: their gaps and their palmar side.
 
-Distance between the skins of two fingers, modelled as round cones.
-
-The flesh on a bone is nearly a round cone.
-
-A round cone is the union of balls whose middles go along a line and whose radii go evenly from one end to the other. So
-the gap of two is the least, over s and t in 0..1, of
+A round cone is the union of balls whose middles go along a line and whose radii go evenly from one end to the other:
+nearly the flesh on a bone. So the gap of two is the least, over s and t in 0..1, of
 
     |(a + s u) - (b + t v)| - (r_a + s d_a) - (r_b + t d_b),
 
-which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` take numbers
-as well as arrays and call nothing of their own, so that kernels may compile them.
+which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` take
+numbers as well as arrays and call nothing of their own, so that kernels may compile them.
 
-Palmar skin of flexed fingers: chains of round cones along the bones.
-
-Computes where rays meet them first.
-
-Where the laser meets a finger depends on its skin, and its bones lie nearer to the back than to the palm. Each finger
-is a chain of spheres joined by cones. A sphere has the radius by which the palmar side is round, and its centre is put
-so that the skin is as far from the bone as it should be.
-
-If the hand file gives `radius_m`, the skin is that far from every joint. If not, it is that of a hand of this size:
-shares of the distance between the knuckles of index and little finger, since the breadth of a hand gives the thickness
-of its fingers (Buchholz, Armstrong, "An ellipsoidal representation of human hand anthropometry", Human Factors 33,
-1991). The shares are those of the generic hand of the WebXR Input Profiles (MIT), cut across at these places while its
-own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and depths by breadth of hand of the scalable
-hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
-bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
-1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion measures of a person
-(`phalanx calibrate wrist subject`) is the file's `palmar_scale`, which multiplies both.
+Where the laser meets a finger depends on its palmar skin: a chain of spheres joined by cones. A sphere has the radius
+by which the palmar side is round, and its centre is put so that the skin is as far from the bone as it should be. If
+the hand file gives `radius_m`, that is the distance from every joint. If not, it is a share of the distance between
+the knuckles of index and little finger, since the breadth of a hand gives the thickness of its fingers (Buchholz,
+Armstrong, "An ellipsoidal representation of human hand anthropometry", Human Factors 33, 1991). The shares are those of
+the generic hand of the WebXR Input Profiles (MIT), cut across while its own rig bends it to a PIP of 50 degrees:
+skin folds. Breadths and depths of the scalable hand of Sancho-Bru et al. (0.23 and 0.23 of the breadth of the hand at
+the proximal bone of the index finger, 0.17 and 0.16 at the middle bone of the little finger), with 0.57 of the depth on
+the palmar side, give the same within 0.8 mm RMS and 1.5 mm at most, and as much may be wrong for another person:
+`SPREAD`. The file's `palmar_scale` (`phalanx calibrate wrist subject`) multiplies distances and radii.
 """
 
 from dataclasses import dataclass
@@ -63,10 +52,7 @@ class TaperedCapsules:
 
     @classmethod
     def of_segments(cls, joints_m: Float, radius_m: Float) -> "TaperedCapsules":
-        """Return the segments (..., 5, 3), thumb ... little, from the root on.
-
-        From joints (..., 26, 3) and radii (26,) [m].
-        """
+        """Segments (..., 5, 3), thumb ... little, of joints (..., 26, 3), radii (26,)."""
         chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
         return cls(chain[..., :-1, :], np.diff(chain, axis=-2), radius[..., :-1], np.diff(radius, axis=-1))
 
@@ -144,9 +130,9 @@ def foot_of(
 
 
 def nearest(on: Foot, share: Float) -> Float:
-    """Return the position along a cone, 0..1, where its skin is nearest to a point.
+    """Where along a cone, 0..1, its skin is nearest to a point of the other's bone.
 
-    The point is given by its share of the other cone's bone.
+    `share`: of the point along that bone.
     """
     foot, foot_by, off_2, off_by, off_by_2, lean = on
     beyond = lean * np.sqrt(np.maximum(off_2 + share * (off_by + share * off_by_2), 0.0))
@@ -196,10 +182,7 @@ class PalmarSurface:
 
     @classmethod
     def of(cls, model: HandModel) -> "PalmarSurface":
-        """Return the palmar surface of a hand file, or of a hand of its size.
-
-        As thick as the file's `palmar_scale` states.
-        """
+        """The surface of a hand file, or of a hand of its size, times its `palmar_scale`."""
         thick = np.array([[model.profile.palmar_scale.get(finger, 1.0)] for finger in get_args(Finger)])
         if model.profile.radius_m is None:
             knuckles = model.rest_position_m[CHAINS[[1, 4], 0]]
@@ -225,15 +208,10 @@ class PalmarSurface:
 
 
 def first_hits(origin: Float, rays: Float, centres: Float, radius: Float) -> Float:
-    """Return the distance along rays at which each cone of a chain is first hit.
+    """Distance along unit rays at which a chain's cones are first hit; inf: missed.
 
-    Unit rays (..., R, 3) from `origin` (3,); result (..., R, K - 1); inf: missed.
-
-    Args:
-        origin: Outside of all cones.
-        rays: In the frame of the centres.
-        centres: (..., K, 3) of the spheres of a chain.
-        radius: (K,).
+    Rays (..., R, 3) from `origin` (3,) outside of all cones, spheres of a chain at `centres` (..., K, 3) with `radius`
+    (K,), all in one frame; result (..., R, K - 1).
     """
     chain = Capsules(centres[..., :-1, :], centres[..., 1:, :], radius[:-1], radius[1:])
     known = terms(chain, origin, np.float64)[..., None, :]

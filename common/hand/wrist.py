@@ -1,13 +1,7 @@
 """The wrist joins forearm and palm and carries the wrist device.
 
-A wrist device with its hand as arrays, checked; slave and master share it.
-
-Everything is in the frame of the wrist camera. The device is strapped to the forearm and the palm pose is calibrated:
+Everything of the device is in the frame of its camera. It is strapped to the forearm and the palm pose is calibrated:
 so the palm stands still in the image, and the roots of the fingers are known pixels.
-
-Wrist joint between forearm and palm.
-
-It stands between a device on the forearm and the hand.
 
 `wrist_angles_rad` (..., 2) is flexion and deviation, 0 where forearm and palm agree. A flexion is a rotation about
 the palm's x, positive where the fingers go to the side of the palm of the hand, a deviation one about its y, positive
@@ -40,7 +34,6 @@ class WristDevice:
 
     Attributes:
         optics: The camera; its rig frame is its own.
-        model: The hand, left or right.
         T_camera_palm: Palm frame -> camera frame (4, 4) [m].
         normal: Unit normal (3,) of the laser plane.
         offset_m: The plane is normal . X = offset_m.
@@ -75,19 +68,17 @@ class WristDevice:
     def on_plane(self, uv: Float) -> Float:
         """Intersect the rays of pixels (..., 2) with the laser plane: (..., 3) [m].
 
-        Triangulation by one camera and a plane of light (Kim et al. 2012).
-        NaN where the pixel is, and where the plane is behind the camera or along the ray.
+        Triangulation by one camera and a plane of light (Kim et al. 2012). NaN where the pixel is, and where the plane
+        is behind the camera or along the ray.
         """
         return intersect_plane(_ORIGIN, self.optics.ray(uv), self.normal, self.offset_m)
 
 
 def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
-    """Return the unit normal and offset of the laser plane.
-
-    Normal (3,), offset [m], camera frame; `where` names the rig in errors.
+    """Unit normal (3,) and offset [m] of the laser plane, camera frame.
 
     Raises:
-        CalibrationError: It is not measured, or crosses no finger.
+        CalibrationError: It is not measured, or crosses no finger; with `where`.
     """
     if rig.laser_plane is None:
         raise CalibrationError(
@@ -107,10 +98,7 @@ def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
 
 
 def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
-    """Reject a palm whose knuckles are behind the camera or far beside its image.
-
-    Knuckles (4, 3) [m]; the cause may be another unit, for example.
-    """
+    """Reject knuckles (4, 3) [m] behind the camera or far beside its image."""
     size = np.array([optics.width_px, optics.height_px])
     uv = optics.project(knuckles_m) / size
     field_margin = 1.0  # image sizes from the middle: half an image beside it
@@ -158,20 +146,13 @@ def forearm_palm(wrist_angles_rad: Float) -> Float:
 
 def wrist_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
     """The quaternion of `forearm_palm` of one bend."""
-    c, s, cd, sd = (
-        cos(0.5 * flexion_rad),
-        sin(0.5 * flexion_rad),
-        cos(0.5 * deviation_rad),
-        sin(0.5 * deviation_rad),
-    )
+    c, s = cos(0.5 * flexion_rad), sin(0.5 * flexion_rad)
+    cd, sd = cos(0.5 * deviation_rad), sin(0.5 * deviation_rad)
     return cd * c, cd * s, sd * c, -sd * s
 
 
 def wrist_angles_of(R_forearm_palm: Float) -> Float:
-    """Return the wrist angles whose rotation comes near to a given rotation.
-
-    Angles (..., 2) [rad], rotations (..., 3, 3): for a rotation about x and y the result is exact.
-    """
+    """Wrist angles (..., 2) [rad] of rotations (..., 3, 3), exact if about x and y."""
     deviation = np.arctan2(-R_forearm_palm[..., 2, 0], R_forearm_palm[..., 0, 0])
     flexion = np.arctan2(-R_forearm_palm[..., 1, 2], R_forearm_palm[..., 1, 1])
     return np.stack([flexion, deviation], axis=-1)

@@ -1,21 +1,11 @@
 """A reader turns the CSV table of a third-party IMU into columns and units.
 
-Meaning and unit of the columns of a third-party IMU table.
-
-By the names in its header.
-
-A name is cut into words (`Gyroscope X (deg/s)`, `gyro_x_dps`, `gyrX`, `angular_velocity.x`, `w_RS_S_x [rad s^-1]`); one
-of them names what is measured, one the axis, the last ones or what stands in brackets the unit. Others are ignored.
-
-Third-party IMU recording: a CSV with a header.
-
-Read by the names of its columns.
-
-Columns in any order between commas, semicolons or tabs, others beside them (`imu_csv_columns`); comments before the
-header are skipped, a header of two lines (group, then axis) is joined, and between semicolons a decimal comma is one. A
-unit that the header lacks can be given. Where it is not, that of time is the one by which the recording has
-4 to 4000 samples a second, of forces the one that gives gravity, rates are in rad/s: `Table.units` states all
-of it. A value that is empty or NaN was not measured.
+A column's name is cut into words (`Gyroscope X (deg/s)`, `gyro_x_dps`, `gyrX`, `angular_velocity.x`,
+`w_RS_S_x [rad s^-1]`); one names what is measured, one the axis, the last ones or what stands in brackets the unit.
+Other columns are ignored. Commas, semicolons or tabs separate columns; between semicolons a decimal comma is one;
+comments before the header are skipped, and a header of two lines (group, then axis) is joined. Units that the header
+lacks can be given; else that of time is the one by which the recording has 4 to 4000 samples a second, that of forces
+the one that gives gravity, and rates are in rad/s. A value that is empty or NaN was not measured.
 """
 
 import csv
@@ -81,10 +71,7 @@ _CUT = re.compile(r"[^a-z0-9°²µμ]+")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column that is read: its place in a row, its name, and its unit.
-
-    The unit is "" where the name does not state it.
-    """
+    """One column that is read: place in a row, name, unit ("": not in the name)."""
 
     index: int
     name: str
@@ -95,7 +82,7 @@ Columns = Mapping[tuple[str, str], Column]  # (what, axis) -> column
 
 
 def find_columns(header: Sequence[str]) -> dict[tuple[str, str], Column]:
-    """The columns that a header names; of several times the leftmost.
+    """The columns that a header names, the leftmost of several times.
 
     Raises:
         RecordingError: Two columns could be the same thing.
@@ -145,10 +132,7 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
 
 
 def _unit(what: str, words: list[str], bracket: str) -> str:
-    """Return the unit stated by the brackets or the last words of a column name.
-
-    "": none.
-    """
+    """Unit stated by the brackets or the last words of a column name; "": none."""
     spelt = {_joined(unit): unit for unit in UNITS[what]} | _SPELT[what]
     endings = ["".join(words[k:]) for k in range(1, len(words))] + (words if what == TIME else [])
     return next((spelt[ending] for ending in (_joined(bracket), *endings) if ending in spelt), "")
@@ -177,7 +161,7 @@ class Table:
     """A recording of T samples by time.
 
     Attributes:
-        t_ns: (T,), each after the last.
+        t_ns: (T,), rising.
         gyro_rad_s, accel_m_s2, mag_ut: (T, 3) in the sensor's axes; NaN: not measured.
         truth_wxyz: (T, 4) of the quaternion in it, whose z axis is up; NaN: none.
         columns: Quantity -> names of its columns.
@@ -242,14 +226,11 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
         for what, axes in AXES.items()
         if all((what, axis) in columns for axis in axes)
     }
-    unit_within = 0.05
-    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < unit_within)] = (
-        nan  # no rotation
-    )
+    unit_within = 0.05  # of the length of a quaternion: others are no rotation
+    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < unit_within)] = nan
     t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
-    return Table(
-        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[QUATERNION], names, units, late, incomplete
-    )  # fmt: skip
+    gyro, accel, mag, quaternion = (scaled[what] for what in (GYRO, ACCEL, MAG, QUATERNION))
+    return Table(t_ns, gyro, accel, mag, quaternion, names, units, late, incomplete)
 
 
 def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
@@ -264,7 +245,7 @@ def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
         options = [(k + 1, names)]
         if k + 1 < len(lines):
             below = next(csv.reader([lines[k + 1]], delimiter=delimiter))
-            options.append((k + 2, _csv_table_joined(names, below)))
+            options.append((k + 2, _one_header(names, below)))
         for first, header in options:
             columns = find_columns(header)
             missing = _missing(columns, timed=timed)
@@ -284,7 +265,7 @@ def _header(lines: Sequence[str], *, timed: bool) -> tuple[int, str, Columns]:
     )
 
 
-def _csv_table_joined(groups: Sequence[str], names: Sequence[str]) -> list[str]:
+def _one_header(groups: Sequence[str], names: Sequence[str]) -> list[str]:
     """A header of two lines as one: the upper line's name holds until the next."""
     out: list[str] = []
     group = ""
@@ -302,10 +283,7 @@ def _missing(columns: Mapping[tuple[str, str], object], *, timed: bool) -> list[
 def _rows(
     lines: Sequence[str], first: int, delimiter: str, columns: Columns
 ) -> tuple[list[Decimal], Float, int]:
-    """Return the times as written, values (T, columns) and the number of late rows.
-
-    The values are in the order of `columns`.
-    """
+    """Times as written, values (T, columns) as in `columns`, number of late rows."""
     times: list[Decimal] = []
     values: list[list[float]] = []
     late, last = 0, len(lines)
@@ -344,10 +322,7 @@ def _number(line: int, name: str, text: str, delimiter: str) -> Decimal:
 def _scaled(
     values: Float, columns: Columns, given: Mapping[str, str]
 ) -> tuple[dict[str, Float], dict[str, str]]:
-    """Return the quantities (T, axes) in SI units (field: uT), and their units.
-
-    Both by quantity; each unit comes with its source.
-    """
+    """Quantities (T, axes) in SI units (field: uT), and their units with the source."""
     places = {key: k for k, key in enumerate(columns)}
     scaled: dict[str, Float] = {}
     units: dict[str, str] = {}
@@ -360,14 +335,9 @@ def _scaled(
         named = {columns[key].unit for key in keys} - {""}
         if len(named) > 1:
             raise RecordingError(f"{what}: its columns say {' and '.join(sorted(named))}: they need one unit")
-        unit, who = next(
-            (
-                (one, who)
-                for one, who in ((next(iter(named), ""), "header"), (given.get(what, ""), "given"))
-                if one
-            ),
-            ("", ""),
-        )
+        unit, who = next(iter(named), ""), "header"
+        if not unit:
+            unit, who = given.get(what, ""), "given"
         if not unit and what != QUATERNION:
             unit, who = _likely(what, raw), "not stated"
         scaled[what] = raw * UNITS[what].get(unit, 1.0)

@@ -1,68 +1,33 @@
 """A Kalman filter estimates orientation and its covariance from IMU samples.
 
-Covariance of an error-state Kalman filter for the IMU orientation.
-
-States how uncertain an integrated orientation is, and how it is corrected.
-
-Eleven errors, after Sola 2017 ("Quaternion kinematics for the error-state Kalman filter", ch. 5) with the global error
-of its ch. 7: attitude t (3,) [rad] in the world's axes, the gyroscope's bias b (3,) [rad/s] and scale s (3,) [1] in
-the sensor's, level velocity v (2,) [m/s]. With R sensor -> world and w the rate,
+An error-state Kalman filter without magnetometer (steel in a desk turns one by more than a gyroscope drifts in
+minutes). Eleven errors, after Sola 2017 ("Quaternion kinematics for the error-state Kalman filter", ch. 5) with the
+global error of its ch. 7: attitude t (3,) [rad] in the world's axes, the gyroscope's bias b (3,) [rad/s] and scale s
+(3,) [1] in the sensor's, level velocity v (2,) [m/s]. With R sensor -> world and w the rate,
 
     t' = -R (b + s w) + noise,      v' = g (t_y, -t_x).
 
-Gravity is seen through the velocity: an arm gains none for long, so that the velocity which a tilted gravity sums up is
-measured as zero. Velocity in the world's axes is where accelerations cancel (the almost inertial frame of Laidig, Seel
-2023, section 4); here it is a state, so that the memory of the mean is the filter's own, and holds at any rate of
-samples. Rest measures the bias. Neither moves the heading, of which they know nothing: its gain is zero, its covariance
-that of a considered parameter (Schmidt 1966).
+Gravity is observed by the level velocity that forces sum to in the world's axes, where accelerations cancel (the
+almost inertial frame of Laidig, Seel 2023, section 4), and which is measured as zero: an arm gains none for long. As a
+state its memory is the filter's own, and holds at any rate of samples. Rest measures the bias, in motion gravity that
+of the level axes and the scale of those that turn. Neither moves the heading: its gain is zero, its covariance that of
+a considered parameter (Schmidt 1966), and it drifts from the beginning on (`heading_sigma_rad`).
+
+A sample's rate is the mean over the period before it: a part's low-pass delays by about half a period, so this comes
+nearer than a trapezoid. Steps are taken from the stamps, which may jitter. `Stillness` has time and single-sample
+limits of VQF (Laidig, Seel 2023; `python -m bench imu` compares with it); those of short means are narrower, for noise
+does not last. A slow even turn looks like rest: it barely moves a bias that was estimated at rest, and where rest
+contradicts that for long, one of the two was a turn: the bias is estimated anew, and the heading is as uncertain as
+that.
 
 The figures are those of parts and arms, not of recordings:
-
 - bias when switched on, 2.5 deg/s: +-5 deg/s of an ICM-20948 (DS-000189, table 1), taken as two sigma; LSM6DSO: +-1;
-- its walk, 0.1 deg/s in 100 s, and how well rest shows it, to 0.03 deg/s within about 9 s: the defaults of VQF (Laidig,
-  Seel 2023);
+- its walk, 0.1 deg/s in 100 s, and how well rest shows it, to 0.03 deg/s within about 9 s: the defaults of VQF;
 - noise, 0.015 deg/s/sqrt(Hz): the same part; LSM6DSO (DS12140, table 2) has a quarter of it;
-- scale, 1 %: LSM6DSO +-1 %; what is wrong otherwise (across axes, not linear), 0.3 % of the rate, half a second long;
+- scale, 1 %: LSM6DSO +-1 %; other errors (across axes, not linear), 0.3 % of the rate, half a second long;
 - velocity, 0.35 m/s along each axis for 0.6 s: fingertips of recorded hands have 0.5 m/s (p99) where they are gentle,
   1 to 2 where they are brisk, and come back;
 - accelerometer, 5 mg after calibration; the zero of one that is not calibrated belongs to `orientation_sigma_rad`.
-
-Stillness detection of an inertial sensor.
-
-It is still when rate and force have stayed near their own mean for a while.
-
-A constant cannot be separated from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
-off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
-VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by half a degree,
-seen by gravity, or half a degree per second more or less is a motion.
-
-Orientation from raw IMU samples.
-
-Rates are integrated, the tilt is corrected towards gravity, and the bias is estimated at rest.
-
-The filter is an error-state Kalman filter without magnetometer (`ErrorState`). Its world has z up, and nothing else is
-known of it: the heading is what it was when the filter began, and drifts from then on; `heading_sigma_rad` is how
-far. Each step is summed up first, exactly for a constant rate, then gravity and rest correct it.
-
-- **A sample's rate is the mean over the period before it.** A part's low-pass, which keeps its samples free of aliases,
-  delays them by about half a period: this comes nearer than a trapezoid does. Steps are taken from the stamps,
-  which may jitter; what lies between the last sample and that period is summed up at the mean of both.
-- **Gravity** is observed by the level velocity that forces sum to in the world's axes: an arm gains none for long.
-- **Bias** is taken where `Stillness` sees rest; in motion gravity gives that of the axes that are level, and the scale
-  of those that turn. Slow even turns look like rest: they barely move a bias that was estimated at rest. Where rest
-  contradicts it for long, one of the two was a turn: the bias is learnt anew, and the heading is as unsure as that.
-
-VQF (Laidig, Seel 2023) is what this is measured against (`python -m bench imu`). It is no dependency: it has no wheel
-for the Pi's processor, expects a fixed period, and estimates no covariance of the tilt.
-
-Magnetometers are not used: steel in a desk turns them by more than a gyroscope drifts in minutes.
-
-Accuracy of an IMU's tilt against a truth.
-
-Also how consistent the stated standard deviation is with the errors.
-
-The error is that of the vertical: the turn about a level axis that takes the found one to the true one. Headings do not
-count, since both worlds may lie anywhere to each other but for their z axes, which are up.
 """
 
 from collections import Counter
@@ -88,10 +53,9 @@ _ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 
 
 class ErrorState:
-    """Push machine. Holds the covariance (11, 11) of the errors."""
+    """Push-driven covariance (11, 11) of the errors."""
 
     def __init__(self) -> None:
-        """Know nothing yet, but where up is roughly."""
         scale = 0.01
         first = [_FIRST_RAD, _FIRST_RAD, 0.0, *[BIAS_RAD_S] * 3, *[scale] * 3, *[_VELOCITY_M_S] * 2]
         self._cov = np.diag(np.square(first))
@@ -115,10 +79,7 @@ class ErrorState:
         return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
 
     def propagate(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
-        """Propagate the covariance over one integration step.
-
-        The sensor rotated at this rate (3,), in this orientation (3, 3), with a force measured or without.
-        """
+        """Propagate over a step at a rate (3,), orientation (3, 3); `felt`: with force."""
         g_m_s2 = 9.80665
         change, fallen = -step_s * world_sensor, step_s * g_m_s2 if felt else 0.0
         self._transition[ATTITUDE, BIAS] = change
@@ -131,10 +92,7 @@ class ErrorState:
         self._warmed(step_s)
 
     def silent(self, gap_s: float) -> bool:
-        """Inflate the covariance over a gap without samples.
-
-        The sensor may have rotated meanwhile. Returns whether the tilt is now unknown.
-        """
+        """Inflate the covariance over a gap without samples; whether the tilt is lost."""
         unseen_rad_s = 3.0  # as fast as a forearm turns unseen
         attitude = self._variance[ATTITUDE] + (unseen_rad_s * gap_s) ** 2
         for block in (ATTITUDE, VELOCITY):
@@ -146,20 +104,13 @@ class ErrorState:
         return bool(attitude[0] >= most[0])
 
     def level(self, step_s: float, velocity_m_s: Float) -> Float:
-        """Correct with a zero level velocity.
-
-        Forces were integrated for a step to this level velocity (2,), which is zero in truth; returns all corrections
-        (11,).
-        """
+        """Correct with the level velocity (2,) of a step, truly zero; corrections (11,)."""
         velocity_s = 0.6
         noise = 2.0 * velocity_s * _VELOCITY_M_S**2 / step_s
         return self._measured(VELOCITY, -velocity_m_s, noise)
 
     def rest(self, step_s: float, off_rad_s: Float) -> Float:
-        """Correct the bias with a step at rest.
-
-        The rate (3,) is what remains beyond the bias; returns all corrections (11,).
-        """
+        """Correct the bias with a rate (3,) beyond it at rest; all corrections (11,)."""
         return self._measured(BIAS, off_rad_s, _REST**2 / step_s)
 
     def contradicted(self, heading_rad: float) -> None:
@@ -173,10 +124,7 @@ class ErrorState:
         self._variance[_HEADING] = min(heading + heading_rad**2, _ANYWHERE_RAD**2)
 
     def _measured(self, block: slice, innovation: Float, noise: float) -> Float:
-        """Apply a measurement of a block of errors, one scalar after the other.
-
-        Returns corrections (11,) of all but the heading.
-        """
+        """Measure a block, one scalar after the other; corrections (11,), no heading."""
         found = np.zeros(_SIZE)
         heading = float(self._variance[_HEADING])
         for k, value in enumerate(innovation.tolist(), block.start):
@@ -196,17 +144,16 @@ class ErrorState:
 
 _SAMPLE_RAD_S = radians(2.0)
 _SHORT_RAD_S = radians(0.5)
-_BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias (`Doubt`)
+_BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias
 
 
 class Stillness:
-    """Push-driven stillness detector.
+    """Push-driven stillness detector: rate and force have stayed near their means.
 
-    Holds means of rate and force: a short one, and one since the sensor may have come to rest.
+    Holds a short mean of both, and one since the sensor may have come to rest.
     """
 
     def __init__(self) -> None:
-        """Know of no rest."""
         self.moved()
 
     @property
@@ -244,10 +191,7 @@ class _Means:
         self.short = self.long = value
 
     def left(self, since_s: float, step_s: float, value: Float, sample: float, short: float) -> bool:
-        """Add a value and return whether it departed from the long mean.
-
-        True where the value is farther from it than `sample`, or the short mean farther than `short`.
-        """
+        """Add a value; whether it or the short mean is too far from the long mean."""
         off = value - self.long
         short_s = 0.3
         self.short = self.short + step_s / min(since_s + step_s, short_s) * (value - self.short)
@@ -266,18 +210,13 @@ _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 class OrientationFilter:
     """Push-driven orientation filter.
 
-    Holds the orientation, level velocity, bias and scale, their uncertainty, and the last sample.
-
     Attributes:
         counts: Samples that gave no orientation or little: `fusion.missing` (no rate, or one that cannot be),
             `fusion.no_gravity` (rate without force), `fusion.late`, `fusion.gap` (after a silence).
     """
 
     def __init__(self, rate_hz: float) -> None:
-        """Expect samples at about this rate.
-
-        The steps themselves are taken from their timestamps.
-        """
+        """Expect samples at about this rate; steps are taken from their timestamps."""
         self.counts: Counter[str] = Counter()
         self._period_s = 1.0 / rate_hz
         bridged_s, bridged_samples = 0.1, 3.0  # a longer gap may hide a turn that no rate measures
@@ -295,10 +234,7 @@ class OrientationFilter:
 
     @property
     def bias_rad_s(self) -> Float:
-        """Return the gyroscope bias (3,) [rad/s] in sensor axes.
-
-        It is the reading at rest.
-        """
+        """Gyroscope bias (3,) [rad/s] in sensor axes: the reading at rest."""
         return self._bias
 
     @property
@@ -308,18 +244,13 @@ class OrientationFilter:
 
     @property
     def heading_sigma_rad(self) -> float:
-        """Return the standard deviation of the heading drift since the first sample.
-
-        At most 1.8, which means unknown.
-        """
+        """Standard deviation of the heading drift since the first sample; 1.8: unknown."""
         return self._errors.heading_rad
 
     def push(self, sample: ImuSample) -> ImuSample:
         """Return the sample with `orientation_wxyz` and `heading_sigma_rad` filled in.
 
-        The orientation maps sensor axes to a world whose z axis is up.
-
-        Both are NaN where they are not known.
+        The orientation maps sensor axes to a world whose z axis is up. Both are NaN where they are not known.
         """
         found = self._pushed(sample)
         drifted = nan if found is _NONE else self._errors.heading_rad
@@ -363,17 +294,14 @@ class OrientationFilter:
         return np.array(self._q) if self._errors.tilt_rad < _SETTLED_RAD else _NONE
 
     def _silence(self, gap_s: float, force: Float, falls: bool) -> None:
-        """Resume after a gap, during which the sensor moved.
-
-        After a long gap, up is where the first force (3,) points.
-        """
+        """Resume after a gap; after a long one, up is where the first force (3,) points."""
         self._stillness.moved()
         self._velocity = np.zeros(2)
         if self._errors.silent(gap_s) and not falls and self._q is not None:
             self._q = _upright(self._q, force)
 
     def _rest(self, step_s: float, rate: Float, force: Float) -> None:
-        """Learn the bias where the sensor lies still."""
+        """Estimate the bias where the sensor lies still."""
         self._stillness.push(step_s, rate, force)
         self._agreed_s += step_s
         if not self._stillness.still:
@@ -429,9 +357,9 @@ def _unit(q: Wxyz) -> Wxyz:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiltErrors:
-    """Tilt errors about both level axes (N, 2), and their stated sigma (N,).
+    """Tilt errors about both level axes (N, 2) and their sigma per axis (N,) [rad].
 
-    Per axis [rad], of every sample whose tilt and truth are known.
+    The error is the turn about a level axis that takes the found vertical to the true one; headings do not count.
     """
 
     error_rad: Float
@@ -439,7 +367,7 @@ class TiltErrors:
 
     @classmethod
     def of(cls, found_wxyz: Float, truth_wxyz: Float, sigma_rad: Float) -> "TiltErrors":
-        """Return the tilt errors of orientations (T, 4); sigma is (T,).
+        """Tilt errors of orientations (T, 4), sigma (T,), where all is known.
 
         Orientations map sensor axes to a world whose z axis is up, NaN where not known.
         """

@@ -1,11 +1,9 @@
-"""IMU data of a recording: imu.csv beside frames.csv.
+"""IMU data of a recording: imu.csv beside frames.csv, one row per sample.
 
-One row per sample, on the same clock.
-
-`t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz[,heading_sigma]]` in rad/s, m/s^2, uT and rad; the quaternion takes
-the sensor's axes to its world, whose z axis is vertical, and its heading may have drifted so far. `nan` is a value that
-the sensor did not give. As of frames.csv, only the last row can be cut by whatever ended the recording: it is dropped,
-every other broken row is an error.
+`t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz[,heading_sigma]]` in rad/s, m/s^2, uT and rad, on the clock of the
+frames; the quaternion takes the sensor's axes to its world, whose z axis is vertical, and its heading may have drifted
+so far. `nan`: the sensor did not give the value. As of frames.csv, a cut last row is dropped, every other broken row
+is an error.
 """
 
 import csv
@@ -37,9 +35,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
-    """Return the samples of a recording's IMU, called `source`, by time.
-
-    Empty where the recording has no imu.csv.
+    """Samples of a recording's IMU, called `source`, by time; empty without imu.csv.
 
     Raises:
         RecordingError: The file is broken; the text names file, line and column.
@@ -74,7 +70,7 @@ def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
 
 
 def write_imu(folder: Path, samples: Iterable[ImuSample]) -> None:
-    """Write imu.csv, all columns; with the digits that give back the same numbers.
+    """Write imu.csv, all columns, with the digits that give back the same numbers.
 
     Raises:
         RecordingError: It cannot be written; nothing is left half done.

@@ -1,20 +1,19 @@
 """Offset of a foreign clock: another machine's monotonic clock relative to ours.
 
-Each machine has its own, so the master measures every slave's by the four time stamps of NTP (RFC 5905, section 8):
+The master measures every slave's clock by the four time stamps of NTP (RFC 5905, section 8):
 
     t1 master sends, t2 slave receives, t3 slave answers, t4 master receives
     there = t2 - t1 = offset + delay          back = t4 - t3 = delay - offset
 
-A network only ever adds delay. So in a plot over time the offset is a line below all `there` and above
-all `-back`, and the best one is the middle of the widest search band between the two clouds. For delays
-with an exponential tail that is the maximum likelihood (Jeske, "On maximum-likelihood estimation of
-clock offset", IEEE Trans. Commun. 53, 2005; the band's slope: Moon, Skelly & Towsley, "Estimation
-and removal of clock skew from network delay measurements", INFOCOM 1999). Each way has its own fastest
-echo: one way may queue as much as it likes, and no echo need be fast both ways, as NTP's filter wants.
+A network only ever adds delay. So in a plot over time the offset is a line below all `there` and above all `-back`,
+and the best one is the middle of the widest search band between the two clouds. For delays with an exponential tail
+that is the maximum likelihood (Jeske, "On maximum-likelihood estimation of clock offset", IEEE Trans. Commun. 53,
+2005; the band's slope: Moon, Skelly & Towsley, "Estimation and removal of clock skew from network delay measurements",
+INFOCOM 1999). Each way has its own fastest echo: no echo need be fast both ways, as NTP's filter wants.
 
-What no echo can see is a constant difference of the two ways. The offset is off by half of it, which
-is at most half of the band's width; where in there is unknown. An echo that leaves the band by
-more than its width would have arrived before it was sent: the remote clock was stepped, or a machine slept.
+What no echo can see is a constant difference of the two ways. The offset is off by half of it, at most half of the
+band's width; where in there is unknown. An echo that leaves the band by more than its width would have arrived before
+it was sent: the remote clock was stepped, or a machine slept.
 """
 
 from collections import deque
@@ -39,8 +38,7 @@ class ClockEstimate:
         offset_ns: Remote minus local time [ns].
         drift_ppm: Rate of the remote clock minus that of the local one [1e-6].
         sigma_ns: Standard deviation of the offset from scatter [ns], if both ways of the network cost the same.
-        bound_ns: Half of the band's width, that is of the shortest round trip [ns]: however much the two
-            ways differ, the offset cannot be further off than that.
+        bound_ns: Half of the band's width, that is of the shortest round trip [ns]: the offset is not further off.
         drift_sigma_ppm: Standard deviation of the drift.
     """
 
@@ -62,9 +60,7 @@ class ClockEstimate:
         return t_local_ns + self.offset_ns + round((t_local_ns - self.t_ns) * (self.drift_ppm * 1e-6))
 
     def scatter_at(self, t_local_ns: int) -> float:
-        """Return the standard deviation [ns] of the offset at a local time.
-
-        Assumes that both directions have the same delay.
+        """Standard deviation [ns] of the offset at a local time, for ways of equal delay.
 
         It grows with the time since the newest echo, as the drift is known and as a crystal wanders.
         """
@@ -75,7 +71,7 @@ class ClockEstimate:
     def sigma_at(self, t_local_ns: int) -> float:
         """Standard deviation [ns] of a converted time, with what no echo can see.
 
-        Of the difference of the two ways only the bound is known, so any value within it is as likely as another.
+        Of the difference of the two ways only the bound is known: any value within it is as likely as another.
         """
         return hypot(self.scatter_at(t_local_ns), self.bound_ns / sqrt(3.0))
 
@@ -89,18 +85,13 @@ class _Echo(NamedTuple):
 class OffsetEstimator:
     """Estimator of clock offset and drift, with their uncertainty.
 
-    Finds the widest search band between the echoes of a sliding window.
-
-    Holds the echoes of the window and the estimate from them; after an echo that contradicts it, also those since.
-    Three such echoes among twenty are a stepped clock and reinitialise the estimate from these. `steps` counts such
+    Finds the widest search band between the echoes of a sliding window. Three echoes among twenty that contradict the
+    estimate are a stepped clock and reinitialise it from the echoes since the first of them. `steps` counts such
     restarts, `refused` impossible echoes.
     """
 
     def __init__(self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 200_000) -> None:
-        """Keep at most `capacity` echoes within `window_ns`.
-
-        A jump above `step_ns` can be a clock step.
-        """
+        """Keep `capacity` echoes within `window_ns`; more than `step_ns` can be a step."""
         self._window_ns = window_ns
         self._step_ns = step_ns
         self._echoes: deque[_Echo] = deque(maxlen=capacity)
@@ -118,10 +109,7 @@ class OffsetEstimator:
 
     @property
     def settled(self) -> bool:
-        """Return whether there are enough echoes, and none that contradict.
-
-        If so, fast echoes are not needed.
-        """
+        """Whether there are enough echoes, none contradicting: no fast ones are needed."""
         return len(self._echoes) >= 2 * AT_LEAST and not self._suspects
 
     def push(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
@@ -152,10 +140,7 @@ class OffsetEstimator:
         return self._estimate
 
     def _uncertain(self, echo: _Echo) -> bool:
-        """Return whether this echo must not be used yet.
-
-        Reinitialises the estimate where too many echoes contradict it.
-        """
+        """Whether this echo must not be used yet; too many reinitialise the estimate."""
         wrong = self._contradicts(echo)
         if wrong or self._suspects:
             self._since.append(echo)
@@ -184,10 +169,7 @@ class OffsetEstimator:
 
 @dataclass(frozen=True, slots=True)
 class _OffsetBounds:
-    """Constraints that the echoes put on a range of drifts.
-
-    All in ns and ns/s, at the newest echo.
-    """
+    """Constraints of the echoes on a range of drifts [ns, ns/s], at the newest echo."""
 
     offset: float
     sigma: float
@@ -211,8 +193,7 @@ class _OffsetBounds:
         gap, other_gap = _spacing(there - shift[widest]), _spacing(back + shift[widest])
         middle_time = drift * t_s.mean()
         log = (wall + middle_time) / gap + (other - middle_time) / other_gap
-        # standard deviation; two crystals differ by less than twice this (Pi: +-100 ppm each)
-        drift_prior = 100e-6
+        drift_prior = 100e-6  # sigma; two Pi crystals (+-100 ppm each) differ by less than twice it
         log -= 0.5 * (drift * (1e-9 / drift_prior)) ** 2
         share = np.exp(log - log.max())
         share /= share.sum()
@@ -230,10 +211,7 @@ class _OffsetBounds:
 
 
 def _fit(echoes: deque[_Echo]) -> ClockEstimate:
-    """Estimate the clock from the search band at the newest echo.
-
-    The grid of drifts is refined until it is fine enough.
-    """
+    """Estimate the clock at the newest echo; the grid of drifts is refined."""
     table = np.array(echoes, dtype=np.int64)
     newest = int(table[-1, 0])
     base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
@@ -257,10 +235,7 @@ def _fit(echoes: deque[_Echo]) -> ClockEstimate:
 
 
 def _spacing(delay_ns: Float) -> float:
-    """Return the typical spacing [ns] of the shortest of the delays (n,) [ns].
-
-    It estimates how far the shortest delay is from the shortest possible one.
-    """
+    """Typical spacing [ns] of the shortest delays (n,) [ns]: the shortest's excess."""
     n = len(delay_ns)
     floor_ns = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
     if n < AT_LEAST:

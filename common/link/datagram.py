@@ -1,9 +1,5 @@
 """Seal and open datagrams, and send and receive them by UDP.
 
-Keys seal and open datagrams. No socket here, and no clock.
-
-Sealed datagrams: bytes in, what they mean out. No socket here, and no clock.
-
     offset size field
     0      4    magic "PHLX"
     4      1    wire version
@@ -15,23 +11,14 @@ Sealed datagrams: bytes in, what they mean out. No socket here, and no clock.
     28     n    body, encrypted
     28+n   16   tag of ChaCha20-Poly1305 (RFC 8439), over header and body
 
-All integers big-endian. The nonce is the counter (and 4 zero bytes): a key belongs to one sender
-in one direction and counts up, so no nonce is used twice. Refusing must be cheap, hence the
-order: length, magic, version, rig, kind, then the key's table, then the cipher.
+All integers big-endian. The nonce is the counter (and 4 zero bytes): a key belongs to one sender in one direction and
+counts up, so no nonce is used twice. Refusing must be cheap, hence the order: length, magic, version, rig, kind, then
+the key's table, then the cipher.
 
-Keys that seal the datagrams of a rig.
-
-The rig key, which all share, and a secret of each device, which no other has.
-
-Whoever has the rig key can make and read handshakes. What a device sends in a session needs its secret as well, which
-only it and the master know: a device that was stolen reads and forges no datagram of another.
-
-The secret of a device follows from `devices.key`, 32 random bytes that never leave the PC. Where there is the rig key
-alone (a simulation, a closed laboratory), secrets follow from that: who has it has them all.
-
-UDP sockets of this project.
-
-One blocking reader each, senders that never wait.
+Whoever has the rig key, which all share, can make and read handshakes. What a device sends in a session needs its
+secret as well, which only it and the master know: a device that was stolen reads and forges no datagram of another.
+Secrets follow from `devices.key`, 32 random bytes that never leave the PC; where there is the rig key alone (a
+simulation, a closed laboratory), they follow from that: who has it has them all.
 """
 
 import errno
@@ -57,9 +44,7 @@ TAG_BYTES = 16
 OVERHEAD = HEADER.size + TAG_BYTES
 MAX_DATAGRAM = 4096  # 48 markers take 2.2 kB, 2.9 kB where they have alternatives
 KEY_BYTES = 32
-WINDOW = (
-    1024  # counters behind the newest within which a late datagram is still distinguished from a replayed one
-)
+WINDOW = 1024  # counters behind the newest within which a late datagram is distinguished from a replayed one
 
 
 class Kind(IntEnum):
@@ -92,18 +77,14 @@ class Refusal(StrEnum):
     REPLAYED = "replayed"  # so old that it can only be a replay; a handshake of an earlier life
     UNDECODABLE = "undecodable"  # sealed rightly, but not a message of its kind
     OUT_OF_BOUNDS = "out_of_bounds"  # a message with a number that no sensor can measure
-    OUTSIDE_PICTURE = (
-        "outside_picture"  # a point that is further outside the picture than the picture is large
-    )
+    OUTSIDE_PICTURE = "outside_picture"  # a point further outside the picture than the picture is large
     READY_TIME = "ready_time"  # a frame that the slave had long before or after it was exposed
     UNASKED_ECHO = "unasked_echo"  # an answer to an echo that was not asked, or was answered
     FOREIGN_SESSION = "foreign_session"  # a message of another process than the one that sent the hello
     SEQUENCE = "sequence"  # a frame number that no camera can have reached since the last
     MARKER_COUNT = "marker_count"  # of a slave whose rig file names more or fewer markers
     RATE = "rate"  # more messages than the sender's rate by its files
-    FAULTY = (
-        "faulty"  # a message that could not be used, and those that its sender sends while it is silenced
-    )
+    FAULTY = "faulty"  # a message that could not be used, and those of its sender while it is silenced
     IMPOSTOR = "impostor"  # speaks for a camera that it is not
     UNKNOWN = "unknown_camera"  # a slave that this rig does not have
     OTHER_MASTER = "other_master"  # a beacon of another master while ours is well
@@ -111,10 +92,7 @@ class Refusal(StrEnum):
 
 
 class Header(NamedTuple):
-    """First 28 bytes of a datagram, not yet authenticated.
-
-    Only `Opener.open` verifies them.
-    """
+    """First 28 bytes of a datagram, authenticated only by `Opener.open`."""
 
     kind: Kind
     key_id: int
@@ -122,10 +100,7 @@ class Header(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """Authenticated datagram.
-
-    `reordered`: a later one arrived before it.
-    """
+    """Authenticated datagram. `reordered`: a later one arrived before it."""
 
     body: bytes
     reordered: bool
@@ -156,27 +131,17 @@ def parse(datagram: bytes, rig_tag: int) -> Header | Refusal:
 
 
 class Sealer:
-    """Sealer of the datagrams of one sender under one key.
-
-    Holds the counter; not for use by two threads.
-    """
+    """Sealer of the datagrams of one sender under one key; for one thread."""
 
     def __init__(self, key: bytes, rig_tag: int, key_id: int) -> None:
-        """Start counting at 1.
-
-        A `Sealer` is made once for a key, and never again for the same key.
-        """
+        """Start counting at 1: a key has one `Sealer` in its life."""
         self._cipher = ChaCha20Poly1305(key)
         self._rig_tag = rig_tag
         self._key_id = key_id
         self._counter = 0
 
     def seal(self, kind: Kind, body: bytes) -> bytes:
-        """Return the datagram.
-
-        Raises:
-            ValueError: The body does not fit into a datagram.
-        """
+        """Return the datagram; raises ValueError if the body does not fit into one."""
         size = OVERHEAD + len(body)
         if size > MAX_DATAGRAM:
             raise ValueError(f"datagram of {size} bytes, at most {MAX_DATAGRAM}")
@@ -186,30 +151,20 @@ class Sealer:
 
 
 class ReplayWindow:
-    """Replay window: record of the counters already accepted.
-
-    Holds the highest and one bit for each of the 1024 before it.
-    """
+    """Counters already accepted: the highest and a bit for each of 1024 before it."""
 
     def __init__(self) -> None:
-        """Begin with nothing taken."""
         self._highest = 0
         self._received = 1  # bit i: counter `highest - i`; 0 is never used and counts as taken
         self._count = 0
 
     @property
     def missing(self) -> int:
-        """Return how many counters up to the highest never arrived.
-
-        These are datagrams that were sent and lost.
-        """
+        """How many counters up to the highest never arrived."""
         return self._highest - self._count
 
     def missing_between(self, after: int, before: int) -> int:
-        """Return how many counters between two received ones never arrived.
-
-        Counters too old for the window all count as missing.
-        """
+        """How many counters between two received ones never arrived; too old: all."""
         newer, span = self._highest - before + 1, before - after - 1  # where it begins in bits; its length
         known = min(span, max(WINDOW - newer, 0))
         return span - ((self._received >> newer) & ((1 << known) - 1)).bit_count()
@@ -233,13 +188,9 @@ class ReplayWindow:
 
 
 class Opener:
-    """Opener of the datagrams that one sender sealed under one key.
-
-    Opens each datagram once. Holds the replay window.
-    """
+    """Opener of the datagrams that one sender sealed under one key, each once."""
 
     def __init__(self, key: bytes) -> None:
-        """Open datagrams sealed with `key`."""
         self._cipher = ChaCha20Poly1305(key)
         self._window = ReplayWindow()
 
@@ -249,17 +200,11 @@ class Opener:
         return self._window.missing
 
     def missing_between(self, after: int, before: int) -> int:
-        """Return how many sealed datagrams between two received ones never arrived here.
-
-        The two are given by their counters.
-        """
+        """How many sealed datagrams between two received counters never arrived here."""
         return self._window.missing_between(after, before)
 
     def open(self, header: Header, datagram: bytes) -> Opened | Refusal:
-        """Return the body of a datagram, or why it is refused.
-
-        The header is the one `parse` returned.
-        """
+        """Return the body of a datagram whose header `parse` gave, or why it is refused."""
         body = unseal(self._cipher, header, datagram)
         if body is None:
             return Refusal.FORGED
@@ -268,10 +213,7 @@ class Opener:
 
 
 def unseal(cipher: ChaCha20Poly1305, header: Header, datagram: bytes) -> bytes | None:
-    """Return the body if the seal is valid, else None.
-
-    Replay is not checked.
-    """
+    """Return the body if the seal is valid, else None. Replay is not checked."""
     try:
         return cipher.decrypt(_nonce(header.counter), datagram[HEADER.size :], datagram[: HEADER.size])
     except InvalidTag:
@@ -291,10 +233,7 @@ def derive(key: bytes, length: int, salt: bytes, info: bytes) -> bytes:
 
 
 def device_secret(root: bytes, name: str) -> bytes:
-    """Return the secret of the device `name` (32 bytes).
-
-    Derived from `devices.key` or the rig key.
-    """
+    """Return the secret of a device (32 bytes), from `devices.key` or the rig key."""
     return derive(root, KEY_BYTES, b"", b"phalanx device " + name.encode())
 
 
@@ -313,11 +252,7 @@ class LinkKey:
     own: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse a key of wrong length.
-
-        Raises:
-            ValueError: One is not 32 bytes.
-        """
+        """Refuse a key that is not 32 bytes (ValueError)."""
         for what, key in (
             ("rig key", self.rig),
             ("devices.key", self.root),
@@ -328,10 +263,7 @@ class LinkKey:
 
     @property
     def has_secrets(self) -> bool:
-        """Return whether device secrets are independent of the rig key alone.
-
-        If so, one device cannot make the secrets of others.
-        """
+        """Whether device secrets need more than the rig key: none makes another's."""
         return self.root is not None or self.own is not None
 
     def secret(self, name: str) -> bytes:
@@ -343,18 +275,16 @@ READ_TIMEOUT_S = 0.01  # the grid of everything that a reading thread repeats in
 
 
 class UdpSocket:
-    """One bound UDP socket. `receive` belongs to one thread, `send` to any.
+    """One bound UDP socket: one thread receives; any sends, which never waits.
 
-    `would_block` counts datagrams that the kernel had no room for, `failed` those it refused (no
-    route, no such interface): both are lost like any other datagram.
+    `would_block` counts datagrams that the kernel had no room for, `failed` those it refused (no route, no such
+    interface): both are lost like any other datagram.
     """
 
     def __init__(
         self, bind: Address, shared: bool = False, broadcast: bool = False, timeout_s: float = READ_TIMEOUT_S
     ) -> None:
-        """Bind the socket.
-
-        `shared` lets several processes receive the same broadcasts.
+        """Bind the socket. `shared` lets several processes receive the same broadcasts.
 
         Raises:
             BusError: The address is taken or not of this machine.

@@ -1,34 +1,21 @@
-"""Run the handshake of both sides as one table of transitions.
+"""Master and slave open a session by a handshake, one transition table.
 
-Master and slave open a session by a handshake, one transition table.
-
-Handshake of master and slave: its keys and its messages.
-
-docs/wire.md draws it.
-
-From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
+docs/wire.md draws it. From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869)
+makes
 - the rig tag, by which a datagram of another rig is recognised at once,
 - one key for every process that sends beacon, hello or welcome, named by its random process id, so
   that two processes never seal under one key with the same nonce.
 
 From the rig key and the secret of one device (`common.link.datagram`), which only that device and the master know,
 - the proof in its hello: nobody else of the rig begins a session in its name,
-- for every session two keys, one per direction, and the session's id, from random numbers of both
-  sides: what was captured in one session opens in no other, whoever restarted, and in no other device,
+- for every session two keys, one per direction, and the session's id, from random numbers of both sides: what was
+  captured in one session opens in no other, whoever restarted, and in no other device,
 - the proof in the welcome: nobody else of the rig ends the session that it has.
 
-The states of a session, for both ends of the link: one transition table.
-
-Each end classifies what arrives as an `Event`, and `RULES` defines what follows:
-the next state, the datagram to send back, or the reason to refuse. What is in
-no row cannot occur. An end obeys reply and refusal. Its state it derives from
-the sessions that it holds and from time, so `next`, and the rows of `SEALED`,
-`EXPIRED` and `SILENCE`, are what the tests hold it to.
-`docs/wire.md` shows `state_pages()`, written by `make schema`.
-
-A slave or master that holds a live session may negotiate another one meanwhile;
-the live session stays until the other one is confirmed, so that neither a late
-nor a replayed datagram ends it.
+Each end classifies what arrives as an `Event`, and `RULES` defines the next state, the datagram to send back, or the
+reason to refuse. What is in no row cannot occur. An end obeys reply and refusal; its state it derives from its
+sessions and from time, so `next`, and the rows of `SEALED`, `EXPIRED` and `SILENCE`, are what the tests hold it to. A
+live session stays until another one is confirmed: neither a late nor a replayed datagram ends it.
 """
 
 from collections.abc import Callable, Mapping
@@ -58,9 +45,7 @@ HandshakeT = TypeVar("HandshakeT", bound=Handshake)
 
 
 class Beacon(Handshake, frozen=True):
-    """Announcement of the master's presence, broadcast for ever.
-
-    Its source address is where hello goes.
+    """Announcement of the master's presence, broadcast for ever; hello answers it.
 
     Attributes:
         master_nonce: Drawn when the master started: another one is another life of it.
@@ -110,12 +95,10 @@ class Welcome(Handshake, frozen=True):
 
 
 class Unproven(Handshake, frozen=True):
-    """Refusal of the hello with this `slave_nonce`, which was not proven.
+    """Refusal of the hello with this `slave_nonce`: the master has another secret.
 
-    The master has another secret for its name. No session.
-
-    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It states only why: it is not
-    proven itself, and whoever has the rig key can claim it.
+    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It is not proven itself:
+    whoever has the rig key can claim it.
     """
 
     master_nonce: Nonce
@@ -124,10 +107,7 @@ class Unproven(Handshake, frozen=True):
 
 
 class Start(Handshake, frozen=True):
-    """Command to begin at `start_t_ns` [ns] on the clock of the receiving slave.
-
-    A past time: now.
-    """
+    """Command to begin at `start_t_ns` [ns] of the receiving slave; a past time: now."""
 
     start_t_ns: TimeNs
 
@@ -182,10 +162,7 @@ def read(kind: Kind, body: bytes) -> Handshake | None:
 
 
 class SessionKeys(NamedTuple):
-    """Keys of one session.
-
-    32 bytes for each direction, the id that datagrams name, the proof of the welcome.
-    """
+    """Keys of one session: 32 bytes a direction, its id, the proof of the welcome."""
 
     key_id: int
     to_master: bytes
@@ -197,11 +174,7 @@ class RigKeys:
     """All keys derived from the rig key and the secrets of devices."""
 
     def __init__(self, key: LinkKey | bytes) -> None:
-        """Derive from the rig key, alone or with what there is of secrets.
-
-        Raises:
-            ValueError: One is not 32 bytes.
-        """
+        """Derive from the rig key, alone or with secrets, each of 32 bytes."""
         self._key = key if isinstance(key, LinkKey) else LinkKey(key)
         self.has_secrets = self._key.has_secrets
         self.rig_tag = int.from_bytes(derive(self._key.rig, 4, b"", b"phalanx rig tag"), "big")
@@ -223,10 +196,7 @@ class RigKeys:
         return message if isinstance(message, expected) else Refusal.UNDECODABLE
 
     def name_in(self, header: Header, datagram: bytes) -> str | None:
-        """Return the sender of a hello of another wire version, if its seal is valid.
-
-        The header is alike in all versions.
-        """
+        """Sender of a hello of another wire version (headers are alike) if it is sealed."""
         body = self.open(header, datagram)
         try:
             return None if body is None else _ANY_HELLO.decode(body).name
@@ -234,10 +204,7 @@ class RigKeys:
             return None
 
     def hello(self, name: str, process: int, slave_nonce: bytes, master_nonce: bytes) -> Hello:
-        """Return the hello of the device `name`.
-
-        It is proven by the secret that this side has for it.
-        """
+        """Return the hello of the device `name`, proven by the secret this side has."""
         info = b"phalanx hello " + process.to_bytes(8, "big") + name.encode()
         proof = derive(self._of_device(name), PROOF_BYTES, master_nonce + slave_nonce, info)
         return Hello(name, process, slave_nonce, master_nonce, proof)

@@ -1,13 +1,9 @@
 """Messages between processes: bytes enter, checked messages leave, and back.
 
-Messages that cross a process boundary.
-Arrays are read-only; NaN means "not seen".
-
-On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
-travels as itself and a message costs no Python loop. Alternatives of markers are rare, and none at
-all travel as no bytes: so the detections of 24 markers fit one Ethernet packet. `decode` is
-the only way in: whatever it returns has the right shapes, and each number is within the
-bounds of its field. Every field is described in docs/wire.md.
+Arrays are read-only; NaN means "not seen". On the wire a message is one msgpack map, an array its little-endian
+bytes: NaN travels as itself, and a message costs no Python loop. Alternatives of markers are rare, and none at all
+travel as no bytes: so the detections of 24 markers fit one Ethernet packet. `decode` is the only way in: whatever it
+returns has the right shapes, and each number is within the bounds of its field. docs/wire.md describes every field.
 """
 
 from copy import copy
@@ -184,9 +180,7 @@ def decode(data: bytes | memoryview) -> AnyMessage:
 
 
 def restamped(message: MessageT, **numbers: float) -> MessageT:
-    """Return the message with other numbers in these fields, such as times.
-
-    Neither they nor its arrays are checked again.
+    """Return the message with other numbers in fields, such as times, unchecked.
 
     `msgspec.structs.replace` looks at every array once more, which costs more than all else that becomes of a message
     on its way in.

@@ -1,13 +1,4 @@
-"""Bodies of commands state what "preview" and "raw" request.
-
-Body of the command "preview": what it requests beside the picture.
-
-A console writes it and a slave reads it.
-
-Body of the command "raw": what it requests of a camera's slave.
-
-A recorder writes it and a slave reads it.
-"""
+"""Bodies of commands state what "preview" and "raw" request of a camera's slave."""
 
 import re
 from typing import Annotated
@@ -21,7 +12,7 @@ from common.messages import MAX_MARKERS, Name
 
 
 class PreviewWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The body; an empty one asks for the plain picture.
+    """Body of the command "preview"; an empty one asks for the plain picture.
 
     Attributes:
         mask: Markers whose pixels are tinted: those inside the colour ranges in use, as the slave takes them.
@@ -33,11 +24,7 @@ class PreviewWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
 
     @classmethod
     def of(cls, body: str) -> "PreviewWish":
-        """Read a body.
-
-        Raises:
-            CalibrationError: It is none; the text names the key.
-        """
+        """Read a body; raises CalibrationError, which names the key, if it is none."""
         return parse(body.encode(), cls, "preview") if body else cls()
 
     def body(self) -> str:
@@ -49,7 +36,7 @@ _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 
 
 class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The body.
+    """Body of the command "raw".
 
     Attributes:
         name: Of the recording, a new folder in the slave's own folder for raw frames.
@@ -61,11 +48,7 @@ class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omi
 
     @classmethod
     def of(cls, body: str) -> "RawWish":
-        """Read a body.
-
-        Raises:
-            CalibrationError: It is none, or the name is not that of a folder; the text names the key.
-        """
+        """Read a body with a folder's name; CalibrationError names the key."""
         wish = parse(body.encode(), cls, "raw")
         refuse_strange(wish.name, "raw: name")
         return wish
@@ -76,19 +59,12 @@ class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omi
 
 
 def raw_name(stem: str, camera: str, number: int = 1) -> str:
-    """Return the name of a camera's raw frames beside a message recording.
-
-    Beside STEM.mcap: STEM-CAMERA, then STEM-CAMERA-2.
-    """
+    """Name of raw frames of a camera beside STEM.mcap: STEM-CAMERA, STEM-CAMERA-2."""
     return f"{stem}-{camera}" if number == 1 else f"{stem}-{camera}-{number}"
 
 
 def refuse_strange(name: str, where: str) -> None:
-    """A name is that of one folder: nothing leads out of it, and none is hidden.
-
-    Raises:
-        CalibrationError: It is another; the text begins with `where`.
-    """
+    """Refuse what is not the name of one folder, or hidden (CalibrationError)."""
     longest = 64  # of a `Name`
     if not _PLAIN.fullmatch(name) or len(name) > longest:
         raise CalibrationError(

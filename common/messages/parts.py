@@ -1,10 +1,8 @@
 """Parts of messages: base, names, bounded numbers, arrays of a fixed shape.
 
-The arrays are read-only.
-
-Every number on the wire has bounds that stand at its field. For a plain number they are msgspec's own `ge` and `le`,
-for an array, and for a number that may be NaN, `within`. They are what a sensor of this kind could measure at all, so
-that whatever is computed of a message stays finite; the decoder refuses what is beyond. docs/wire.md and
+Arrays are read-only. Every number on the wire has bounds that stand at its field: msgspec's own `ge` and `le`, or
+`within` for an array and a number that may be NaN. They are what a sensor of this kind could measure at all, so that
+whatever is computed of a message stays finite; the decoder refuses what is beyond. docs/wire.md and
 docs/schema/messages.json list the bounds from here.
 """
 
@@ -52,10 +50,7 @@ class Bounds(NamedTuple):
 
 
 def within(low: float, high: float) -> Meta:
-    """Bounds of an array, or of a number that may be NaN.
-
-    NaN, which is "not observed", is within.
-    """
+    """Bounds of an array or number; NaN ("not observed") is within."""
     return Meta(extra={"bounds": Bounds(low, high)}, extra_json_schema={"x-minimum": low, "x-maximum": high})
 
 
@@ -75,9 +70,8 @@ TimeSigmaNs = Annotated[float, Meta(ge=0.0, le=1e10)]
 Finite = Annotated[float, Meta(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 
 Numbers = Annotated[Float, within(-MAX_NUMBER, MAX_NUMBER)]
-Pixels = Annotated[
-    Float, within(-MAX_PICTURE, 2 * MAX_PICTURE)
-]  # the largest picture, and one beside each edge
+# the largest picture, and one beside each edge
+Pixels = Annotated[Float, within(-MAX_PICTURE, 2 * MAX_PICTURE)]
 SigmaPx = Annotated[Float, within(1e-6, MAX_PICTURE)]
 Metres = Annotated[Float, within(-1e4, 1e4)]
 SensedMetres = Annotated[Float, within(-1e3, 1e3)]  # of a device: what is made of it stays within `Metres`
@@ -85,10 +79,7 @@ UnitQuaternion = Annotated[Float, within(-_UNIT, _UNIT)]  # a quaternion
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
-    """Base of all messages: immutable, tagged with its own name.
-
-    Unknown fields are refused.
-    """
+    """Base of all messages: immutable, tagged with its own name, no unknown fields."""
 
 
 @cache
@@ -134,9 +125,9 @@ class Layout:
         self._low, self._high = np.array(each).reshape(-1, 2).T.copy()
 
     def freeze(self, message: Message) -> None:
-        """Check all arrays of a new message, and make them read-only.
+        """Check all arrays of a new message, shape them, and make them read-only.
 
-        Each is given its shape, and copied if it was writable.
+        An array that was writable is copied.
 
         Raises:
             ValueError: Another shape.
@@ -164,9 +155,7 @@ class Layout:
             self._refuse(every.tolist())
 
     def adopt(self, message: Message, arrays: Mapping[str, np.ndarray]) -> None:
-        """Give a message arrays that its creator knows to be valid.
-
-        They are read-only from here on, and their numbers are not checked.
+        """Give a message arrays known to be valid: read-only from here on, unchecked.
 
         Raises:
             ValueError: Another name, shape or type: the maker is wrong.
@@ -189,13 +178,7 @@ class Layout:
 
 
 def refuse_parts(message: Message, field: str) -> None:
-    """Refuse points (..., D) that are only partly seen.
-
-    A row is NaN in all or in no element.
-
-    Raises:
-        ValueError: One is.
-    """
+    """Refuse points (..., D) with NaN in only a part of a row (ValueError)."""
     points: Float = getattr(message, field)
     for row in points.reshape(-1, points.shape[-1]).tolist():
         missing = row[0] != row[0]
@@ -205,13 +188,7 @@ def refuse_parts(message: Message, field: str) -> None:
 
 
 def refuse_sigma(message: Message, sigma: str, uv: str) -> None:
-    """Refuse partly seen points (N, 2) and inconsistent standard deviations (N,).
-
-    Standard deviations must be given exactly where points are seen.
-
-    Raises:
-        ValueError: One is.
-    """
+    """Refuse partly seen points (N, 2) or sigmas (N,) not where seen (ValueError)."""
     points: Float = getattr(message, uv)
     for (u, v), value in zip(points.tolist(), getattr(message, sigma).tolist(), strict=True):
         missing = u != u
@@ -226,22 +203,14 @@ def _in_part(field: str) -> ValueError:
 
 
 def refuse_beyond(message: Message, field: str) -> None:
-    """Refuse a number that is beyond the bounds of its field; NaN passes.
-
-    Raises:
-        OutOfBoundsError: It is.
-    """
+    """Refuse a number beyond the bounds of its field (OutOfBoundsError); NaN passes."""
     value, (low, high) = getattr(message, field), bounds_of(type(message))[field]
     if value < low or value > high:
         raise _beyond(field, value, low, high)
 
 
 def refuse_bad_quaternion(message: Message, field: str) -> None:
-    """Refuse a quaternion (4,) that is not of length 1; NaN passes.
-
-    Raises:
-        OutOfBoundsError: Its squared length misses 1 by more than a tenth.
-    """
+    """Refuse squared lengths off 1 by over 0.1 (OutOfBoundsError); NaN passes."""
     w, x, y, z = getattr(message, field).tolist()
     length = 0.1  # by how much the squared length of a quaternion may miss 1
     if abs(w * w + x * x + y * y + z * z - 1.0) > length:

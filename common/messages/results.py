@@ -136,9 +136,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
 
     @classmethod
     def known_good(cls, hand: str, t_ns: int, **arrays: Float | Bool | Code) -> "HandPose":
-        """Return a pose from arrays that their creator knows to be valid.
-
-        Their numbers are not checked.
+        """Return a pose from arrays that their creator knows to be valid: unchecked.
 
         They become read-only, and are the pose's: nobody writes into them later. Those of a wrist device may be
         missing.
@@ -224,9 +222,7 @@ class Contact(Message, frozen=True, eq=False, tag=True):
 
 
 class Gesture(Message, frozen=True, eq=False, tag=True):
-    """Gesture of a hand.
-
-    One that lasts begins, is repeated with every pose of the hand, and ends.
+    """Gesture of a hand; if it lasts, it begins, repeats with every pose, and ends.
 
     Attributes:
         hand: Name of the hand profile.
@@ -240,7 +236,8 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
         confidence: 0..1.
         distance_m: Of a pinch: between the skin of thumb and finger [m].
         strength: Of a pinch: 0 (open) .. 1 (closed).
-        angle_rad: Of a dial: by how much it was turned since it began, clockwise as the user sees the back of the hand.
+        angle_rad: Of a dial: by how much it was turned since it began, clockwise as the user sees the back of the
+            hand.
         origin_m: (3,) of a pointing ray [m], rig frame; of a pinch the middle between the two; of a dial its centre.
         direction: (3,) unit vector of a pointing ray, rig frame; of a dial its axis.
     """

@@ -3,9 +3,9 @@
 docs/schema/messages.json, by `make schema`.
 
 On the wire a message is a msgpack map, and JSON schema has no word for two things there: bytes, and an array of
-numbers, sent as the bytes of its elements, little-endian and row by row. Both have `"x-msgpack": "bin"`, and an
-array what its elements are: `"x-dtype"` is "<f8" (64-bit floats), "<u2", "u1" (unsigned integers) or "?" (truth values,
-a byte each), and `"x-minimum"`, `"x-maximum"` their bounds. Shapes stand in the descriptions and in docs/wire.md; a NaN
+numbers, sent as the bytes of its elements, little-endian and row by row. Both have `"x-msgpack": "bin"`, and an array
+what its elements are: `"x-dtype"` is "<f8" (64-bit floats), "<u2", "u1" (unsigned integers) or "?" (truth values, a
+byte each), and `"x-minimum"`, `"x-maximum"` their bounds. Shapes stand in the descriptions and in docs/wire.md; a NaN
 in an array or a number is "not known", and within all bounds.
 """
 
@@ -28,10 +28,7 @@ _REF = "#/$defs/{name}"
 
 
 def bus_schema() -> bytes:
-    """Return the schema of the streams, their keys, and their messages.
-
-    The same bytes on every Python version.
-    """
+    """Schema of streams, keys and messages, the same bytes on every Python version."""
     kinds = sorted(
         {row.message for row in STREAMS.values()} - {Message} | {Backlog}, key=lambda kind: kind.__name__
     )
@@ -97,13 +94,7 @@ def _limits(kind: type[Message], field: str) -> dict[str, float]:
 
 
 def _array(kind: type) -> dict[str, Any]:
-    """Return the schema of an array type as such.
-
-    The field states what the array holds.
-
-    Raises:
-        NotImplementedError: It is none.
-    """
+    """Schema of an array type, whose field states the content."""
     if kind is not np.ndarray:
         raise NotImplementedError(f"{kind}")
     return {"x-msgpack": "bin"}

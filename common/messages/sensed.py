@@ -1,7 +1,4 @@
-"""Messages of senders: markers, wrist fingers, tags, IMU samples, tracker poses.
-
-Cameras see the markers, the fingers before a wrist device and the tags.
-"""
+"""Messages of senders: markers, wrist fingers, tags, IMU samples, tracker poses."""
 
 from functools import cache
 from math import nan
@@ -47,11 +44,10 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         uv: Marker centroids (M, 2) [px], distorted image, (0, 0) = centre of the top-left pixel.
         area: Blob areas (M,) [px^2].
         quality: Probability (M,) 0..1 that what was found is the marker.
-        sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
-            the whole marker: noise, uncertainty from occlusion, size. Positive where `uv` is seen, NaN elsewhere.
-        alt_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
-            this is the marker. NaN: none, the usual case. Only where `uv` is seen.
-            A row that is NaN in all was not seen.
+        sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of the
+            whole marker: noise, uncertainty from occlusion, size. Positive where `uv` is seen, NaN elsewhere.
+        alt_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that this is
+            the marker. NaN: none, the usual case. Only where `uv` is seen. A row that is NaN in all was not seen.
         t_sigma_ns: Standard deviation of `t_ns` [ns]: of the sender's stamp until `ingest`, with that of the clock
             conversion afterwards. 0: exact, or not known (a recording).
     """
@@ -89,17 +85,16 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
 
 
 class WristDetections(Message, frozen=True, eq=False, tag=True):
-    """Detections of a wrist device's camera in one strobe cycle.
+    """Detections of a wrist device's camera in one strobe cycle: ambient, laser, LED.
 
-    The cycle is ambient, laser, LED; fingers thumb ... little.
-
-    Pixels are of the distorted image, (0, 0) = centre of the top-left pixel; NaN: not seen.
+    Fingers thumb ... little. Pixels are of the distorted image, (0, 0) = centre of the top-left pixel; NaN: not seen.
 
     Attributes:
         camera: Camera name, the rig's only one.
         session: Random id of the sending process; a restart is a new session.
         seq: Frame counter of the laser frame. It rises by more than one from strobe cycle to strobe cycle.
-        t_ns: Middle of the exposure of row 0 of the laser frame [ns], sender's clock until `ingest`, then the master's.
+        t_ns: Middle of the exposure of row 0 of the laser frame [ns], sender's clock until `ingest`, then the
+            master's.
         ready_t_ns: When the last frame of the strobe cycle was handed to the slave [ns], same clock as `t_ns`.
         laser_uv: (5, 2) centroids of the part of the laser line that lies on each finger and is seen.
         laser_sigma_px: (5,) their standard deviation per axis; positive where `laser_uv` is seen, NaN elsewhere.
@@ -237,10 +232,7 @@ Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera send
 
 @cache
 def nowhere(markers: int) -> Float:
-    """Return empty alternatives (M, 2) for markers of which none has one.
-
-    Read-only; at most 49 are ever made.
-    """
+    """Empty alternatives (M, 2) for markers of which none has one; read-only."""
     nowhere = np.full((markers, 2), np.nan)
     nowhere.flags.writeable = False
     return nowhere

@@ -1,13 +1,8 @@
 """Processes publish their state and metrics and receive requests.
 
-Table of the metrics that processes publish in `Health`.
-
-A `Health` with a metric that is not in it is refused, where it is made and where it is received. `<...>` in a name
-stands for a name of the rig (a camera, a marker, a sender) or of a device's control. docs/metrics.md is made of it.
-
-State of processes and requests to them.
-
-Health, checklist, commands, and pictures for people.
+A `Health` with a metric that is not in the table is refused, where it is made and where it is received. `<...>` in a
+name stands for a name of the rig (a camera, a marker, a sender) or of a device's control. docs/metrics.md is made of
+it.
 """
 
 import re
@@ -153,10 +148,7 @@ _CUT = tuple(metric.name.partition("<")[0] for metric in METRICS if "<" in metri
 
 @lru_cache(maxsize=4096)
 def is_known(name: str) -> bool:
-    """Return whether a metric of this name is in the table.
-
-    A name of the full length may have been cut.
-    """
+    """Whether a metric of this name is in the table; a full-length name may be cut."""
     if _KNOWN.fullmatch(name):
         return True
     return len(name) == MAX_NAME_CHARACTERS and any(head and name.startswith(head) for head in _CUT)
@@ -265,9 +257,7 @@ class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Checklist(Message, frozen=True, eq=False, tag=True):
-    """All faults at one time.
-
-    Empty: all is well.
+    """All faults at one time. Empty: all is well.
 
     Attributes:
         source: Process name: "master".
@@ -297,13 +287,11 @@ class Command(Message, frozen=True, eq=False, tag=True):
 
 
 class Backlog(Message, frozen=True, eq=False, tag=True):
-    """Backlog of a master that records.
-
-    Valid from the next message shown until the master reports otherwise.
+    """Backlog of a master that records, valid until it reports another.
 
     Attributes:
         source: Process name: "master".
-        t_ns: When that message was there [ns], master's clock.
+        t_ns: When the next message shown was there [ns], master's clock.
         skip: How many epochs of each hand are skipped, at most, between two that are solved; 0: none.
     """
 
@@ -313,9 +301,7 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):
-    """Small picture of what a camera sees, for a person who requested it.
-
-    Nothing is measured in it.
+    """Small picture of what a camera sees, for a person; nothing is measured in it.
 
     Attributes:
         camera: Camera name.
@@ -333,9 +319,7 @@ class Preview(Message, frozen=True, eq=False, tag=True):
 
 
 class Still(Message, frozen=True, eq=False, tag=True):
-    """One whole frame of a camera, on request.
-
-    The cameras themselves are calibrated from it.
+    """One whole frame of a camera, on request, to calibrate the camera from.
 
     Attributes:
         camera: Camera name.
@@ -354,13 +338,7 @@ class Still(Message, frozen=True, eq=False, tag=True):
 
 
 def _check_jpeg(jpeg: bytes, most: int) -> None:
-    """Refuse a JPEG that no camera of ours sends.
-
-    Whoever decodes it compares its size with the camera file as well.
-
-    Raises:
-        ValueError: Too many bytes, no JPEG, or one that claims too many pixels or scans.
-    """
+    """Refuse no JPEG, or too many bytes, pixels or scans (ValueError)."""
     if len(jpeg) > most:
         raise ValueError(f"jpeg: {len(jpeg)} bytes, expected a JPEG of at most {most}")
     try:

@@ -1,7 +1,4 @@
-"""Single table of streams: content, transport path, key and recording.
-
-What travels, by which path, under which key, recorded or not.
-"""
+"""Single table of streams: content, transport path, key and recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,7 +39,6 @@ class Stream:
 
     Attributes:
         message: Type that travels.
-        path: Datagram or zenoh.
         key: Key on the zenoh bus, with {name} for the sender or target; None for datagrams.
         recorded: Whether the message recorder keeps it.
         most_hz: Of those streams that devices send on the bus: what is accepted of one sender per second.
@@ -81,11 +77,7 @@ MASTER = "master"  # its name on the bus
 
 
 def key_of(stream: str, name: str) -> str:
-    """Return the zenoh key of `stream` for the sender or target `name`.
-
-    Raises:
-        ValueError: The stream travels as datagrams and has no key.
-    """
+    """Return the zenoh key of `stream` for `name`; raises ValueError for datagrams."""
     key = STREAMS[stream].key
     if key is None:
         raise ValueError(f"stream {stream!r} travels as datagrams, it has no key")
@@ -100,8 +92,5 @@ _SENDER: dict[type[Message], Callable[[Any], str]] = {
 
 
 def sender_of(message: Message) -> str:
-    """Return the name under which a message travels.
-
-    Its camera, sensor, hand, object or process.
-    """
+    """Name under which a message travels: camera, sensor, hand, object or process."""
     return _SENDER[type(message)](message)

@@ -1,11 +1,8 @@
 """Recording of raw frames.
 
-A folder with recording.json, frames.csv and pictures, or videos.
-
-The replay camera and the offline solver read it; `common.recording.frame_writing` writes it. Whatever ended
-the recording,
-what is there can be read: the manifest comes first, and a frame's row after its file. So only the last row can be
-cut, and a cut last row is dropped with a warning; every other broken row is an error.
+A folder with recording.json (the manifest), frames.csv and pictures or videos. The manifest comes first, and a frame's
+row after its file: so whatever ended the recording, only the last row can be cut. A cut last row is dropped with a
+warning; every other broken row is an error.
 """
 
 import csv
@@ -87,9 +84,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return tuple(sorted(rigs, key=lambda rig: rig.kind != "markers"))
 
     def rig_named(self, name: str | None) -> RigCalibration:
-        """Return the rig called `name`.
-
-        None: the marker rig, or the wrist rig where there is no other.
+        """Return the rig `name`; None: the marker rig, or else the wrist rig.
 
         Raises:
             RecordingError: There is no such rig.
@@ -101,19 +96,11 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         raise RecordingError(f"{MANIFEST}: no rig {name or ''!r}; it has {known}")
 
     def marker_rig(self) -> RigCalibration:
-        """The marker rig of this recording.
-
-        Raises:
-            RecordingError: There is none.
-        """
+        """The marker rig, or RecordingError."""
         return self._rig_of("markers")
 
     def wrist_rig(self) -> RigCalibration:
-        """The wrist rig of this recording.
-
-        Raises:
-            RecordingError: There is none.
-        """
+        """The wrist rig, or RecordingError."""
         return self._rig_of("wrist")
 
     def _rig_of(self, kind: str) -> RigCalibration:
@@ -128,10 +115,8 @@ class FrameRow:
     """One line of frames.csv.
 
     Attributes:
-        camera: Name of the camera.
-        seq: Its frame counter.
+        seq: Frame counter of the camera.
         t_ns: Middle of the exposure of row 0 [ns].
-        illumination: What lit the frame.
         file: A picture, FOLDER/NAME, or a frame of a video, VIDEO/NUMBER (`common.recording.pictures`).
     """
 
@@ -144,21 +129,14 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameRecording:
-    """Opened recording: its folder, manifest and frame table.
-
-    The table is in the order of the file.
-    """
+    """Opened recording: folder, manifest, frame table in the order of the file."""
 
     folder: Path
     manifest: Manifest
     rows: tuple[FrameRow, ...]
 
     def frames_of(self, camera: str) -> tuple[FrameRow, ...]:
-        """Rows of one camera, by `t_ns`.
-
-        Raises:
-            RecordingError: The recording has no such camera.
-        """
+        """Rows of one camera, by `t_ns`; RecordingError if there is no such camera."""
         if camera not in self.manifest.cameras:
             known = ", ".join(sorted(self.manifest.cameras))
             raise RecordingError(f"{self.folder}: no camera {camera!r}; it has {known}")
@@ -211,13 +189,7 @@ def open_recording(folder: Path) -> FrameRecording:
 
 
 def check_manifest(manifest: Manifest, where: str) -> None:
-    """Check the files inside the manifest, and whether they are consistent.
-
-    `load` cannot detect these errors; they are refused here.
-
-    Raises:
-        CalibrationError: With `where` and the key.
-    """
+    """Check the files inside the manifest: CalibrationError with `where` and the key."""
     for key, names in (("cameras", manifest.cameras), ("objects", manifest.objects)):
         for name in names:
             if not is_plain(name):
@@ -235,10 +207,7 @@ def check_manifest(manifest: Manifest, where: str) -> None:
 
 
 def _rows(path: Path, text: str) -> tuple[FrameRow, ...]:
-    """Return all rows of frames.csv.
-
-    The last one is rejected, with a warning, where the end of the recording cut it.
-    """
+    """All rows of frames.csv; a cut last one is rejected with a warning."""
     reader = csv.reader(io.StringIO(text, newline=""))
     if tuple(next(reader, ())) != COLUMNS:
         raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")

@@ -31,13 +31,7 @@ _PNG = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 
 
 def encode_png(image: Image) -> bytes:
-    """Encode `image` losslessly as a PNG file.
-
-    (H, W, 3) BGR or (H, W) grey, uint8. Any thread may call it.
-
-    Raises:
-        RecordingError: OpenCV cannot encode it.
-    """
+    """Encode BGR (H, W, 3) or grey (H, W) uint8 losslessly; any thread may call it."""
     try:
         done, data = cv2.imencode(".png", image, _PNG)
     except cv2.error as error:
@@ -48,11 +42,7 @@ def encode_png(image: Image) -> bytes:
 
 
 def refuse_occupied(folder: Path) -> None:
-    """Nothing is ever recorded over something else.
-
-    Raises:
-        RecordingError: `folder` is a file, or a folder that holds something already.
-    """
+    """Refuse a folder that is a file, or holds something already (RecordingError)."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise RecordingError(f"{folder}: holds something already; give a new or an empty folder")
@@ -61,17 +51,10 @@ def refuse_occupied(folder: Path) -> None:
 
 
 class RecordingWriter:
-    """A recording being written. Not for several threads at once.
-
-    Holds the open table, its length up to the last whole row, and how many frames each camera has.
-    """
+    """A recording being written. Not for several threads at once."""
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
-        """Make the folder, its manifest and an empty table.
-
-        Args:
-            folder: New or empty.
-            manifest: Content of recording.json.
+        """Make the folder, which must be new or empty, its manifest and an empty table.
 
         Raises:
             RecordingError: The folder holds something, or cannot be written; the manifest contradicts itself.
@@ -100,16 +83,9 @@ class RecordingWriter:
             raise RecordingError(f"{folder / FRAMES}: cannot write: {error.strerror}") from error
 
     def add(self, camera: str, seq: int, t_ns: int, illumination: Illumination, png: bytes) -> FrameRow:
-        """Write one frame: its file, then its row.
+        """Write one frame: its PNG file, then its row; after an error it leaves no trace.
 
-        After an error the frame leaves no trace.
-
-        Args:
-            camera: A camera of the manifest.
-            seq: Frame counter of the camera.
-            t_ns: Middle of the exposure of row 0 [ns].
-            illumination: What lit the scene.
-            png: The PNG file.
+        `t_ns`: middle of the exposure of row 0 [ns].
 
         Raises:
             RecordingError: The disk is full or gone, or a limit is met; the text names the file.
@@ -156,11 +132,7 @@ class RecordingWriter:
             self._remove()
 
     def _append(self, values: tuple[object, ...]) -> None:
-        """Add one line to the table, whole or not at all.
-
-        Raises:
-            OSError: It does not fit; the table is as before.
-        """
+        """Add one line to the table, whole or not at all (OSError)."""
         text = io.StringIO(newline="")
         csv.writer(text, lineterminator="\n").writerow(values)
         line = text.getvalue().encode()

@@ -1,25 +1,11 @@
 """A reader opens an MCAP file chunk by chunk, within bounds.
 
-Bounds of an MCAP file: what a recording of ours can hold.
-
-What is beyond them is lost, and counted with its cause.
-
-A few bytes can claim any size, and zstd packs 4 MiB of zeros into 400 bytes. So each part is bounded, and so is what
-one pass over a file unpacks, by the size of the file: a writer of ours leaves 16 bytes of index for each message.
-
-One chunk of an MCAP file, opened within bounds.
-
-Its sizes are checked before anything is unpacked.
-
-Contents of an MCAP file: its chunks, channels, attachments and metadata.
-
-The file may be whole or cut anywhere.
-
-A file that was ended has a summary behind its data, with a check sum: then nothing but that is read at the start. Any
+A file that was ended has a summary with a check sum behind its data: then nothing but that is read at the start. Any
 other is walked record by record up to the first that is not whole, and its chunks are opened once to see what they
-hold. Bytes that were flipped cost the chunk or the attachment they are in, no other: each has a check sum. Records
-are read by the `mcap` library from bytes that were cut out here, never from the file: a length that lies reads nothing.
-What is beyond a bound is a loss as what is broken is: it is counted with its cause, and the rest is read.
+hold. A few bytes can claim any size, and zstd packs 4 MiB of zeros into 400 bytes: so each part is bounded, and so is
+what one pass over a file unpacks, by the size of the file (a writer of ours leaves 16 bytes of index for each
+message). Records are read by the `mcap` library from bytes that were cut out here, never from the file: a length that
+lies reads nothing. What is broken or beyond a bound is counted with its cause, and the rest is read.
 """
 
 import io
@@ -77,16 +63,12 @@ BEYOND = "more than a file of this size can hold"
 
 
 class WorkBudget:
-    """What one pass over a file may still read and unpack.
-
-    Holds the bytes and records that are left.
-    """
+    """Bytes and records that one pass over a file may still read and unpack."""
 
     def __init__(self, file_bytes: int) -> None:
         """Of a file of that size."""
         free_bytes = 16 << 20  # that a pass may unpack of the smallest file
-        # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
-        ratio = 256
+        ratio = 256  # unpacked bytes for each byte of the file; ours reach 100 where no marker is seen
         self._bytes = free_bytes + ratio * file_bytes
         index_bytes = 16  # of the file, for each message in it
         self._records = CHUNK_RECORDS + file_bytes // index_bytes
@@ -100,11 +82,7 @@ class WorkBudget:
         self._records = max(self._records - count, 0)
 
     def take(self, size: int) -> None:
-        """Use up so many bytes.
-
-        Raises:
-            RecordingError: There are not so many left.
-        """
+        """Use up so many bytes; RecordingError if there are not so many left."""
         if size > self._bytes:
             raise RecordingError(BEYOND)
         self._bytes -= size
@@ -116,7 +94,7 @@ class Losses:
 
     Attributes:
         count: Chunks, attachments, metadata and messages, as far as they were met.
-        named: The first few, with the cause; printable.
+        named: The first five, with the cause; printable.
     """
 
     count: int = 0
@@ -151,8 +129,7 @@ class OpenedChunk:
     """What is in a chunk, in the order of writing.
 
     Attributes:
-        channels: By their number, as they stand there: a chunk repeats them, and only who wants them reads them.
-        messages: All of them.
+        channels: By their number, as bytes: a chunk repeats them, and only who wants them reads them.
     """
 
     channels: dict[int, bytes] = field(default_factory=dict[int, bytes])
@@ -232,11 +209,7 @@ def _message(content: bytes, at: int, length: int) -> ChunkMessage:
 
 
 def read_channel(data: bytes) -> Channel:
-    """Read the content of a channel record.
-
-    Raises:
-        RecordingError: It is too long or broken.
-    """
+    """Read the content of a channel record; RecordingError if too long or broken."""
     if len(data) > BOUNDS.channel_bytes:
         raise RecordingError(f"a channel of {len(data)} bytes, at most {BOUNDS.channel_bytes}")
     try:
@@ -269,8 +242,7 @@ class McapContent:
         channels: By their number.
         chunks: In the order of the file.
         counts: Number of a channel -> messages in it.
-        attachments: Those that are whole.
-        metadata: Those that are whole, by name.
+        attachments, metadata: Those that are whole.
         metadata_met: How many there are, also those that are not kept.
         cut: It has no end: it broke off, or its end is broken.
         losses: What cannot be read, as far as that is known.
@@ -315,9 +287,7 @@ def read_content(path: Path) -> McapContent:
 def messages_of(
     path: Path, chunks: list[ChunkPlace], losses: Losses
 ) -> Iterator[tuple[ChunkPlace, list[ChunkMessage]]]:
-    """The messages of each chunk, in the order in which they were written.
-
-    `losses` counts what is broken.
+    """Messages of each chunk, in the order of writing; `losses` counts broken ones.
 
     Raises:
         RecordingError: The file cannot be read any more.
@@ -342,10 +312,7 @@ def _content(path: Path, fd: int, size: int) -> McapContent:
 
 
 def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
-    """The records from `at` on, as far as they are whole.
-
-    The walk stops at the first that does not end before `end`, or that is none.
-    """
+    """Records from `at` on, up to the first that is none or ends beyond `end`."""
     while at + HEAD.size <= end:
         opcode, length = HEAD.unpack(os.pread(fd, HEAD.size, at))
         at += HEAD.size
@@ -356,10 +323,7 @@ def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
 
 
 def _bytes(fd: int, length: int, at: int) -> bytes:
-    """Read `length` bytes from position `at`.
-
-    Empty where a false index points outside the file.
-    """
+    """Read `length` bytes from position `at`; empty outside the file."""
     return os.pread(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
 
 
@@ -373,10 +337,7 @@ def _header(fd: int, place: _Place | None) -> Header | None:
 
 
 def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
-    """Content of a file by the summary at its end.
-
-    None: there is no summary, or it is broken or holds what cannot be.
-    """
+    """Content of a file by the summary at its end; None: missing, broken, too large."""
     tail = os.pread(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:
         return None
@@ -396,12 +357,7 @@ def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
 
 
 def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budget: WorkBudget) -> None:
-    """Store the contents of one record of the summary.
-
-    Raises:
-        RecordingError: It is beyond a bound.
-        McapError, ValueError, struct.error: It is broken.
-    """
+    """Store one record of the summary; RecordingError or one of `BROKEN` if refused."""
     if opcode == Opcode.CHANNEL:
         content.add_channel(int.from_bytes(data[:2], "little"), data)
     elif opcode == Opcode.STATISTICS:
@@ -482,10 +438,7 @@ def _take_attachment(content: McapContent, fd: int, at: int, length: int, budget
 
 
 def _take_metadata(content: McapContent, fd: int, at: int, length: int, budget: WorkBudget) -> None:
-    """Keep metadata that are printable.
-
-    They have no check sum, so any byte of them may be another one.
-    """
+    """Keep printable metadata: without check sum, any byte may be another one."""
     try:
         content.metadata_met += 1  # not by their names: one may stand in the index many times
         if content.metadata_met > BOUNDS.metadata:

@@ -1,24 +1,12 @@
 """A recording of messages is one MCAP file that any MCAP tool opens.
 
-Where the bytes of a recording go: all of them at once, or an error.
-
-What may stand in a recording of messages.
-
-Its names lead no path elsewhere, and its messages fit their channel.
-
-Names come from the file and become names of files. They are checked once, where a recording is opened or begun.
-
-Recording of messages: one MCAP file that any MCAP tool opens.
-
-It contains the calibration it was made with.
-
     header | metadata "phalanx" | a file of calibration per attachment | chunks of messages | index
 
 There is a channel for each stream, sender and type, topic phalanx/STREAM/SENDER; a message is what `encode` makes of
-it (msgpack), and the channel's schema states its fields. The log time is when a message came, on the master's
-clock; the order in the file is that of writing, whatever the times are. A chunk is closed at least every half second
-and given to the system at once: what is lost with the process is that half second. A file without its end is read up
-to the cut (`common.recording.mcap_file`).
+it (msgpack), and the channel's schema states its fields. The log time is when a message came, on the master's clock;
+the order in the file is that of writing. A chunk is closed at least every half second and given to the system at once:
+what is lost with the process is that half second. A file without its end is read up to the cut. Names from a file
+become names of files, so they are checked once, where a recording is opened or begun.
 """
 
 import io
@@ -39,13 +27,7 @@ from mcap.writer import Writer
 
 from common.calibration.files import PLAIN, is_plain
 from common.errors import MessageError, RecordingError
-from common.messages import (
-    WIRE_VERSION,
-    AnyMessage,
-    Message,
-    decode,
-    encode,
-)
+from common.messages import WIRE_VERSION, AnyMessage, Message, decode, encode
 from common.messages.parts import MAX_TIME_NS
 from common.messages.schema import message_schema
 from common.messages.sensed import Detections, ImuSample, TagDetections, TrackerPose
@@ -58,10 +40,7 @@ class Disk(Protocol):
     """Where the bytes go: a file, or what a test puts in its place."""
 
     def write(self, data: bytes, /) -> int | None:
-        """Write part of the data and return how much.
-
-        OSError where that fails.
-        """
+        """Write part of the data and return how much, or raise OSError."""
         ...
 
     def close(self) -> None:
@@ -70,10 +49,7 @@ class Disk(Protocol):
 
 
 class Output:
-    """Where the library writes to.
-
-    Every byte goes to the disk at once, and is counted.
-    """
+    """What the library writes to: every byte goes to the disk at once."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk, self._written = disk, 0
@@ -116,11 +92,7 @@ def check_files(where: Path, files: Mapping[str, bytes]) -> None:
 
 
 def channel_names(where: Path, channels: Iterable[Channel]) -> dict[int, tuple[str, str]]:
-    """Number of each channel of ours -> its stream and sender.
-
-    Raises:
-        RecordingError: One of these is no plain name.
-    """
+    """Number of each channel of ours -> stream and sender, plain names."""
     found: dict[int, tuple[str, str]] = {}
     for one in channels:
         if not {"stream", "name"} <= one.metadata.keys():
@@ -133,11 +105,7 @@ def channel_names(where: Path, channels: Iterable[Channel]) -> dict[int, tuple[s
 
 
 def plain_names(where: Path, key: str, text: str) -> tuple[str, ...]:
-    """The names in a JSON list, as `key` of the metadata has it.
-
-    Raises:
-        RecordingError: It is no such list, or one is no plain name.
-    """
+    """The plain names in a JSON list, `key` of the metadata, or RecordingError."""
     try:
         names = msgspec.json.decode(text, type=tuple[str, ...])
     except (msgspec.DecodeError, RecursionError) as error:
@@ -149,12 +117,10 @@ def plain_names(where: Path, key: str, text: str) -> tuple[str, ...]:
 
 
 def refuse_misplaced(stream: str, name: str, message: AnyMessage) -> None:
-    """Refuse a message that its channel cannot have.
-
-    It is of another kind or sender, or of a time that cannot be.
+    """Refuse a message of another kind or sender than its channel's, or a bad time.
 
     Raises:
-        RecordingError: The message states what, not where.
+        RecordingError: The text states what, not where.
     """
     if not isinstance(message, _kinds(stream)) or sender_of(message) != name:
         raise RecordingError(
@@ -167,7 +133,7 @@ def refuse_misplaced(stream: str, name: str, message: AnyMessage) -> None:
 
 @cache
 def _kinds(stream: str) -> tuple[type[Message], ...]:
-    """The types of the messages on a stream; any, where we do not know it."""
+    """Types of the messages on a stream; any, where we do not know it."""
     if stream == "taken":
         return (*Detections.__args__, TagDetections, TrackerPose, ImuSample, Backlog)
     return (STREAMS[stream].message if stream in STREAMS else Message,)
@@ -186,10 +152,9 @@ class Recorded:
     """One message of a recording.
 
     Attributes:
-        stream: Its stream, a key of `common.messages.streams.STREAMS`.
+        stream: A key of `common.messages.streams.STREAMS`.
         name: Its sender, or what it is about: a camera, a hand, a process.
         t_ns: When it came [ns], master's clock.
-        message: The message.
     """
 
     stream: str
@@ -199,10 +164,7 @@ class Recorded:
 
 
 class MessageWriter:
-    """Writer of one recording.
-
-    Holds the file, its channels, and when the chunk in progress began.
-    """
+    """Writer of one recording."""
 
     def __init__(
         self,
@@ -214,9 +176,9 @@ class MessageWriter:
         """Begin a new file.
 
         Args:
-            path: The file; nothing is ever recorded over something else.
+            path: Must not exist.
             files: Files of calibration by their relative path, for example "rigs/desk.json".
-            about: What else is to be known of the recording, beside wire, program and start.
+            about: Metadata beside wire, program and start.
             open_disk: Makes the file.
 
         Raises:
@@ -267,21 +229,13 @@ class MessageWriter:
             self.flush()
 
     def flush(self) -> None:
-        """End the chunk in progress: all of it is with the system from here on.
-
-        Raises:
-            RecordingError: As of `write`.
-        """
+        """End the chunk in progress, and give all of it to the system; raises as `write`."""
         self._chunk_ns = None
         if not self._ended:
             self._do(self._writer.flush)
 
     def close(self) -> None:
-        """Write the index and end the file. Safe to call twice, and after a failure.
-
-        Raises:
-            RecordingError: As of `write`.
-        """
+        """Write the index and end the file; raises as `write`. Safe to call again."""
         if not self._ended:
             self._do(self._writer.finish)
             self._end()
@@ -309,11 +263,7 @@ class MessageWriter:
         )
 
     def _do(self, step: Callable[[], object]) -> None:
-        """Write something.
-
-        Raises:
-            RecordingError: It failed; a chunk that was begun is taken back, where the system lets us.
-        """
+        """Write something; on an OSError take a begun chunk back, raise RecordingError."""
         whole = self._out.tell()
         try:
             step()
@@ -335,7 +285,6 @@ class MessageRecording:
     """An opened recording.
 
     Attributes:
-        path: The file.
         files: Files of calibration by their relative path.
         about: Metadata from its writer: wire, program, started, and what else it gave.
         begin_t_ns, end_t_ns: First and last log time [ns]; both 0 where there is no message.
@@ -346,11 +295,7 @@ class MessageRecording:
     """
 
     def __init__(self, path: Path, content: McapContent) -> None:
-        """Of the content of a file.
-
-        Raises:
-            RecordingError: A name in it is not plain.
-        """
+        """Of the content of a file; RecordingError if a name in it is not plain."""
         self.path, self.cut, self.losses = path, content.cut, content.losses
         self.files = {one.name: one.data for one in content.attachments}
         check_files(path, self.files)
@@ -371,17 +316,9 @@ class MessageRecording:
         return self.losses.count
 
     def read(
-        self,
-        streams: Collection[str] | None = None,
-        from_t_ns: int | None = None,
-        to_t_ns: int | None = None,
+        self, streams: Collection[str] | None = None, from_t_ns: int | None = None, to_t_ns: int | None = None
     ) -> Iterator[Recorded]:
-        """The messages in the order in which they were written.
-
-        Args:
-            streams: Those that are wanted; None: all.
-            from_t_ns: None before this [ns].
-            to_t_ns: And none after this [ns].
+        """Messages from `from_t_ns` to `to_t_ns` [ns] in the order of writing; None: all.
 
         Raises:
             RecordingError: The file cannot be read any more.

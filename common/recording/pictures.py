@@ -1,37 +1,11 @@
-"""Encode, decode and bound the pictures of a recording.
+"""Decoders read a recording's pictures from image files and videos.
 
-Width and height of a picture from the header of its file.
-
-Of JPEG, PNG, BMP and TIFF, without a decoder.
-
-A decoder allocates what the header claims, so 600 bytes can cost gigabytes. Whoever has the bytes of a picture from
-elsewhere compares this size with the one that it may have, and only then decodes (`common.recording.pictures`).
-
-The walk through a JPEG accepts less than decoders do: nothing between two segments but fill bytes, a frame header with
-both sizes. So the first frame header that it finds is the first one that a decoder finds, too.
-
-Decoders read a recording's pictures from image files and videos.
-
-Decode pictures that come from elsewhere, never larger than they may be.
-
-This is the only place that calls a decoder of pictures; that of videos is in `common.recording.pictures`.
-
-Video files, decoded frame by frame.
-
-They were recorded by other people's cameras and programs.
-
-A frame is known by its number in the file, from 0. One that cannot be decoded has a number, too, and is skipped, so
-that the same frame has the same number however often the file is read. Frames come in the order of the file: going
-forward costs what lies between, going back begins anew.
-
-Only files that begin as one of the known containers are opened: the decoder would follow a playlist wherever it leads.
-
-Reader of a recording's pictures in the order in which they are requested.
-
-Each is a file of its own, or a frame of a video.
-
-A row of frames.csv names the file of a picture, `left/000007.png`, or a video in the recording's folder and the number
-of a frame in it, `left.mp4/000007`.
+A decoder allocates what a header claims, so 600 bytes can cost gigabytes: the size is read from the header of a JPEG,
+PNG, BMP or TIFF first, and compared with the one that it may have. The walk through a JPEG accepts less than decoders
+do (nothing between two segments but fill bytes, a frame header with both sizes), so the first frame header that it
+finds is the first one that a decoder finds, too. A row of frames.csv names a picture, `left/000007.png`, or a video
+and the number of a frame in it, `left.mp4/000007`. Frames that do not decode have numbers, too, and are skipped. Only
+files that begin as a known container are opened: the decoder would follow a playlist wherever it leads.
 """
 
 import re
@@ -82,9 +56,7 @@ def size_of(data: bytes) -> Size:
 
 
 def jpeg_size(data: bytes) -> Size:
-    """Width and height [px] in the frame header of a JPEG.
-
-    As in ITU-T T.81, B.2.2; baseline or progressive.
+    """Width and height [px] in the frame header of a JPEG (ITU-T T.81, B.2.2).
 
     Raises:
         PictureError: It is no JPEG, its header is cut or odd, a side is not 1 to 16384 px, or it has too many scans.
@@ -135,10 +107,7 @@ def _bmp_size(data: bytes) -> Size:
 
 
 def _tiff_size(data: bytes) -> Size:
-    """From the first directory of a TIFF (6.0, section 2).
-
-    A tile is decoded as a whole, so it is bounded as well.
-    """
+    """From the first directory (TIFF 6.0, section 2); tiles are decoded as a whole."""
     order = "little" if data[:2] == b"II" else "big"
 
     def number(at: int, count: int) -> int:
@@ -167,14 +136,9 @@ MAX_FILE_BYTES = 256 << 20  # of one picture: 64 megapixels of 32 bits, not pack
 
 
 def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
-    """Decode the picture of a device, whose size is known.
+    """Decode the JPEG or PNG of a device as (H, W, 3) BGR or (H, W), uint8.
 
-    JPEG or PNG, as our own programs write them; returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
-
-    Args:
-        data: A whole file.
-        size: Width and height [px] that it must have: those of the camera file.
-        grey: Whether one channel is wanted.
+    The image is as the sensor has it; `size` is that of the camera file [px].
 
     Raises:
         PictureError: It has another size, is of another kind, or no whole picture. Another size costs no memory.
@@ -207,9 +171,7 @@ def read_picture(path: Path) -> bytes:
 
 
 def decode_file(data: bytes, *, grey: bool = False) -> Image:
-    """Decode a picture that a person keeps on a disk.
-
-    Of any size up to 16384 x 16384 px; returns (H, W, 3) BGR or (H, W), uint8.
+    """Decode a picture of up to 16384 x 16384 px as (H, W, 3) BGR or (H, W), uint8.
 
     Raises:
         PictureError: It is larger, of another kind than JPEG, PNG, BMP and TIFF, or no whole picture.
@@ -255,10 +217,7 @@ class VideoTimes:
 
 
 class VideoFrames:
-    """The frames of one video file.
-
-    Holds the decoder, the number of the frame it stands at, and whether that one decoded.
-    """
+    """The frames of one video file, by number; going back decodes from the beginning."""
 
     def __init__(self, path: Path) -> None:
         """Open the file.
@@ -298,11 +257,7 @@ class VideoFrames:
         self._number += 1
 
     def image(self, number: int) -> Image:
-        """Frame `number` (H, W, 3) BGR uint8.
-
-        Raises:
-            PictureError: There is no such frame, or it does not decode.
-        """
+        """Frame `number` (H, W, 3) BGR uint8, or PictureError."""
         if number < self._number:
             self.close()
             self._open()
@@ -316,11 +271,7 @@ class VideoFrames:
         return np.asarray(image, np.uint8)
 
     def times(self) -> VideoTimes:
-        """Decode the file from here to its end.
-
-        Raises:
-            PictureError: Not one frame decodes.
-        """
+        """Decode the file from here to its end; PictureError if not one frame decodes."""
         number: list[int] = []
         shown_ms: list[float] = []
         failed = 0
@@ -362,16 +313,10 @@ def frame_name(video: str, number: int) -> str:
 
 
 class FramePictures:
-    """The pictures of one camera of a recording. Holds the video that is open."""
+    """The pictures of one camera of a recording. Holds the videos that are open."""
 
     def __init__(self, folder: Path, size_px: tuple[int, int], *, grey: bool = False) -> None:
-        """Nothing is opened yet.
-
-        Args:
-            folder: The recording.
-            size_px: Width and height by the camera file.
-            grey: Whether one channel is wanted.
-        """
+        """Of the recording `folder`, sizes of the camera file; nothing is opened yet."""
         self._folder, self._size_px, self._grey = folder, size_px, grey
         self._videos: dict[str, VideoFrames] = {}
 

@@ -1,16 +1,8 @@
 """Readers check the tables and .npz files of a foreign folder.
 
-Reproducible writer and defensive reader of .npz files.
-
-Writes the same bytes on every run; reads a file that may be missing, cut, hostile or no .npz at all.
-
-An .npz is a zip file of arrays, so a few bytes can claim any size, twice: the zip's index states how large a member is
-unpacked, the member's header how large the array. Both are compared, with each other and with a bound, before anything
-is unpacked.
-
-Read files in a folder that somebody else made.
-
-They are read within bounds, and none that is outside of the folder.
+Nothing outside of the folder is read, and nothing without a bound. An .npz is a zip file of arrays, so a few bytes can
+claim any size, twice: the zip's index states how large a member is unpacked, the member's header how large the array.
+Both are compared, with each other and with a bound, before anything is unpacked. Equal arrays give equal files.
 """
 
 import math
@@ -50,9 +42,7 @@ _BROKEN = (  # what the zip file, the header of an array and its data can raise
 
 
 def write_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> None:
-    """Write the arrays uncompressed.
-
-    Memory stays constant, also for the columns of a mapped file.
+    """Write arrays uncompressed, in constant memory, also columns of a mapped file.
 
     Raises:
         OSError: The folder is missing, read-only or full; no part of a file is left.
@@ -70,8 +60,7 @@ def read_npz(
     fix: str = "",
     also: Iterable[str] = (),
     *,
-    # of a file of our own: six hours of poses
-    most_bytes: int = 4 << 30,
+    most_bytes: int = 4 << 30,  # of a file of our own: six hours of poses
 ) -> dict[str, Float]:
     """Arrays by name, as they are stored.
 
@@ -107,11 +96,7 @@ def read_npz(
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Float:
-    """Return the array of a member whose size the zip file states correctly.
-
-    Raises:
-        ValueError: Another size, pickled objects, or packed in another way than NumPy does.
-    """
+    """Array of a member; ValueError if its sizes differ or NumPy did not pack it."""
     name = member.filename[:80]
     if member.compress_type not in _METHODS:
         raise ValueError(f"{name!r}: must be stored or deflated")
@@ -154,10 +139,7 @@ def read_table(folder: Path, name: str) -> str:
 
 
 def has_truth(folder: Path) -> bool:
-    """Whether a folder has exact values.
-
-    A link that leads nowhere counts, and is refused when it is read.
-    """
+    """Whether a folder has exact values; a link that leads nowhere counts."""
     path = folder / TRUTH
     return path.is_symlink() or path.exists()
 
@@ -165,26 +147,14 @@ def has_truth(folder: Path) -> bool:
 def read_truth(
     folder: Path, names: Sequence[str] = (), fix: str = "", also: Iterable[str] = ()
 ) -> dict[str, Float]:
-    """The exact values of a rendered recording, by name.
-
-    Args:
-        folder: The recording.
-        names: Which must be there.
-        fix: Printed after the error: what the user can do.
-        also: Which are read as well where they are there.
-
-    Raises:
-        RecordingError: It is missing, broken, too large, no plain file, leads out of the folder, or lacks a name.
-    """
+    """The exact values of a rendered recording, by name; otherwise as `read_npz`."""
     refuse_links(folder, [TRUTH])
     truth_bytes = 256 << 20  # unpacked; a frame has some 3 kB: 20 minutes at 60 Hz
     return read_npz(folder / TRUTH, names, fix, also, most_bytes=truth_bytes)
 
 
 def refuse_links(folder: Path, names: Iterable[str]) -> None:
-    """Refuse files that links lead out of a folder, and pipes and devices.
-
-    The links are symbolic; reading a pipe or a device has no end.
+    """Refuse files that symbolic links lead out of a folder, and pipes and devices.
 
     Args:
         folder: Itself it may be a link.

@@ -1,10 +1,9 @@
 """Simulated calibration board in front of the cameras of a rig.
 
-Held still, rotated, held again, as a person does it.
-
-For the calibration of cameras without hardware. The board is flat and exact, each pixel is the mean of the part of
-the board that it sees, light falls off with the board's tilt, and the sensor's noise is that of every simulated
-camera. Not modelled: motion blur and rolling shutter, since a board is measured while it is held still.
+For the calibration of cameras without hardware: the board is held still, rotated, held again, as a person does it. It
+is flat and exact, each pixel is the mean of the part of the board that it sees, light falls off with the board's
+tilt, and the sensor's noise is that of every simulated camera. Not modelled: motion blur and rolling shutter, since a
+board is measured while it is held still.
 """
 
 from collections.abc import Mapping
@@ -43,15 +42,14 @@ TILT_RAD, ROLL_RAD = np.radians(38.0), np.radians(25.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Print:
-    """Appearance of a flat thing and its background.
-
-    Given as shares of the way from one colour to another.
+    """Appearance of a flat thing, as shares of the way between two colours.
 
     Attributes:
-        texture: (rows, columns) shares, TEXELS_PER_M; above 0 on the thing.
+        texture: (rows, columns) shares, `texels_per_m`; above 0 on the thing.
         origin: Texel (2,), column first, at the origin of the thing's frame.
         wall: Share of what lies behind.
-        none_bgr, all_bgr: (3,) linear light of the shares 0 and 1, blue first, of a thing that faces the camera.
+        none_bgr, all_bgr: (3,) linear light of the shares 0 and 1, blue first, of a thing that faces the
+            camera.
     """
 
     texture: Float32
@@ -65,11 +63,7 @@ class Print:
 class BoardScene:
     """Checkerboard of 9 x 6 inner corners, squares of 25 mm, moved through the view.
 
-    The view is that of a rig's cameras.
-
     Attributes:
-        rig: Which cameras, where.
-        cameras: Camera name -> its file, with intrinsics.
         seed: Of the poses and the noise.
         poses: (POSES, 4, 4) board -> rig [m]: held one after the other. The board's origin is its first inner
             corner, +x along a row of COLUMNS corners, +y to the next row, +z away from the viewer.
@@ -87,16 +81,40 @@ class BoardScene:
         object.__setattr__(self, "poses", self.find_poses())
 
     def find_poses(self) -> Float:
-        """Where it is held (K, 4, 4) [m], one place after the other.
+        """Poses (K, 4, 4) [m] that one camera, mostly all, see whole: tilted every way.
 
         Raises:
-            CalibrationError: There is no such place.
+            CalibrationError: No pose was found that the rig's first camera sees whole: it looks past the volume.
         """
-        return _poses([self.optics(name) for name in self.rig.cameras], self.seed)
+        optics = [self.optics(name) for name in self.rig.cameras]
+        rng = np.random.default_rng([self.seed, 5])
+        found: list[Float] = []
+        for _ in range(200 * BOARD.poses):
+            first_camera = optics[len(found) % len(optics)]
+            T = first_camera.T_rig_camera @ _before(first_camera, rng)
+            seen = [_sees(camera, T) for camera in optics]
+            if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
+                found.append(T)
+            if len(found) == BOARD.poses:
+                return np.stack(found)
+        raise CalibrationError(
+            "scene board: the cameras of this rig have no view in common that holds a board"
+        )
 
     def printed(self) -> Print:
-        """Return what is seen of it."""
-        return _printed()
+        """What is seen of it, a share of 1 being all light."""
+        step = round(BOARD.square_m * BOARD.texels_per_m)
+        margin_m = 0.0125  # white paper around the squares
+        margin = round(margin_m * BOARD.texels_per_m)
+        y, x = np.indices(((BOARD.rows + 1) * step, (BOARD.columns + 1) * step)) // step
+        white, black, wall = 0.62, 0.035, 0.10  # linear light
+        squares = np.where((x + y) % 2 == 0, black, white).astype(np.float32)
+        texture = cv2.copyMakeBorder(
+            squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(white,)
+        )
+        # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
+        corner = np.full(2, margin + step - 0.5)
+        return Print(np.asarray(texture, np.float32), corner, wall, np.zeros(3), np.ones(3))
 
     def optics(self, camera: str) -> CameraModel:
         """One camera as geometry.
@@ -107,19 +125,12 @@ class BoardScene:
         return CameraModel.of(self.cameras[camera], self.rig.camera_pose(camera))
 
     def T_rig_board(self, t_s: float) -> Float:
-        """Return the pose (4, 4) [m] of the board at scene time `t_s` [s].
-
-        The poses repeat.
-        """
+        """Return the pose (4, 4) [m] at scene time `t_s` [s]; the poses repeat."""
         count, step_s = len(self.poses), BOARD.held_s + BOARD.moved_s
         k = int(max(t_s, 0.0) // step_s)
         past = max(t_s, 0.0) - k * step_s - BOARD.held_s
         now, then = self.poses[k % count], self.poses[(k + 1) % count]
         return now if past <= 0.0 else _between(now, then, past / BOARD.moved_s)
-
-    def corners_m(self) -> Float:
-        """The inner corners (54, 3) [m] in the board's frame, row by row."""
-        return board_corners()
 
 
 def board_corners() -> Float:
@@ -131,15 +142,11 @@ def board_corners() -> Float:
 class BoardRenderer:
     """Images of a board scene by one camera; a frame is a pure function of t.
 
-    It holds rays, print and noise, and the last picture without noise: most of the time the board is held.
+    Holds rays, print and noise, and the last picture without noise: most of the time the board is held.
     """
 
     def __init__(self, scene: BoardScene, camera: str) -> None:
-        """Prepare the ray of every fine pixel.
-
-        Raises:
-            CalibrationError: No such camera, or one without intrinsics.
-        """
+        """Prepare the ray of every fine pixel; CalibrationError: no such camera or lens."""
         self._scene, self._optics = scene, scene.optics(camera)
         height, width = self._optics.height_px, self._optics.width_px
         fine = (np.arange(BOARD.fine) + 0.5) / BOARD.fine - 0.5
@@ -154,10 +161,7 @@ class BoardRenderer:
         self._drawn: tuple[Float, Image] | None = None
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "BoardRenderer":
-        """Return the renderer for a camera of other brightness (3,), blue first.
-
-        Nothing here is smeared by `exposure_us`.
-        """
+        """Return the renderer at channel gains (3,), blue first; nothing is smeared."""
         del exposure_us
         other = copy(self)
         other._gains_bgr = np.array(gains_bgr, dtype=np.float32)
@@ -202,46 +206,8 @@ class BoardRenderer:
         return self._encode.encode(np.asarray(colour * self._gains_bgr, np.float32))
 
 
-def _printed() -> Print:
-    """The board, a share of 1 being all light; its origin is the first inner corner."""
-    step = round(BOARD.square_m * BOARD.texels_per_m)
-    margin_m = 0.0125  # white paper around the squares
-    margin = round(margin_m * BOARD.texels_per_m)
-    y, x = np.indices(((BOARD.rows + 1) * step, (BOARD.columns + 1) * step)) // step
-    white, black, wall = 0.62, 0.035, 0.10  # linear light
-    squares = np.where((x + y) % 2 == 0, black, white).astype(np.float32)
-    texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(white,))
-    # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
-    corner = np.full(2, margin + step - 0.5)
-    return Print(np.asarray(texture, np.float32), corner, wall, np.zeros(3), np.ones(3))
-
-
-def _poses(optics: list[CameraModel], seed: int) -> Float:
-    """Return poses (POSES, 4, 4) that at least one camera sees whole.
-
-    Most are seen whole by all cameras: near and far, tilted every way.
-
-    Raises:
-        CalibrationError: No pose was found that the rig's first camera sees whole: it looks past the volume.
-    """
-    rng = np.random.default_rng([seed, 5])
-    found: list[Float] = []
-    for _ in range(200 * BOARD.poses):
-        first_camera = optics[len(found) % len(optics)]
-        T = first_camera.T_rig_camera @ _before(first_camera, rng)
-        seen = [_sees(camera, T) for camera in optics]
-        if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
-            found.append(T)
-        if len(found) == BOARD.poses:
-            return np.stack(found)
-    raise CalibrationError("scene board: the cameras of this rig have no view in common that holds a board")
-
-
 def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
-    """Return a random pose of the board before one camera, in the camera frame.
-
-    Its middle is anywhere in the view.
-    """
+    """Random pose (4, 4), camera frame, of the board with its middle in the view."""
     near_m, far_m = 0.34, 0.70
     z = 1.0 / rng.uniform(1.0 / far_m, 1.0 / near_m)
     reach = np.array([camera.width_px / camera.matrix[0, 0], camera.height_px / camera.matrix[1, 1]]) / 2.0
@@ -255,10 +221,7 @@ def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
 
 
 def _sees(camera: CameraModel, T: Float) -> bool:
-    """Return whether the whole board is in a camera's picture.
-
-    With half a square around the corners.
-    """
+    """Whether the board and half a square around it are in a camera's picture."""
     rim = (
         np.array([[-1, -1, 0], [BOARD.columns, -1, 0], [BOARD.columns, BOARD.rows, 0], [-1, BOARD.rows, 0]])
         * BOARD.square_m
@@ -269,10 +232,7 @@ def _sees(camera: CameraModel, T: Float) -> bool:
 
 
 def _between(now: Float, then: Float, share: float) -> Float:
-    """Interpolate between two poses.
-
-    Smooth start and end, about one axis.
-    """
+    """Interpolate between two poses about one axis, with smooth start and end."""
     s = share * share * (3.0 - 2.0 * share)
     rotation = np.asarray(cv2.Rodrigues(then[:3, :3] @ now[:3, :3].T)[0], np.float64)
     T = np.eye(4)

@@ -1,10 +1,8 @@
 """Postures of a hand that pinches, grips a knob or lays its thumb on a key.
 
-Solved on the hand model itself, skin on skin.
-
-What a posture must do is a handful of residuals, each over the width that it may miss by; the angles that meet them
-best and stay nearest to a natural posture are found by damped Gauss-Newton steps with differences for derivatives.
-Some tenths of a second for all of them.
+Solved on the hand model itself, skin on skin. What a posture must do is a handful of residuals, each over the width
+that it may miss by; the angles that meet them best and stay nearest to a natural posture are found by damped
+Gauss-Newton steps with differences for derivatives. Some tenths of a second for all of them.
 """
 
 from collections.abc import Callable
@@ -32,12 +30,9 @@ KNOB_M = (0.020, 0.026)  # radius of knobs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knob:
-    """A grip of a knob.
+    """A grip of a knob: posture (5, 3) [deg], centre [m], axis (3,), palm frame.
 
-    Attributes:
-        posture_deg: (5, 3) of the hand round it.
-        centre_m, axis: (3,) of the knob, palm frame; the axis goes from the back of the hand through the palm.
-        radius_m: Of the knob.
+    The axis goes from the back of the hand through the palm.
     """
 
     posture_deg: Float
@@ -48,10 +43,7 @@ class Knob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Key:
-    """Thumb on a key: finger 1 ... 4, segment 0 ... 2, and the posture (5, 3) [deg].
-
-    Segments are counted from the knuckle.
-    """
+    """Thumb on finger 1 ... 4, segment 0 ... 2 from the knuckle, posture (5, 3)."""
 
     finger: int
     segment: int
@@ -60,13 +52,9 @@ class Key:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """Candidate postures as geometry, palm frame.
+    """Candidate postures (N, 5, 3) [deg] as geometry, palm frame.
 
-    Attributes:
-        posture_deg: (N, 5, 3).
-        joints_m: (N, 26, 3) [m].
-        rotation: (N, 26, 3, 3).
-        capsules: (N, 5, 3) segments.
+    Joints (N, 26, 3) [m], their rotations (N, 26, 3, 3), capsules (N, 5, 3) of the segments.
     """
 
     posture_deg: Float
@@ -82,18 +70,12 @@ class Posed:
         return cls(posture_deg, found.position_m, found.rotation, capsules)
 
     def palmar(self, finger: int, segment: int) -> Float:
-        """Return unit vectors (N, 3) out of the palmar side of a segment.
-
-        They are -y of the joint it begins at.
-        """
+        """Unit vectors (N, 3) out of a segment's palmar side: -y of its first joint."""
         return -self.rotation[:, CHAINS[finger, segment], :, 1]
 
 
 def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
-    """Return the posture (5, 3) [deg] in which thumb and finger 1 ... 4 pinch.
-
-    Their pads meet, the other fingers are well away.
-    """
+    """Posture (5, 3) [deg] in which the pads of thumb and finger 1 ... 4 meet."""
     start = np.array(POSES["pinch"], dtype=np.float64)
     start[1:, 1:] = (12.0, 18.0)
     start[finger, 1:] = (46.0, 44.0)
@@ -116,9 +98,8 @@ def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
 def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> Float:
     """Return the posture (5, 3) [deg] in which the thumb's tip lies on a key.
 
-    Segment 0 ... 2, from the knuckle, of finger 1 ... 4.
-
-    All fingers bend alike, as far as the thumb needs to reach the key, and that finger a little on its own.
+    Segment 0 ... 2, from the knuckle, of finger 1 ... 4. All fingers bend alike, as far as the thumb needs to
+    reach the key, and that finger a little on its own.
     """
     mine = slice(3 * (finger - 1), 3 * finger)
 
@@ -156,10 +137,7 @@ def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> F
 
 
 def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
-    """Return the posture (5, 3) [deg] of a thumb retracted from a key.
-
-    Straight off the skin.
-    """
+    """Posture (5, 3) [deg] of a thumb retracted from a key, straight off the skin."""
     there = Posed.of(model, key.posture_deg[None], wobble)
     hover_m = 0.020
     target = there.joints_m[0, TIPS[0]] + hover_m * there.palmar(key.finger, key.segment)[0]
@@ -171,10 +149,7 @@ def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
 
 
 def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
-    """Return the posture (5, 3) [deg] of the same fingers with the thumb aside.
-
-    The thumb is out of the way, and touches no finger on its way.
-    """
+    """Posture (5, 3) [deg] with the thumb aside, from where it touches no finger."""
     aside = [(across, bend, 6.0) for across in (0.0, 15.0, 30.0, 45.0) for bend in (-10.0, 5.0, 20.0)]
     share = np.linspace(0.0, 1.0, 9)[:, None]
     ways = np.tile(hover_deg, (len(aside), len(share), 1, 1))
@@ -208,10 +183,7 @@ def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
 
 
 def _middle_and_axis(tips_m: Float) -> tuple[Float, Float]:
-    """Return the middle (N, 3) between the finger tips, and their plane's normal.
-
-    Between the tip of the thumb and those of the fingers (N, 5, 3).
-    """
+    """Middle (N, 3) between thumb tip and finger tips (N, 5, 3), normal of the tips."""
     middle = 0.5 * tips_m[:, 0] + 0.5 * tips_m[:, 1:].mean(axis=1)
     across = tips_m[:, 0] - middle
     along = tips_m[:, 1] - tips_m[:, 4]
@@ -228,10 +200,7 @@ def _solved(
     misses: Callable[[Posed], Float],
     wobble: Float,
 ) -> tuple[Float, float]:
-    """Solve for the posture (5, 3) [deg] with the least residual and deviation.
-
-    The deviation is relative to the widths, in the free angles. Also returns the squared residual.
-    """
+    """Posture (5, 3) [deg] of least residual and deviation over width, and its cost."""
 
     def residuals(x: Float) -> Float:
         posture = np.tile(start_deg.ravel(), (len(x), 1))
@@ -243,9 +212,7 @@ def _solved(
     nudge_deg = 0.25
     steps = np.concatenate([np.zeros((1, len(free))), nudge_deg * np.eye(len(free))])
     here = residuals(x + steps)
-    # damping
     best_x, best, damping = x, float(here[0] @ here[0]), 0.05
-    # steps
     for _ in range(24):
         jacobian = (here[1:] - here[0]) / nudge_deg
         square = jacobian @ jacobian.T

@@ -1,18 +1,15 @@
 """Simulated hand that pinches, turns knobs, taps its keys and points.
 
-It moves freely between; the true gestures are known.
-
 In 75 s two rounds of everything, in an order, at a pace, in places and with knobs that are drawn from the seed: each
 finger is pinched, a knob is turned to and fro, another is turned farther than a hand turns at once and gripped again,
 keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and signals
 nothing.
 
-What the cameras see of it changes as it does in use: in each round every act is shown another way (`_SHOWN_DEG`).
-Knobs, keys and pinches are seen more or less from the palm's side, for they hide tips of a hand that is seen from
-behind; who points has the back of his hand up, the finger towards the cameras or past them.
+In each round every act is shown another way (`_SHOWN_DEG`). Knobs, keys and pinches are seen more or less from the
+palm's side, for they hide tips of a hand that is seen from behind; who points has the back of his hand up.
 
-Skin meets skin: postures are found on the hand itself (`gesture_postures`). A hand that touches or grips stands still
-but for what it does, else it wanders as hands do. While a knob is turned the palm goes round its axis.
+Skin meets skin (`gesture_postures`). A hand that touches or grips stands still but for what it does, else it wanders
+as hands do. While a knob is turned the palm goes round its axis.
 """
 
 from collections.abc import Callable
@@ -53,12 +50,7 @@ _LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """Annotation of one gesture of the hand.
-
-    Attributes:
-        kind, name: As of a Gesture message.
-        start_s, stop_s: The hand begins to do it, and has done it [s].
-    """
+    """One gesture of the hand: kind and name of its message, begin and end [s]."""
 
     kind: GestureKind
     name: str
@@ -67,10 +59,7 @@ class Annotation:
 
 
 class Track:
-    """Values that change smoothly (C2) from one to the next, and rest between.
-
-    It holds them.
-    """
+    """Values that change smoothly (C2) from one to the next, and rest between."""
 
     def __init__(self, first: Float) -> None:
         self._start, self._stop, self._value = [-1.0], [0.0], [np.asarray(first, dtype=np.float64)]
@@ -98,22 +87,12 @@ class Track:
 
 
 class Gestures:
-    """One minute of gestures.
+    """One round of gestures: its script and, in order, its annotations."""
 
-    The state it holds is its script, fixed by the constructor.
-
-    Attributes:
-        annotations: All gestures of the hand, in order.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Write the script, and find its postures (about half a second).
-
-        Args:
-            model: Whose limits and coupling hold.
-            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
-            seed: Same seed, same motion.
-        """
+        """Write the script of a hand whose open middle is at (3,) [m], rig frame."""
         rng = np.random.default_rng([seed, 37])
         self._model, self._centre, self._rng = model, np.asarray(centre_m, dtype=np.float64), rng
         self._drift, self._sway = Drift(rng, PERIOD_S), Waves(rng, 2, PERIOD_S)
@@ -125,9 +104,8 @@ class Gestures:
             Track(np.zeros(1)),
             Track(np.zeros(1)),
         )
-        self._ways = np.random.default_rng(
-            [seed, 41]
-        )  # of its own, so that what the fingers do stays as it is
+        # of its own, so that what the fingers do stays as it is
+        self._ways = np.random.default_rng([seed, 41])
         self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
         self._knobs: list[tuple[float, Knob]] = []
         self._keys = reachable_keys(model, self._own)
@@ -140,16 +118,8 @@ class Gestures:
             )
         self._finish()
 
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
-
     def dial_rad(self, t_s: float) -> float:
-        """Return by how much knobs have been turned up to a time [s].
-
-        Clockwise as seen from the back of the hand.
-        """
+        """Turn of all knobs until a time [s], clockwise from the back of the hand."""
         return float(self._knob_angle.at(max(t_s, 0.0) % PERIOD_S)[0])
 
     def at(self, t_s: float) -> HandState:
@@ -281,10 +251,7 @@ class Gestures:
         self._now += rest_s
 
     def _taps(self) -> None:
-        """Add taps on some keys, one after another.
-
-        The thumb comes and goes over the key that is nearest to it, touching none.
-        """
+        """Tap some keys; the thumb comes and goes over the nearest, touching none."""
         door = hover_posture(self._model, self._keys[0], self._own)
         aside = pad_before(self._model, door, self._own)
         self._go(aside, 0.5, 0.2, 1.0)

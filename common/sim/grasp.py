@@ -1,24 +1,16 @@
 """A simulated hand closes round a bar, lifts it, rotates it, puts it back.
 
-Close a hand round a bar: the bar's place and the angles of each finger.
-
 The bar lies in the hooked fingers, across the hand and a little aslant, as that of a bucket or a drawer. Index to
 little finger close as fingers do, the knuckle by a fixed share of the middle joint, until the first of their bones
 meets the bar; the thumb closes over it from the other side, its tip across the palm. Bones are round cones with the
 radii of the profile.
 
-Simulated hand that grasps a bar, lifts it, rotates it and puts it back.
-
-Five times a minute.
-
-From rest the hand comes from below with open fingers until the bar lies before them, and closes (`grip`); palm and
+Five times a minute the hand comes from below with open fingers until the bar lies before them, and closes; palm and
 fingers then hide the finger tips from cameras that see the back of the hand. It lifts the bar, turns it briskly in
 the picture and towards the cameras, lowers it to its old place, opens and goes back. Place, pace, turns and postures
-are drawn from the seed. While the bar is held it follows the palm, and before and after it lies still; the hand stands
-still to the bar whenever its skin touches it.
-
-The wrist is a little flexed round the bar, and bends by up to 7 degrees either way about that and by up to 8 to the
-sides while the bar is turned; by 3 either way else.
+are drawn from the seed. While the bar is held it follows the palm, else it lies still; the hand stands still to the
+bar whenever its skin touches it. The wrist is a little flexed round the bar, and bends by up to 7 degrees either way
+about that and by up to 8 to the sides while the bar is turned; by 3 either way else.
 """
 
 from typing import NamedTuple
@@ -50,10 +42,7 @@ _THUMB_DEG = (np.arange(-15.0, 45.1, 5.0), np.arange(-12.5, 45.1, 2.5), np.arang
 
 
 def bar_in_palm(model: HandModel, radius_m: float) -> Float:
-    """Return `T_palm_object` (4, 4) [m] of a bar of that radius in the closed hand.
-
-    The bar's axis is its z.
-    """
+    """Return `T_palm_object` (4, 4) [m] of a bar (axis z) in the closed hand."""
     axis = np.array([model.side_sign * np.cos(ASLANT), 0.0, np.sin(ASLANT)])
     rotation = np.stack([np.cross([0.0, 1.0, 0.0], axis), [0.0, 1.0, 0.0], axis], axis=1)
     _, y, z = model.rest_position_m[MIDDLE_PROXIMAL].tolist()
@@ -64,10 +53,7 @@ def bar_in_palm(model: HandModel, radius_m: float) -> Float:
 
 
 def gaps_m(model: HandModel, angles_rad: Float, T_palm_object: Float, radius_m: float) -> Float:
-    """Return the gap (..., 5, 3) [m] between each phalanx's skin and a long bar.
-
-    At angles (..., 5, 4); negative: inside.
-    """
+    """Gap (..., 5, 3) [m] between each phalanx and a long bar; negative: inside."""
     bones, girth = _phalanges(model, angles_rad)
     return _clear_of(bones, girth, T_palm_object, radius_m).min(axis=-1)
 
@@ -78,9 +64,7 @@ def closed_round(
     """Posture (5, 3) [deg] in which all fingers touch the bar.
 
     Args:
-        model: The hand.
         T_palm_object: (4, 4) where the bar lies [m].
-        radius_m: Its radius.
         wobble: (5, 4) that `angles_of` is given with this posture.
         mcp_per_pip: (4,) by how much the knuckles flex as index to little finger close.
     """
@@ -103,17 +87,13 @@ def closed_round(
 def _thumb(
     model: HandModel, fingers_deg: Float, T_palm_object: Float, radius_m: float, wobble: Float
 ) -> Float:
-    """Return the thumb's posture (3,) [deg] in which it touches the bar.
-
-    It lies on the fingers at most, its tip below the palm.
-    """
+    """Thumb's posture (3,) [deg]: touches the bar, tip below the palm."""
     grid = np.stack(np.meshgrid(*_THUMB_DEG, indexing="ij"), axis=-1).reshape(-1, 3)
     posture = np.tile(fingers_deg, (len(grid), 1, 1))
     posture[:, 0] = grid
     angles = angles_of(model, posture, wobble)
     bones, girth = _phalanges(model, angles)
     to_bar = _clear_of(bones[:, 0], girth[:, 0], T_palm_object, radius_m).min(axis=(-1, -2))
-    # near
     near = np.argsort(np.abs(to_bar))[:200]
     own, own_girth = (
         bones[near, 0, 1:].reshape(len(near), -1, 1, 3),
@@ -128,26 +108,12 @@ def _thumb(
 
 
 def _phalanges(model: HandModel, angles_rad: Float) -> tuple[Float, Float]:
-    """Return points (..., 5, 3, n, 3) [m] along the phalanges, and their radii.
-
-    Palm frame; the fingers' radius there is (..., 5, 3, n).
-    """
+    """Points (..., 5, 3, n, 3) [m] along the phalanges, palm frame, and their radii."""
     joints = model.chains(angles_rad).position_m
-    radius = np.broadcast_to(model.radius_m[CHAINS], joints.shape[:-1])
-    return _thick(
-        np.stack([joints[..., :-1, :], joints[..., 1:, :]], axis=-2),
-        np.stack([radius[..., :-1], radius[..., 1:]], axis=-1),
-    )
-
-
-def _thick(ends: Float, radius_m: Float) -> tuple[Float, Float]:
-    """Return points (..., n, 3) along bones and their radii (..., n).
-
-    Bones have ends (..., 2, 3); the radii follow from those at the ends (..., 2).
-    """
+    radius = np.broadcast_to(model.radius_m[CHAINS], joints.shape[:-1])[..., None]
     along = _ALONG[:, None]
-    points = (1.0 - along) * ends[..., :1, :] + along * ends[..., 1:, :]
-    return points, (1.0 - _ALONG) * radius_m[..., :1] + _ALONG * radius_m[..., 1:]
+    points = (1.0 - along) * joints[..., :-1, None, :] + along * joints[..., 1:, None, :]
+    return points, (1.0 - _ALONG) * radius[..., :-1, :] + _ALONG * radius[..., 1:, :]
 
 
 def _clear_of(points: Float, girth: Float, T_palm_object: Float, radius_m: float) -> Float:
@@ -163,9 +129,8 @@ ROUND_S = PERIOD_S / ROUNDS
 
 
 class GraspTiming(NamedTuple):
-    """Times [s] within one round of grasping."""
+    """Times [s] since the beginning of a round of grasping, before its pace."""
 
-    # Seconds since the beginning of a round, before its pace.
     leave_s: float = 0.8
     arrive_s: float = 2.4
     closed_s: float = 3.3
@@ -182,33 +147,19 @@ PACE = (0.92, 1.0)
 LIFT_M = (0.08, 0.12)
 PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
 COMES_M = np.array([0.015, 0.0, -0.13])  # from there, palm axes
-LEAN_DEG = np.array(
-    [-26.0, -10.0, 0.0]
-)  # of the whole hand: fingers and thumb a little away from the cameras
+# of the whole hand: fingers and thumb a little away from the cameras
+LEAN_DEG = np.array([-26.0, -10.0, 0.0])
 SWAY_DEG, SWING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
 _OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
 
 class Grasp:
-    """Five grasps in 60 s.
+    """Five grasps in 60 s; `pace` (ROUNDS,) multiplies the times of each."""
 
-    The state it holds is its script, fixed by the constructor.
-
-    Attributes:
-        pace: (ROUNDS,) by what the times of each round are multiplied.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = 0.012) -> None:
-        """Write the script, and close the hand round the bar once.
-
-        Takes some tenths of a second.
-
-        Args:
-            model: Whose limits and coupling hold.
-            centre_m: Place (3,) of the middle of the scene, rig frame [m].
-            seed: Same seed, same motion.
-            radius_m: Of the bar.
-        """
+        """Write the script about (3,) [m], rig frame, and close the hand (some 0.1 s)."""
         rng = np.random.default_rng([seed, 17])
         self._model, self._radius_m = model, radius_m
         self._drift, self._sway = Drift(rng), Waves(rng, 2)
@@ -230,16 +181,8 @@ class Grasp:
         self._grip = closed_round(model, self._T_palm_object, radius_m, self._grip_wobble, mcp_per_pip)
         self._T_grip = base_pose(model, self._centre, np.zeros(3), self._lean)
 
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
-
     def round_at(self, t_s: float) -> tuple[int, float]:
-        """Return the round at `t_s` [s], and the time within it.
-
-        The time is in seconds of a round at full length.
-        """
+        """Return the round at `t_s` [s], and the time in it [s] at a round's full length."""
         t = max(t_s, 0.0) % PERIOD_S
         k = min(int(t / ROUND_S), ROUNDS - 1)
         return k, (t - k * ROUND_S) / float(self.pace[k])
@@ -275,10 +218,7 @@ class Grasp:
         return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, bar_length_m, held),))
 
     def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:
-        """Return the palm rotation (3,) [rad] and wrist flexion (2,) [deg] of a round.
-
-        Of round `k`; the rotation is about the rig's axes.
-        """
+        """Palm rotation (3,) [rad], rig axes, and wrist flexion (2,) [deg] of round `k`."""
         rotation, swing = np.zeros(3), np.zeros(2)
         for place in (0, 1):
             rotation_s, rotation_fade_s = 1.7, 0.3

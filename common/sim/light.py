@@ -1,30 +1,16 @@
 """Light gives a simulated scene its illuminant, colours, desk and noise.
 
-Colours of the simulated scene.
-
-Reflectances, light, and the step between linear light and sRGB bytes.
-
 Marker reflectances are those of the rendered recordings (truth_meta.json, paint_reflectance_linear_srgb), so that
-colours learnt here and there agree.
-
-Changing illumination and its effect on the picture.
-
-A lamp of another colour temperature, or another exposure.
+colours learnt here and there agree. The desk of a camera and the tiles of noise are made once: cameras do not move.
 
 The camera's white balance is fixed, set under the light that the colours were calibrated in. Another light multiplies
 every channel in linear light (von Kries' law of coefficients, with the channels of linear sRGB as receptors):
 
     gain = exposure * white(kelvin) / white(calibrated kelvin)
 
-where `white` is the linear sRGB colour of a Planckian radiator of luminance 1, its chromaticity from the cubic splines
-of Kang et al. 2002 (J. Korean Phys. Soc. 41, 865), 1667-25000 K. Equal luminance: exposure is the only change of
-brightness.
-
-Image background and sensor noise.
-
-The desk as one camera sees it behind the hand, and tiles of noise.
-
-Both are made once and only copied afterwards: cameras do not move.
+where `white` is the linear sRGB colour of a Planckian radiator of luminance 1, its chromaticity from the cubic
+splines of Kang et al. 2002 (J. Korean Phys. Soc. 41, 865), 1667-25000 K. Equal luminance: exposure is the only change
+of brightness.
 """
 
 from dataclasses import dataclass
@@ -75,10 +61,7 @@ _ENCODE_STEPS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SrgbTables:
-    """sRGB curve as lookup tables.
-
-    byte -> linear 0..1 (256,), and 4096 linear steps -> byte.
-    """
+    """sRGB curve: byte -> linear 0..1 (256,), and 4096 linear steps -> byte."""
 
     linear: Float32
     byte: Image
@@ -109,10 +92,7 @@ def bgr_bytes(linear_rgb: Float) -> tuple[int, int, int]:
 
 
 def shades(linear_rgb: tuple[float, float, float], gloss: float = 0.0) -> tuple[tuple[int, int, int], ...]:
-    """Return the colours (BGR bytes) of the layers of a Lambert surface.
-
-    Its brightest layer has `gloss` of white.
-    """
+    """Colours (BGR bytes) of a Lambert surface's layers; `gloss` whitens the last."""
     albedo = np.array(linear_rgb)
     light = AMBIENT + (1.0 - AMBIENT) * _LAYER_MEAN_COSINE
     whiteness = np.array([0.0, 0.1, 0.45, 1.0]) * gloss
@@ -120,10 +100,7 @@ def shades(linear_rgb: tuple[float, float, float], gloss: float = 0.0) -> tuple[
 
 
 def face_shade(linear_rgb: tuple[float, float, float], cosine: float) -> tuple[int, int, int]:
-    """Return the colour (BGR bytes) of a flat Lambert face.
-
-    Its normal has this cosine to the light.
-    """
+    """Colour (BGR bytes) of a flat Lambert face at this cosine to the light."""
     return bgr_bytes((AMBIENT + (1.0 - AMBIENT) * max(cosine, 0.0)) * np.array(linear_rgb))
 
 
@@ -189,18 +166,13 @@ def white(kelvin: float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One light: its colour temperature [K], and the brightness of the picture.
-
-    The brightness is relative to calibration.
-    """
+    """Colour temperature [K], and brightness of the picture against calibration."""
 
     kelvin: float = CALIBRATED_KELVIN
     exposure: float = 1.0
 
     def gains_bgr(self, calibrated_kelvin: float = CALIBRATED_KELVIN) -> Float:
-        """Return the factors (3,) of the channels in linear light, blue first.
-
-        Relative to the calibrated light.
+        """Factors (3,) of the channels in linear light against calibration, blue first.
 
         Raises:
             PhalanxError: A temperature outside 1667-25000 K.
@@ -212,9 +184,8 @@ class Light:
 class LightSchedule:
     """Schedule of a scene's light: knots (time [s], kelvin, exposure).
 
-    Straight lines between the knots.
-
-    Two knots at one time are a jump. Before the first knot and after the last nothing changes.
+    Straight lines between knots; two at one time are a jump. Before the first and after the last nothing
+    changes.
 
     Attributes:
         knots: In order of time.
@@ -280,10 +251,7 @@ LENS_SIGMA_PX = 0.62
 
 
 def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
-    """Return the image (H, W, 3) BGR of a worn dark grey desk.
-
-    At rig depth `depth_m` [m], fixed in the rig frame.
-    """
+    """Image (H, W, 3) BGR of a worn dark grey desk at `depth_m` [m], rig frame."""
     height, width = optics.height_px, optics.width_px
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
@@ -302,9 +270,7 @@ def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
 
 
 def _wear(seed: int) -> npt.NDArray[np.float32]:
-    """Return the relative brightness (SIDE, SIDE, 3) of wear, about 1.
-
-    Blotches, grain and brushed streaks.
+    """Relative brightness (SIDE, SIDE, 3) of wear: blotches, grain, brushed streaks.
 
     Single precision and one plane for what has no colour: a slave that starts again waits for this.
     """
@@ -326,10 +292,7 @@ def _wear(seed: int) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseTiles:
-    """Sensor noise, drawn once.
-
-    What to add and what to subtract (2 x H + margin, W + margin, 3).
-    """
+    """Sensor noise, drawn once: tiles (H + margin, W + margin, 3), plus and minus."""
 
     plus: tuple[Image, ...]
     minus: tuple[Image, ...]

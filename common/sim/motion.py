@@ -1,23 +1,13 @@
 """Seeded motions move a simulated hand, its fingers and what it holds.
 
-Things that a simulated hand holds: what they are and where at a time.
+Pure functions of time. A motion is a sum: a resting posture with slow natural drift is always there; on top of it
+acts come and go, each faded in and out by a smooth window (C2), so that the whole is smooth for every t, and closed
+over its period. Finger targets are whole postures in degrees; DIP angles follow the hand's coupling only nearly, as
+real ones do, so that a solver's prior is never exactly true.
 
-Seeded hand motions: hand pose and finger flexion.
-
-A pure function of time.
-
-A motion is a sum. A resting posture with slow natural drift is always there; on top of it acts come and go, each
-faded in and out by a smooth window (C2), so that the whole is smooth for every t, and closed over its period.
-Finger targets are given as whole postures in degrees; DIP angles follow the hand's coupling only nearly, as real
-ones do, so that a solver's prior is never exactly true.
-
-Six poses of the Digits study in sequence, with the palm rotated every way.
-
-Occlusion is measured on them.
-
-Open palm, counting two, pointing, small grasp, large grasp and pinch (Kim et al., "Digits", UIST 2012, poses A-F) in
-a new order each round; each is held for a while, in a place and with a turn of the palm of its own, with slow drift
-all the time. From one to the next the hand goes smoothly (C2), and from the last back to the first.
+`StudyPoses` (occlusion is measured on it): open palm, counting two, pointing, small grasp, large grasp and pinch (Kim
+et al., "Digits", UIST 2012, poses A-F) in a new order each round, each held in a place and with a turn of the palm of
+its own.
 """
 
 from collections.abc import Callable
@@ -35,16 +25,7 @@ from common.hand.wrist import STRAIGHT
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cylinder:
-    """Matt dark cylinder, closed at both ends.
-
-    Its axis is its own z, its origin the middle.
-
-    Attributes:
-        T_rig_object: (4, 4) [m].
-        radius_m: Its radius.
-        length_m: From end to end.
-        held: Whether the hand carries it.
-    """
+    """Matt dark cylinder about its own z, origin in the middle; `held`: by the hand."""
 
     T_rig_object: Float
     radius_m: float
@@ -84,7 +65,8 @@ class HandState:
         angles_rad: (5, 4) [rad].
         wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.hand.wrist`).
         things: What stands about, or is held.
-        objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's order.
+        objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's
+            order.
     """
 
     T_rig_palm: Float
@@ -103,19 +85,13 @@ class HandMotion(Protocol):
         ...
 
     def at(self, t_s: float) -> HandState:
-        """Return the hand at time `t_s` [s].
-
-        Before 0 the pose of 0, after the period from the beginning.
-        """
+        """Return the hand at time `t_s` [s]: before 0 the pose of 0, periodic."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """Change that one act adds to the rest state.
-
-    Posture change (5, 3) [deg], shift (3,) [m], rotation (3,) [rad], rig axes.
-    """
+    """What an act adds: posture (5, 3) [deg], shift (3,) [m], rotation (3,) [rad]."""
 
     posture: Float
     shift: Float
@@ -124,10 +100,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Act:
-    """One act on the time line.
-
-    `change` takes the seconds since its start, and is faded at both ends.
-    """
+    """One act; `change` takes the seconds since its start, faded at both ends."""
 
     name: str
     start_s: float
@@ -137,10 +110,7 @@ class Act:
 
 
 def smooth_step(x: float) -> float:
-    """Return a smooth step: 0 below 0, 1 above 1, between 6x^5 - 15x^4 + 10x^3.
-
-    First and second derivative vanish at the ends.
-    """
+    """Smooth step (C2): 0 below 0, 1 above 1, between 6x^5 - 15x^4 + 10x^3."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
 
@@ -151,30 +121,18 @@ def window(t_s: float, start_s: float, stop_s: float, fade_s: float) -> float:
 
 
 class ScriptedMotion:
-    """The motion of the standard scene: all acts in each half of its period.
+    """The motion of the standard scene: all acts in each half of its period."""
 
-    The state it holds is its script, fixed by the constructor.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Write the script.
-
-        Args:
-            model: Whose limits and coupling hold.
-            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
-            seed: Same seed, same motion.
-        """
+        """Write the script of a hand whose open middle is at (3,) [m], rig frame."""
         rng = np.random.default_rng(seed)
         self._model = model
         self._centre = np.asarray(centre_m, dtype=np.float64)
         self._rest = np.array(REST, dtype=np.float64)
         self._drift = Drift(rng)
         self.acts = _half(rng, 0.0, 0) + _half(rng, PERIOD_S / 2, 1)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -193,11 +151,10 @@ class ScriptedMotion:
 
 
 def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
-    """Return angles (..., 5, 4) [rad] of postures (..., 5, 3) [deg].
+    """Angles (..., 5, 4) [rad], in the limits, of postures (..., 5, 3) [deg].
 
-    The angles are inside the limits; `wobble` (5, 4) is about -1..1.
-
-    The wobble moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the DIP coupling by up to 12 %.
+    The wobble (5, 4), about -1..1, moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the
+    DIP coupling by up to 12 %.
     """
     angles = np.empty((*posture_deg.shape[:-1], 4))
     angles[..., :3] = posture_deg + _WOBBLE_DEG * wobble[:, :3]
@@ -208,12 +165,10 @@ def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
 
 
 def base_pose(model: HandModel, centre_m: Float, shift_m: Float, rotation_rad: Float) -> Float:
-    """Return `T_rig_palm` (4, 4) of the hand seen from behind its back.
+    """`T_rig_palm` (4, 4) of the hand seen from behind, fingers up in the image.
 
-    Fingers up in the image.
-
-    The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `rotation_rad` (3,) turns the
-    palm about the rig's axes through that middle. Fingers point a little towards the cameras.
+    The flat hand's middle is at `centre_m` + `shift_m`; `rotation_rad` (3,) turns the palm about the rig's
+    axes through that middle. Fingers point a little towards the cameras.
     """
     rotation = np.asarray(cv2.Rodrigues(rotation_rad)[0], np.float64) @ _SEEN_FROM_BEHIND
     middle = 0.5 * float(model.rest_position_m[:, 2].max())
@@ -221,10 +176,7 @@ def base_pose(model: HandModel, centre_m: Float, shift_m: Float, rotation_rad: F
 
 
 class Waves:
-    """Values that wander slowly within -1..1.
-
-    Random Fourier sums, closed over the period.
-    """
+    """Random Fourier sums within -1..1, slow and closed over the period."""
 
     def __init__(self, rng: np.random.Generator, count: int, period_s: float = PERIOD_S) -> None:
         slow, fast = (max(round(rate * period_s / PERIOD_S), 1) for rate in (5, 30))
@@ -329,10 +281,7 @@ def _rotate_about(axes: tuple[int, ...], each_s: float) -> Callable[[float], Cha
 
 
 def _half(rng: np.random.Generator, start_s: float, half: int) -> tuple[Act, ...]:
-    """Return all acts once, within 30 s from `start_s`.
-
-    The halves differ in tempo, order and direction.
-    """
+    """All acts once, in 30 s from `start_s`; tempo, order and direction by half."""
     acts: list[Act] = []
     t = start_s + 0.6
 
@@ -364,22 +313,12 @@ REACH_M = np.array([0.05, 0.03, 0.05])  # half of the box that the palm's middle
 
 
 class StudyPoses:
-    """Six poses, four times in 60 s.
+    """Six poses, four times in 60 s; `order` (ROUNDS * 6,) are their names."""
 
-    The state it holds is its script, fixed by the constructor.
-
-    Attributes:
-        order: (ROUNDS * 6,) names of the poses, station by station.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
-        """Write the script.
-
-        Args:
-            model: Whose limits and coupling hold.
-            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
-            seed: Same seed, same motion.
-        """
+        """Write the script of a hand whose open middle is at (3,) [m], rig frame."""
         rng = np.random.default_rng([seed, 3])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
         self._drift = Drift(rng)
@@ -393,11 +332,6 @@ class StudyPoses:
         # Evenly over the ball: most turns are large ones.
         size = np.radians(ROTATION_DEG) * np.cbrt(rng.uniform(size=(count, 1)))
         self._rotations = size * axis / np.linalg.norm(axis, axis=1, keepdims=True)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""

@@ -1,16 +1,7 @@
 """One image shows tracked objects: outlines, shading, depth, printed tags.
 
-Tracked objects in one image: outlines, shading and depth of each part.
-
-The depth is how far away each part is behind a pixel.
-
-Tracked objects as one camera sees them.
-
-From key points in space to outlines and shading (`objects_seen`).
-
-Printed tags in an image: ink on paper, in linear light, blurred by motion.
-
-The appearance is that over a box of pixels while the tag moves.
+Key points in space (`Points`) become the outlines, shading and depth of each part in one camera's image. A tag is ink
+on paper in linear light, over a box of pixels, blurred by its motion.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,14 +10,13 @@ from functools import cache
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.calibration.object_profile import TagFamily
 from common.geometry.tag_family import tag_image
 from common.geometry.transforms import cross
 from common.sim import light, raster
-from common.sim.light import AMBIENT
+from common.sim.light import AMBIENT, Float32
 from common.sim.raster import Shape
 from common.sim.surface import LAYER_SINES, rim, unit
 from common.sim.tracked import BLOCK_FACES, PAPER_CELLS, Ball, Block, ObjectSurface, Rod, Sheet
@@ -41,8 +31,8 @@ class SeenPart:
     Attributes:
         outline: (N, 2) [px].
         fills: Convex outlines (N, 2) [px] and their colours, in the order of drawing; none for a bead.
-        ends_uv: (2, 2) [px], ends_depth: (2,) [m], ends_speed: (2, 2) [px/s] of its two ends; of what has none, its
-            middle twice.
+        ends_uv: (2, 2) [px], ends_depth: (2,) [m], ends_speed: (2, 2) [px/s] of its two ends; of what has
+            none, its middle twice.
     """
 
     outline: Float
@@ -67,9 +57,7 @@ class SeenBead:
     """A painted ball in one image.
 
     Attributes:
-        bead: Which.
         at: (3,) its middle [m], camera frame.
-        part: Its outline.
         bands: (LAYERS, N, 2) [px] its outline, then the parts on which the light falls more and more steeply.
         shine_uv: (2,) [px] where the marker mirrors the lamp; shine_px: radius of that spot.
         t_s: The moment of its row [s], scene time.
@@ -99,9 +87,9 @@ class SeenSheet:
     """A tag in one image.
 
     Attributes:
-        sheet: Which.
         at: (3,) its middle [m], camera frame.
-        paper_uv, square_uv: (4, 2) [px] corners of its paper and of its black square, each at the moment of its row.
+        paper_uv, square_uv: (4, 2) [px] corners of its paper and of its black square, each at the moment of
+            its row.
         speed: (2,) [px/s].
         shows: Whether its front is turned to the camera.
         lit: Cosine of its front to the light.
@@ -130,10 +118,9 @@ class SeenSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenObjects:
-    """All tracked objects in one image.
+    """All tracked objects in one image, in the order of `ObjectSurface`.
 
     Attributes:
-        parts, beads, sheets: In the order of `ObjectSurface`.
         solid: The parts, and those of the beads: whatever may hide something. S of them.
         low, high: (S, 2) [px] boxes about their outlines.
         ends_uv, ends_depth: (S, 2, 2) [px], (S, 2) [m] as theirs.
@@ -166,11 +153,9 @@ class SeenObjects:
         )
 
     def before(self, uv: Float, depth_m: float, low: Float, high: Float) -> list[SeenPart]:
-        """Return the parts that pass in front of a pixel and reach into a box.
+        """Parts nearer than a depth [m] at pixel (2,) that reach into a box (2,) [px].
 
-        Parts nearer than a depth at pixel (2,); box `low`, `high` (2,) [px].
-
-        Its depth is that of its axis where that passes nearest to the pixel.
+        The depth of a part is that of its axis where that passes nearest to the pixel.
         """
         if not self.solid:
             return []
@@ -204,10 +189,7 @@ Project = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Key points of the objects at their times.
-
-    (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s].
-    """
+    """Key points: (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s]."""
 
     at: Float
     uv: Float
@@ -217,17 +199,17 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearances:
-    """Viewing parameters of one camera.
-
-    Direction towards the light (3,), camera frame; `unit_circle`; points (..., 3) [m] to pixels.
-    """
+    """Viewing parameters of one camera: light (3,), camera frame, focal length [px]."""
 
     to_light: Float
     circle: Float
     focal_px: float
     project: Project
     thing: tuple[Colour, ...] = field(default_factory=lambda: light.shades(light.THING_LINEAR_RGB))
-    faces: tuple[Colour, ...] = field(default_factory=lambda: _faces())
+    faces: tuple[Colour, ...] = field(
+        # by the cosine to the light, from 0 to 1
+        default_factory=lambda: tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))
+    )
 
     def seen(self, surface: ObjectSurface, points: Points) -> SeenObjects:
         """What a camera sees of the objects whose key points are there."""
@@ -236,14 +218,17 @@ class Appearances:
         rods = [part for part in surface.parts if isinstance(part, Rod)]
         balls = [*(part for part in surface.parts if isinstance(part, Ball)), *surface.beads]
         rod_rims, (edges, lit, shine) = self._rims(rods, points), self._ball_points(balls, points)
-        uv = self._project_all((rod_rims, edges, lit, shine))
+        uv = project_all(self.project, (rod_rims, edges, lit, shine))
         round_parts: dict[int, SeenPart] = {}
         for k, rod in enumerate(rods):
             round_parts[id(rod)] = self._rod(rod, uv[0][k], points)
         bands = self._bands(balls, uv[1], uv[2], points)
         for k, ball in enumerate(balls):
             fills = () if ball.marker is not None else tuple(zip(bands[k], self.thing, strict=True))
-            round_parts[id(ball)] = _whole(ball.middle.start, uv[1][k], fills, points)
+            place = [ball.middle.start] * 2  # it has no ends, its middle stands for both
+            round_parts[id(ball)] = SeenPart(
+                uv[1][k], fills, points.uv[place], points.at[place, 2], points.speed_uv[place]
+            )
         parts = [
             self._block(part, points) if isinstance(part, Block) else round_parts[id(part)]
             for part in surface.parts
@@ -264,10 +249,7 @@ class Appearances:
         return SeenObjects.of(parts, beads, [self._sheet(sheet, points) for sheet in surface.sheets])
 
     def _rims(self, rods: Sequence[Rod], points: Points) -> Float:
-        """Return the shading edges of all rods at their ends.
-
-        Shape (R, 2, LAYERS, n, 3) [m]; see `things.tube_rims`.
-        """
+        """Shading edges (R, 2, LAYERS, n, 3) [m] of rods; see `surface.tube_rims`."""
         ends = np.array([points.at[rod.ends] for rod in rods]).reshape(-1, 2, 3)
         radius = np.array([rod.radius_m for rod in rods])
         axis = unit(ends[:, 1] - ends[:, 0])
@@ -278,11 +260,7 @@ class Appearances:
         return ends[:, :, None, None] + rims[:, None]
 
     def _ball_points(self, balls: Sequence[Ball], points: Points) -> tuple[Float, Float, Float]:
-        """Return the edges, shading centres and lamp reflections of balls.
-
-        Edges (B, n, 3) [m] of the balls, centres (B, LAYERS, 3) of their shading, points (B, 3) where they mirror the
-        lamp.
-        """
+        """Edges (B, n, 3) [m], shading centres (B, LAYERS, 3), lamp's mirror (B, 3)."""
         middle = np.array([points.at[ball.middle][0] for ball in balls]).reshape(-1, 3)
         radius = np.array([ball.radius_m for ball in balls])
         d2 = (middle * middle).sum(axis=1)
@@ -343,27 +321,14 @@ class Appearances:
             float(points.t_s[sheet.corners].mean()),
         )
 
-    def _project_all(self, parts: tuple[Float, ...]) -> list[Float]:
-        """Project arrays of points (..., 3) in one call."""
-        uv = self.project(np.concatenate([part.reshape(-1, 3) for part in parts]))
-        ends = np.cumsum([part.size // 3 for part in parts])[:-1]
-        return [
-            flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)
-        ]
+
+def project_all(project: Project, parts: tuple[Float, ...]) -> list[Float]:
+    """Project arrays of points (..., 3) in one call."""
+    uv = project(np.concatenate([part.reshape(-1, 3) for part in parts]))
+    ends = np.cumsum([part.size // 3 for part in parts])[:-1]
+    return [flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)]
 
 
-def _whole(point: int, outline: Float, fills: tuple[tuple[Float, Colour], ...], points: Points) -> SeenPart:
-    """A ball: it has no ends, its middle stands for both."""
-    place = [point, point]
-    return SeenPart(outline, fills, points.uv[place], points.at[place, 2], points.speed_uv[place])
-
-
-def _faces() -> tuple[Colour, ...]:
-    """Colours of dark faces by the cosine to the light, from 0 to 1."""
-    return tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))
-
-
-Float32 = npt.NDArray[np.float32]
 INK, PAPER = 0.035, 0.72  # reflectance of toner and of office paper
 PAPER_BGR = np.array([0.97, 1.0, 1.0])
 TEXELS = 8  # of a cell, when the tag is near
@@ -379,14 +344,11 @@ def printed(family: TagFamily, number: int) -> Image:
 
 
 def sheet_appearance(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int, int]) -> Float32:
-    """Return the linear light of a tag over a box of pixels, as if it filled it.
-
-    Shape (h, w, 3), blue first; box x0, y0, x1, y1.
+    """Linear light (h, w, 3), blue first, of a tag as if it filled a box of pixels.
 
     Args:
-        seen: The tag.
         moments_s: Moments (n,) of the exposure, relative to its middle [s].
-        box: The pixels.
+        box: x0, y0, x1, y1.
     """
     x0, y0, x1, y1 = box
     texture = printed(seen.sheet.family, seen.sheet.number)

@@ -1,16 +1,7 @@
 """Painters draw markers, beads and tags and record their ground truth.
 
-Beads and tags of tracked objects: image coverage, appearance and ground truth.
-
-As with a hand's markers (`painter`), everything nearer is cut out of the coverage, and the same coverage blends the
-marker colour into the image.
-
-Markers: pixel coverage, marker colour in linear light and ground truth.
-
-The ground truth is what a camera sees of each marker.
-
-Coverage is measured with everything nearer cut out, and the same coverage blends the marker colour into the image, so
-image and truth come from one drawing.
+Pixel coverage is measured with everything nearer cut out, and the same coverage blends the marker's colour into the
+image in linear light, so image and truth come from one drawing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,19 +10,17 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.geometry.transforms import cross
 from common.sim import light, raster
-from common.sim.light import LENS_SIGMA_PX
+from common.sim.light import LENS_SIGMA_PX, Float32
 from common.sim.objects_seen import SeenBead, SeenPart, SeenSheet, sheet_appearance
 from common.sim.raster import Coverage, Shape
 from common.sim.surface import unit
 from common.sim.view import NO_PHALANX, REACH_PX, Places, Snapshot, View, hand_before, things_before
 
-Float32 = npt.NDArray[np.float32]
-Box = tuple[int, int, int, int]
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1 [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,9 +30,10 @@ class ObjectView:
     Features as `TrackedObjects.features`.
 
     Attributes:
-        visible: (F,) visible share of the outline of each bead and of the paper of each tag, which is 0 from behind.
-        corners_uv: (tags, 4, 2) [px] corners of the black squares, hidden or not, each where it is when its own row is
-            exposed, as `tag_corners` has them; NaN from behind.
+        visible: (F,) visible share of the outline of each bead and of the paper of each tag, which is 0 from
+            behind.
+        corners_uv: (tags, 4, 2) [px] corners of the black squares, hidden or not, each where it is when its
+            own row is exposed, as `tag_corners` has them; NaN from behind.
         t_s: (F,) scene time [s] at which the row of each is at mid-exposure.
     """
 
@@ -61,17 +51,10 @@ class PaintedFeature:
 
 
 class ObjectPainter:
-    """Renderer of the beads and tags of one view.
-
-    It holds prepared colours; every call is pure.
-    """
+    """Renderer of the beads and tags of one view; every call is pure."""
 
     def __init__(self, view: View, tables: light.SrgbTables) -> None:
-        """Prepare colours.
-
-        Raises:
-            CalibrationError: A bead's marker has no colour.
-        """
+        """Prepare colours; CalibrationError: a bead's marker has none."""
         self._view, self._tables = view, tables
         self._size = (view.optics.width_px, view.optics.height_px)
         names = view.scene.rig.markers
@@ -92,7 +75,6 @@ class ObjectPainter:
         """Every bead and every tag that shows its front, everything nearer cut out.
 
         Args:
-            snapshot: The image.
             cards: Occluders before all else.
             hand: Outlines of the hand's markers and their depths [m].
         """
@@ -130,10 +112,7 @@ class ObjectPainter:
         return [PaintedFeature(feature, cover) for (feature, _), cover in zip(features, covers, strict=True)]
 
     def appearance(self, item: PaintedFeature, box: Box) -> Float32:
-        """Return the linear light of the item's surface over a box of pixels.
-
-        Shape (h, w, 3), over pixels x0, y0, x1, y1, as if the surface filled them.
-        """
+        """Linear light (h, w, 3) as if the item's surface filled pixels x0, y0, x1, y1."""
         if isinstance(item.feature, SeenSheet):
             return sheet_appearance(
                 item.feature, raster.moments(item.feature.shape, self._view.exposure_s), box
@@ -192,10 +171,7 @@ class MarkerView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painted:
-    """One marker of the hand in one frame: what it covers and the time of its row.
-
-    The time of its row is in [s], scene time.
-    """
+    """One marker of the hand in one frame: coverage and scene time of its row [s]."""
 
     marker: int
     coverage: Coverage
@@ -203,15 +179,11 @@ class Painted:
 
 
 AnyPainted: TypeAlias = Painted | PaintedFeature
-Window: TypeAlias = tuple[int, int, int, int]  # x0, y0, x1, y1 [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covered:
-    """Everything painted in one frame.
-
-    Markers of the hand in the order of the rig, then beads and tags of objects.
-    """
+    """Everything painted in one frame: the rig's markers in order, then beads, tags."""
 
     markers: tuple[Painted, ...]
     features: tuple[PaintedFeature, ...]
@@ -219,17 +191,10 @@ class Covered:
 
 
 class Painter:
-    """Renderer of the markers of one view.
-
-    It holds prepared colours; every call is pure.
-    """
+    """Renderer of the markers of one view; every call is pure."""
 
     def __init__(self, view: View) -> None:
-        """Prepare colours.
-
-        Raises:
-            CalibrationError: A marker of the rig has no colour.
-        """
+        """Prepare colours; CalibrationError: a marker of the rig has none."""
         self._view = view
         self._size = (view.optics.width_px, view.optics.height_px)
         self._tables = light.SrgbTables.make()
@@ -285,10 +250,7 @@ class Painter:
         return Covered(tuple(sorted(painted, key=lambda item: item.marker)), tuple(features), snapshot)
 
     def _places(self, snapshot: Snapshot, box_uv: Float) -> Places:
-        """Return the positions of the markers of the hand, caps first, then boxes.
-
-        The boxes have the corners `box_uv` (B, 8, 2) [px].
-        """
+        """Positions of the hand's markers: caps, then boxes, corners (B, 8, 2) [px]."""
         view = self._view
         boxes = [box.corners for box in view.surface.boxes]
         corners = snapshot.cap_uv, box_uv
@@ -305,10 +267,7 @@ class Painter:
         )
 
     def window(self, image: Image, group: list[AnyPainted], snapshot: Snapshot) -> tuple[int, int, Image]:
-        """Draw a group of markers and blur its window, all in linear light.
-
-        Returns where the window goes and its pixels.
-        """
+        """Draw and blur the window of a group, in linear light; its x, y and pixels."""
         width, height = self._size
         x0 = max(min(p.coverage.x for p in group) - MARGIN_PX, 0)
         y0 = max(min(p.coverage.y for p in group) - MARGIN_PX, 0)
@@ -339,7 +298,7 @@ class Painter:
         inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
         return x0 + left, y0 + top, self._tables.encode(np.asarray(inner, dtype=np.float32))
 
-    def _appearance(self, item: Painted, snapshot: Snapshot, box: Window) -> Image:
+    def _appearance(self, item: Painted, snapshot: Snapshot, box: Box) -> Image:
         """Colours of one marker's surface over a pixel box, as if it filled it."""
         x0, y0, x1, y1 = box
         appearance = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
@@ -361,11 +320,8 @@ class Painter:
         return appearance
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:
-        """Group markers whose windows touch.
-
-        Markers that are outside the image or hidden are omitted.
-        """
-        groups: list[tuple[Window, list[AnyPainted]]] = []
+        """Group markers whose windows touch; without those outside or hidden."""
+        groups: list[tuple[Box, list[AnyPainted]]] = []
         for item in (*painted.markers, *painted.features):
             cover = item.coverage
             height, width = cover.alpha.shape
@@ -373,7 +329,7 @@ class Painter:
             x1, y1 = cover.x + width + MARGIN_PX, cover.y + height + MARGIN_PX
             if x1 <= 0 or y1 <= 0 or x0 >= self._size[0] or y0 >= self._size[1] or not cover.alpha.any():
                 continue
-            box: Window = (x0, y0, x1, y1)
+            box: Box = (x0, y0, x1, y1)
             members: list[AnyPainted] = [item]
             while touching := [group for group in groups if _touch(box, group[0])]:
                 for other, others in touching:
@@ -404,9 +360,9 @@ def _of_markers(painted: Covered) -> Iterator[tuple[int, Coverage, float]]:
             yield item.feature.bead.marker, item.coverage, item.feature.t_s
 
 
-def _around(a: Window, b: Window) -> Window:
+def _around(a: Box, b: Box) -> Box:
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
 
 
-def _touch(a: Window, b: Window) -> bool:
+def _touch(a: Box, b: Box) -> bool:
     return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]

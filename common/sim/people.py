@@ -1,20 +1,13 @@
 """A simulated hand moves as people do: guided routine, Leap recordings.
 
-Hand that follows the guided routine the way people do.
+`HandRoutine` follows the guided routine late, at its own tempo, and never holds a joint quite still. The palm rests
+on something and faces the cameras, so that the finger tips are seen however the fingers bend.
 
-It is late, at its own tempo, and never holds a joint quite still.
-
-The palm rests on something and faces the cameras, so that the finger tips are seen however the fingers bend.
-
-Motion that follows a real hand: the Leap recordings of the data folder.
-
-The files are `leapjs/*.npz`.
-
-They hold `t` (T,) [s] and, of the first hand, joints (T, 21, 3) [m] (slot 0 the wrist, unknown; then thumb base,
-MCP, IP, tip and index ... little MCP, PIP, DIP, tip), palm centre, palm normal (out of the palm) and direction. Leap
-axes: x right, y up from the device, z to the user, so a camera looking down has x = x, y = z, z = -y.
-
-Palm pose and joint angles are taken from them and played by our own hand, within its limits; bones are ours.
+`LeapMotion` follows the recordings leapjs/*.npz of the data folder. They hold `t` (T,) [s] and, of the first hand,
+joints (T, 21, 3) [m] (slot 0 the wrist, unknown; then thumb base, MCP, IP, tip and index ... little MCP, PIP, DIP,
+tip), palm centre, palm normal (out of the palm) and direction. Leap axes: x right, y up from the device, z to the
+user, so a camera looking down has x = x, y = z, z = -y. Palm pose and joint angles are played by our own hand, within
+its limits; bones are ours.
 """
 
 from dataclasses import dataclass
@@ -43,19 +36,14 @@ REST = 0.1  # share of the drift of a hand in the air that is left when the palm
 
 
 class HandRoutine:
-    """One pass through the guided routine.
+    """One pass through the guided routine, and its script."""
 
-    The state it holds is its script, fixed by the constructor.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int, rest: float = REST) -> None:
-        """Write the script.
+        """Write the script of a hand whose open middle is at (3,) [m], rig frame.
 
-        Args:
-            model: Whose limits and coupling hold.
-            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
-            seed: Same seed, same motion.
-            rest: Share of the drift of a hand held in the air that the palm keeps.
+        `rest` is the share of the drift of a hand held in the air that the palm keeps.
         """
         rng = np.random.default_rng([seed, 5])
         self._model, self._centre, self._rest = model, np.asarray(centre_m, np.float64), rest
@@ -64,11 +52,6 @@ class HandRoutine:
         late = rng.uniform(*LATE_S, len(STEPS))
         self._script_s = np.array([*starts, ROUTINE_S])
         self._done_s = REACTION_S + np.array([*(starts + late), ROUTINE_S + LATE_S[1]])
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def script_s(self, t_s: float) -> float:
         """Where in the routine [s] the hand is at time `t_s` [s]."""
@@ -100,15 +83,12 @@ REACH_M = np.array([0.13, 0.08, 0.10])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeapMotion:
-    """Recorded motion on an even grid, closed into a loop.
-
-    Played with cubic Hermite curves (C1).
+    """Recorded motion on an even grid, a loop of cubic Hermite curves (C1).
 
     Attributes:
         centre_m: (3,) [m] middle of the volume, rig frame.
         position_m: (N, 3) palm centre [m] around 0, rig axes; quaternion: (N, 4) wxyz; angles_rad: (N, 5, 4).
         middle_m: (3,) the point of the palm frame that follows it, the middle of the flat hand.
-        model: The hand, whose limits are kept.
     """
 
     centre_m: Float
@@ -176,10 +156,7 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
 
 
 def palm_rotation(normal: Float, direction: Float) -> Float:
-    """Return palm frames (T, 3, 3) of palm normals and finger directions (T, 3).
-
-    y = -normal, z near the direction.
-    """
+    """Palm frames (y = -normal, z near the direction) of normals, directions (T, 3)."""
     y = -normal / np.linalg.norm(normal, axis=1, keepdims=True)
     z = direction - (direction * y).sum(axis=1, keepdims=True) * y
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
@@ -188,12 +165,10 @@ def palm_rotation(normal: Float, direction: Float) -> Float:
 
 
 def joint_angles(model: HandModel, joints: Float, rotation: Float) -> Float:
-    """Return joint angles (T, 5, 4) [rad], within the limits.
+    """Joint angles (T, 5, 4) [rad] of joints (T, 21, 3) and palm frames (T, 3, 3).
 
-    From joints (T, 21, 3) and palm frames (T, 3, 3), same axes.
-
-    A finger's first bone is R_y(s abduction) R_rest R_x(-flexion) (-z): azimuth and elevation in the palm. The
-    thumb's bone is read in its own rest frame.
+    A finger's first bone is R_y(s abduction) R_rest R_x(-flexion) (-z): azimuth and elevation in the palm.
+    The thumb's bone is read in its own rest frame.
     """
     chain = joints[:, 1:].reshape(-1, 5, 4, 3)
     bone = np.diff(chain, axis=2)
@@ -248,10 +223,7 @@ def _close(values: Float) -> Float:
 
 
 def _hermite(values: Float, place: float) -> Float:
-    """Interpolate periodic samples (N, ...) at a fractional index.
-
-    Catmull-Rom interpolation (Catmull & Rom, 1974).
-    """
+    """Interpolate periodic samples (N, ...) at an index (Catmull & Rom, 1974)."""
     n = len(values)
     k = int(place) % n
     s = place - int(place)

@@ -1,7 +1,5 @@
 """Rasterisation of polygons: smooth-edged capsules and exact pixel coverage.
 
-The coverage is the exact share of each pixel that a marker covers.
-
 Pixel (0, 0) is the centre of the top-left pixel, in OpenCV's drawing as everywhere here.
 """
 
@@ -30,10 +28,7 @@ _MOMENTS = tuple((np.arange(n) + 0.5) / n - 0.5 for n in range(1, MAX_STEPS + 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """Convex outline in one image, with its velocity.
-
-    Corners (N, 2) [px]; velocity (2,) [px/s].
-    """
+    """Convex outline (N, 2) [px] in one image, with its velocity (2,) [px/s]."""
 
     corners: Float
     velocity: Float
@@ -44,7 +39,6 @@ class Marker:
     """A marker's outline and what hides it.
 
     Attributes:
-        outline: The marker.
         nearer: Everything that lies before it.
         cut: What it hides of itself (the finger before its cap); not part of its own outline.
     """
@@ -76,9 +70,7 @@ class Coverage:
 
 
 def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
-    """Return the outlines of pairs of discs joined by their outer tangents.
-
-    Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2).
+    """Outlines (..., 2 n, 2) [px] of disc pairs joined by their outer tangents.
 
     Complex numbers are points of the plane: e^(i angle) turns by an angle, its powers walk along an arc.
     """
@@ -108,10 +100,7 @@ def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
 
 
 def discs(centre: Float, radius: Float, circle: Float) -> Float:
-    """Return the outlines of discs.
-
-    Outlines (..., n, 2) [px] about `centre` (..., 2), each a `circle` (n, 2) of that radius (...).
-    """
+    """Outlines (..., n, 2) [px] of discs (...) about (..., 2), by a `circle` (n, 2)."""
     points = _complex(centre)[..., None] + radius[..., None] * _complex(circle)
     return points.view(np.float64).reshape(*points.shape, 2)
 
@@ -138,14 +127,9 @@ def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
 
 
 def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -> list[Coverage]:
-    """Measure the pixel coverage of each marker.
+    """Pixel coverage of each marker, drawn sixfold finer at moments of the exposure.
 
-    Each is drawn at six times the resolution at each moment of the exposure.
-
-    Args:
-        markers: Markers, each with what hides it.
-        exposure_s: Exposure [s].
-        size: Width and height of the image [px]; what falls outside is not visible.
+    `size` is width and height of the image [px]; what falls outside is not visible.
     """
     if not markers:
         return []
@@ -185,14 +169,14 @@ def _covered(
     window: tuple[int, int, int, int],
     size: tuple[int, int],
 ) -> Coverage:
-    """What one marker covers.
+    """Coverage of one marker.
 
     Args:
         corners: (n, N, 2) of all shapes at each moment, on the fine grid of the window.
-        parts: Where the corners of each shape begin and end: the marker, what it hides of itself, what hides it.
+        parts: Where the corners of each shape begin and end: the marker, what it hides of itself, what hides
+            it.
         own_parts: How many of them are the marker's own.
         window: Pixels x0, y0, x1, y1.
-        size: Of the image.
     """
     x0, y0, x1, y1 = window
     level = 255 // len(corners)
@@ -214,10 +198,7 @@ def _covered(
 
 
 def moments(shape: Shape, exposure_s: float) -> Float:
-    """Return the moments of an exposure at which a shape is drawn.
-
-    Moments (n,) [s] from the middle of the exposure: about one per pixel of motion.
-    """
+    """Moments (n,) [s] from mid-exposure to draw at: about one per pixel of motion."""
     way = hypot(*shape.velocity.tolist()) * exposure_s
     blur_step_px = 1.2
     n = min(max(ceil(way / blur_step_px), 1), MAX_STEPS)
@@ -241,10 +222,7 @@ def _complex(points: Float) -> Complex:
 
 
 def _inset(corners: Float, middle: Float, owner: Int) -> Float:
-    """Move corners towards the centre of their shape by what the fill adds.
-
-    Corners (N, 2); `owner` (N,) is the index of each corner's shape.
-    """
+    """Move corners (N, 2) towards their shape's centre by what the fill adds."""
     spread = corners - middle[owner]
     reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
     return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)

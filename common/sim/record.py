@@ -1,9 +1,7 @@
 """Export of a rendered sequence as a recording of raw frames with exact truth.
 
-It serves the offline pipeline and its tests.
-
-The form is that of every recording (recording.json, frames.csv, PNG files); the truth has the keys and conventions
-of rendered recordings: truth.npz, truth_meta.json.
+The form is that of every recording (recording.json, frames.csv, PNG files); the truth has the keys and conventions of
+rendered recordings: truth.npz, truth_meta.json.
 """
 
 from collections.abc import Iterable, Iterator
@@ -52,10 +50,7 @@ class RenderedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """Ground truth of one row.
-
-    Every camera's view and its time of row 0 [s], and the scene at the reference time.
-    """
+    """Truth of one row: views and times of row 0 [s], scene at the reference time."""
 
     views: tuple[MarkerView, ...]
     t_row0: tuple[float, ...]
@@ -64,25 +59,14 @@ class _Row:
 
 
 class SceneTake:
-    """Frames that the cameras of a rig take of a scene, with the exact ground truth.
+    """Frames that the cameras of a rig take of a scene, and their exact truth.
 
-    It holds the ground truth of the frames taken so far.
-
-    Cameras run by the scene's timing, all stamped on one clock. The reference time of a row is the middle
-    of the exposure of the centre row of the rig's first camera.
+    Cameras run by the scene's timing, all stamped on one clock. The reference time of a row is the middle of
+    the exposure of the centre row of the rig's first camera.
     """
 
     def __init__(self, scene: Scene, seconds: float, start_s: float = 0.0) -> None:
-        """Prepare what draws.
-
-        Args:
-            scene: What to render.
-            seconds: How long [s]; at least one frame of each camera is taken.
-            start_s: Scene time of the first frame [s].
-
-        Raises:
-            ValueError: The cameras differ in frame rate.
-        """
+        """Prepare `seconds` [s] from `start_s` [s]; ValueError: frame rates differ."""
         self._scene, self._start_s = scene, start_s
         names, self._period_s = scene.rig.cameras, _period_s(scene)
         self.count = max(round(seconds / self._period_s), 1)
@@ -98,10 +82,7 @@ class SceneTake:
         return self._start_s, self._start_s + (self.count - 1) * self._period_s + max(self._offsets)
 
     def manifest(self, continuous: bool = True) -> Manifest:
-        """Return the manifest of what is rendered.
-
-        The clicks are the exact centroids in the first frame of each camera.
-        """
+        """Return the manifest; its clicks are exact centroids in the first frames."""
         scene = self._scene
         clicks: dict[str, dict[str, tuple[float, float]]] = {}
         for name, renderer, offset in zip(scene.rig.cameras, self._renderers, self._offsets, strict=True):
@@ -156,10 +137,7 @@ class SceneTake:
         } | self._truth_of_objects()
 
     def _truth_of_objects(self) -> Arrays:
-        """Return the ground truth of every tracked object.
-
-        Its poses, what each camera saw of its features, and the corners of its tags.
-        """
+        """Poses of each tracked object, what cameras saw of it, its tags' corners."""
         arrays: Arrays = {}
         for name in self._scene.rig.objects:
             seen = [[view.objects[name] for view in row.views] for row in self._rows]
@@ -197,17 +175,15 @@ def record_scene(
     *,
     imu: bool = False,
 ) -> int:
-    """Render `seconds` of a scene with every camera of its rig.
-
-    Returns the number of frames per camera.
+    """Render `seconds` [s] with every camera; return the number of frames per camera.
 
     Args:
         folder: New or empty.
-        scene: What to render.
-        seconds: How long [s]; at least one frame is written.
+        seconds: At least one frame is written.
         start_s: Scene time of the first frame [s].
         continuous: False informs readers that every frame is a pose of its own.
-        imu: Whether the rig's IMU is recorded too, from a little before the first frame to a little after the last.
+        imu: Whether the rig's IMU is recorded too, from a little before the first frame to a little after the
+            last.
 
     Raises:
         CalibrationError: The rig has no IMU, or it is not known how that is mounted.
@@ -259,10 +235,7 @@ def _period_s(scene: Scene) -> float:
 
 
 def named_angles(model: HandModel, angles_rad: Float) -> Float:
-    """Return joint angles in the order of ANGLE_NAMES.
-
-    Angles (21,) [rad], of angles (5, 4), whose abduction is measured from the palm's +z.
-    """
+    """Joint angles (21,) [rad] by ANGLE_NAMES; abduction from the palm's +z."""
     thumb = angles_rad[0]
     ahead = -model.rest_rotation[CHAINS[1:, 0], :, 2]
     spread = angles_rad[1:, 0] + model.side_sign * np.arctan2(ahead[:, 0], ahead[:, 2])

@@ -1,10 +1,8 @@
 """Renderer from scene to camera image, with the truth of what each marker shows.
 
-It draws hand, markers, desk, card, blur and noise.
-
-Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look round;
-sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the light, where
-it is not the calibrated one; noise.
+Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look
+round; sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the
+light, where it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
 there stays as bright as a white marker in the new light, also where a real one would outshine it. Another exposure or
@@ -35,17 +33,10 @@ ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
 
 
 class Renderer:
-    """Renderer of one scene as seen by one camera.
-
-    It holds prepared desk, noise and colours; a frame is a pure function of t.
-    """
+    """Renderer of one scene by one camera; a frame is a pure function of t."""
 
     def __init__(self, scene: Scene, camera: str) -> None:
-        """Prepare desk, noise and colour tables (some tenths of a second).
-
-        Raises:
-            CalibrationError: No such camera, or a marker without a colour.
-        """
+        """Prepare all (some 0.1 s); CalibrationError: no such camera, no such colour."""
         self._view = View(scene, camera)
         optics = self._view.optics
         place = scene.rig.cameras.index(camera)
@@ -63,12 +54,10 @@ class Renderer:
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "Renderer":
         """Return a renderer of the same scene for a camera with other settings.
 
-        It shares everything that was prepared.
-
         Args:
             exposure_us: Exposure [us], which smears what moves.
-            gains_bgr: Brightness (3,) of the channels in linear light, blue first, against that of the camera file
-                that the scene was made with. The noise stays as it is.
+            gains_bgr: Brightness (3,) of the channels in linear light, blue first, against that of the camera
+                file that the scene was made with. The noise stays as it is.
         """
         other = copy(self)
         other._view = self._view.exposed(exposure_us)
@@ -77,10 +66,7 @@ class Renderer:
         return other
 
     def render(self, t_s: float) -> Image:
-        """Render the frame whose row 0 is at mid-exposure at scene time `t_s`.
-
-        Returns an image (H, W, 3) BGR; `t_s` in [s].
-        """
+        """Image (H, W, 3) BGR; row 0 is at mid-exposure at scene time `t_s` [s]."""
         return self._draw(t_s)[0]
 
     def visible_fraction(self, t_s: float) -> Float:
@@ -164,10 +150,7 @@ class Renderer:
         raster.fill(image, raster.fixed(face), light.face_shade(light.THING_LINEAR_RGB, cosine))
 
     def _draw_part(self, image: Image, part: SeenPart, snapshot: Snapshot) -> None:
-        """Draw a part of a tracked object, blurred by its motion if that is larger.
-
-        Larger than the motion of the hand, whose blur follows afterwards.
-        """
+        """Draw an object's part, blurred by its motion beyond the hand's, which follows."""
         own = part.shape.velocity
         speed = float(np.hypot(*own))
         smeared = float(np.hypot(*self._way(snapshot))) / self._view.exposure_s

@@ -1,6 +1,6 @@
 """Scene of hand, motion, occluders and cameras, with exact truth at every time.
 
-Every process that builds the scene from the same files and seed sees the same world: nothing in it remembers.
+Stateless: every process that builds the scene from the same files and seed sees the same world.
 """
 
 from collections.abc import Mapping
@@ -53,13 +53,11 @@ class SceneTruth:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Dark card that passes between the cameras and the hand, once a period.
-
-    It moves at steady speed.
+    """Dark card that passes steadily between the cameras and the hand, once a period.
 
     Attributes:
         middle_s: When its middle is before the reference point [s].
-        width_m: Its width along the way: width over speed is the time a resting marker is hidden.
+        width_m: Along the way: width over speed is the time a resting marker is hidden.
         top_m, bottom_m: Its edges along the rig's y [m].
         depth_m: Its distance from the cameras.
         speed_m_s: Along the rig's x; negative from right to left.
@@ -98,10 +96,7 @@ STANDARD_CARDS = (
 
 @dataclass(frozen=True, slots=True)
 class CameraTiming:
-    """Timing of one camera's frames: start offset and clock rate.
-
-    Start after the others [ns], rate of its clock [ppm].
-    """
+    """Start of a camera's frames after the others [ns], rate of its clock [ppm]."""
 
     start_offset_ns: int
     clock_ppm: float
@@ -112,10 +107,6 @@ class Scene:
     """Hand, motion, occluders and the cameras that look at them.
 
     Attributes:
-        rig: Which cameras, where, which markers.
-        cameras: Camera name -> its file.
-        model: The hand.
-        motion: How it moves.
         cards: Occluders.
         seed: Of textures and noise.
         centre_m: Middle of the volume (3,), rig frame [m].
@@ -155,13 +146,11 @@ class Scene:
         seed: int = STANDARD_SEED,
         objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
-        """Create the standard scene of demo and benchmarks.
-
-        Every motion in each half of 60 s, two occlusion gaps.
+        """Standard scene: every motion in each half of 60 s, two occlusions.
 
         Raises:
-            CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger; an object
-                of the rig has no file.
+            CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger;
+                an object of the rig has no file.
         """
         model = HandModel.of(hand)
         centre = view_centre(rig)
@@ -178,10 +167,7 @@ class Scene:
         seed: int = STANDARD_SEED,
         objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
-        """Create a scene without occluders for any motion.
-
-        For example a motion that follows a recording.
-        """
+        """Create a scene without occluders for any motion."""
         model, centre = HandModel.of(hand), view_centre(rig)
         return cls(rig, cameras, model, motion, centre, (), seed, objects=objects or {})
 
@@ -211,17 +197,11 @@ class Scene:
         return self.tracked.poses(state, self.centre_m)
 
     def untracked(self, state: HandState) -> tuple[Cylinder, ...]:
-        """Return the things that are not tracked.
-
-        A tracked object takes the place of the thing that the hand takes.
-        """
+        """Untracked things; a tracked object replaces the one that the hand takes."""
         return state.things[len(self.rig.objects) :]
 
     def _marker_points(self, joints: HandJoints, poses: tuple[Float, ...]) -> Float:
-        """Return the centroids of all markers of the rig.
-
-        Shape (M, 3) [m]; NaN for a free marker that is on no object.
-        """
+        """Centroids (M, 3) [m] of all markers; NaN for a free one on no object."""
         if not self.rig.free_markers:
             return self.model.marker_points(joints, self.rig.markers)
         points = np.full((len(self.rig.markers), 3), np.nan)
@@ -245,18 +225,12 @@ class Scene:
         return tuple(quad for quad in corners if quad is not None)
 
     def timing(self, camera: str) -> CameraTiming:
-        """Return the timing of a camera in the standard scene.
-
-        Each camera is 5 ms after the one before, clocks 50 ppm apart.
-        """
+        """Timing of a camera: each 5 ms after the one before, clocks 50 ppm apart."""
         place = self.rig.cameras.index(camera)
         return CameraTiming(place * LATE_NS, place * APART_PPM)
 
 
 def view_centre(rig: RigCalibration) -> Float:
-    """Return the centre of the scene in the rig frame.
-
-    Shape (3,) [m]: in front of the rig's first two cameras, at the hand's working distance.
-    """
+    """Centre (3,) [m] of the scene: before the first two cameras, where hands work."""
     centres = np.stack([rig.camera_pose(name)[:3, 3] for name in rig.cameras[:2]])
     return centres.mean(axis=0) + np.array([0.0, 0.01, HAND_DEPTH_M])

@@ -1,14 +1,11 @@
 """Names select scenes, so that every process renders the same one.
 
-A painted card at known distances, for `calibrate depth` without hardware.
+`CardScene`, for `calibrate depth` without hardware: the published target, 75 x 50 mm in a finger's colour
+(Kalbfleisch, section VI), stands between the lenses and faces them, before a wall of the grey of the desk. It is
+drawn as the checkerboard is; its colour is that of a flat marker in the light of all scenes with a hand.
 
-The published target, 75 x 50 mm in a finger's colour (Kalbfleisch, section VI), stands between the lenses and faces
-them, before a wall of the grey of the desk. It is drawn as the checkerboard is; its colour is that of a flat marker in
-the light of all scenes with a hand.
-
-Tracked object that travels and rotates freely at half a metre, beside a hand.
-
-Object tracking is measured on it.
+`ObjectTravel`: a tracked object travels and rotates freely at half a metre, beside a hand that is aside, its fingers
+slowly moving. Place, pace, axes and order of the turns are drawn from the seed; smooth (C2), closed over the period.
 
     0 - 12 s    wanders and turns at once, about all axes
     12 - 15 s   rests
@@ -18,11 +15,6 @@ Object tracking is measured on it.
     35 - 45 s   wanders; a card passes before it (`CARDS`) that hides it from above
     45 - 53 s   comes to rest; the open hand comes before it, hides some of it and goes again
     53 - 60 s   wanders
-
-Else the hand is aside, its fingers slowly moving. Place, pace, axes and order of the turns are drawn from the seed.
-All is smooth (C2) and closed over the period.
-
-Scenes by name, so that every process of a simulated rig renders the same one.
 """
 
 from collections.abc import Mapping
@@ -64,19 +56,17 @@ from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 MARKER = "index"
 WIDTH_M, HEIGHT_M = 0.075, 0.050
-ROLL_RAD = np.radians(
-    4.0
-)  # no hand holds it along the rows, where rays in thirds of a pixel would draw it 0.1 px off
+# no hand holds it along the rows, where rays in thirds of a pixel would draw it 0.1 px off
+ROLL_RAD = np.radians(4.0)
 DISTANCES_M = (*(round(0.88 - 0.03 * k, 2) for k in range(15)), 0.40, 0.35)  # closest where the hand is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CardScene(BoardScene):
-    """A card held at DISTANCES_M before the middle between the first two lenses.
+    """Card held at DISTANCES_M before the middle between the first two lenses.
 
-    It moves along the axis of the first camera.
-
-    Its frame: origin in its middle, z the axis of the first camera, x and y that camera's, turned by ROLL_RAD.
+    Its frame: origin in its middle, z the axis of the first camera, x and y that camera's, turned by
+    ROLL_RAD.
     """
 
     def find_poses(self) -> Float:
@@ -123,10 +113,9 @@ CARDS = (Card(middle_s=40.0, width_m=0.09, top_m=-0.40, bottom_m=0.005, depth_m=
 
 
 class ObjectTravel:
-    """Motion of a travelling object and the hand.
+    """Motion of a travelling object and the hand, and its script."""
 
-    The state it holds is its script, fixed by the constructor.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand and an object about a place (3,) [m]; the same seed, the same motion."""
@@ -144,11 +133,6 @@ class ObjectTravel:
         axes = np.stack([self._facing[:, 2], other / np.linalg.norm(other)])
         self._spins = axes[rng.permutation(2)] * rng.choice((-1.0, 1.0), (2, 1))
         self._before = BEFORE_M + rng.uniform(-1.0, 1.0, 3) * np.array([0.035, 0.01, 0.01])
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
         """Hand and object at time `t_s` [s]; before 0 those of 0."""
@@ -195,38 +179,38 @@ def scene_by_name(
 ) -> Scene:
     """Return the scene of the given name.
 
-    `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a hand that
-    follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object that travels
-    (`object`), one that moves as in front of a wrist device at the same time (`TOGETHER`), or one that follows a
-    recorded motion. `objects` are the files of the objects that the rig names (`common.sim.tracked`).
+    `standard`, the same under light that changes (`lights`), the six poses of the Digits study (`poses`), a
+    hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
+    that travels (`object`), one that moves as in front of a wrist device at the same time (`TOGETHER`), or
+    one that follows a recorded motion. `objects` are the files of the objects that the rig names
+    (`common.sim.tracked`).
 
     Raises:
-        PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot be read.
+        PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot
+            be read.
     """
     if rig.kind != "markers":
         raise PhalanxError(
             f"scene {name!r}: shows markers, and rig {rig.name!r} is of kind {rig.kind!r}; that has {WRIST_NAMES}"
         )
-    if name == "standard":
-        return Scene.standard(rig, cameras, hand, seed, objects)
-    if name == "lights":
-        return replace(Scene.standard(rig, cameras, hand, seed, objects), light=ROOM)
+    if name in ("standard", "lights"):
+        scene = Scene.standard(rig, cameras, hand, seed, objects)
+        return scene if name == "standard" else replace(scene, light=ROOM)
+    model, centre_m = HandModel.of(hand), view_centre(rig)
     if name == "poses":
-        motion = StudyPoses(HandModel.of(hand), view_centre(rig), seed)
-        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
-    if name == "hand-routine":
-        motion = HandRoutine(HandModel.of(hand), view_centre(rig), seed)
-        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
-    if name == "object":
-        motion = ObjectTravel(HandModel.of(hand), view_centre(rig), seed)
-        return replace(Scene.of_motion(rig, cameras, hand, motion, seed, objects), cards=CARDS)
-    if name.startswith(_LEAP):
-        motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
-        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
-    together = together_motion(name, HandModel.of(hand), view_centre(rig), seed)
-    if together is not None:
-        return Scene.of_motion(rig, cameras, hand, together, seed, objects)
-    raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board and card for cameras only)")
+        motion = StudyPoses(model, centre_m, seed)
+    elif name == "hand-routine":
+        motion = HandRoutine(model, centre_m, seed)
+    elif name == "object":
+        motion = ObjectTravel(model, centre_m, seed)
+    elif name.startswith(_LEAP):
+        motion = load_leap(Path(name.removeprefix(_LEAP)), model, centre_m)
+    else:
+        motion = together_motion(name, model, centre_m, seed)
+    if motion is None:
+        raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board and card for cameras only)")
+    scene = Scene.of_motion(rig, cameras, hand, motion, seed, objects)
+    return replace(scene, cards=CARDS) if name == "object" else scene
 
 
 def view_by_name(
@@ -239,8 +223,8 @@ def view_by_name(
 ) -> Scene | BoardScene | WristScene:
     """Return the scene of the given name that a simulated camera looks at.
 
-    A scene with a hand, that of a wrist rig where the rig is one, `board`, a checkerboard to calibrate cameras with,
-    or `card`, a painted card to calibrate the depth of a pair with.
+    A scene with a hand, that of a wrist rig where the rig is one, `board`, a checkerboard to calibrate
+    cameras with, or `card`, a painted card to calibrate the depth of a pair with.
 
     Raises:
         PhalanxError: As `scene_by_name`; the scene is none of this kind of rig.
@@ -265,13 +249,8 @@ def renderer_of(
 ) -> Renderer | BoardRenderer | WristRenderer:
     """Return the renderer of the scene for one camera.
 
-    The renderer of a wrist scene also takes the illumination of each frame.
-
-    Args:
-        scene: What the camera looks at.
-        camera: Its name.
-        live: What is not drawn in time is lost: skin before a wrist device is shaded more coarsely, the
-            palm of a bent wrist by steps of its bend.
+    `live`: what is not drawn in time is lost: skin before a wrist device is shaded more coarsely, the palm of
+    a bent wrist by steps of its bend.
 
     Raises:
         CalibrationError: The scene has no such camera, or a marker without a colour.

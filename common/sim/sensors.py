@@ -1,23 +1,16 @@
 """Simulated sensors measure a scene: an IMU, and a tracker on an object.
 
-Simulated IMU on a hand or forearm.
+IMU: the motion's exact rates, as means since the last sample, and forces, and on top of them the errors of a part, an
+LSM6DSO if none is named. The accelerometer's zero is off by as much as the tilt may be by the rig's file: gravity
+then points elsewhere, and no filter can know better. Zeros and scale are the same for a whole recording; the
+gyroscope's zero wanders a little, as in a part that warms up. That of a wrist device sits on the forearm, at the
+wrist joint (`OnForearm`).
 
-Raw output of a common part; it does not know its orientation.
-
-The motion's exact rates, as means since the last sample, and forces, and on top of them the errors of a part, an
-LSM6DSO if none is named. The
-accelerometer's zero is off by as much as the tilt may be by the rig's file: gravity then points elsewhere, and
-no filter can know better. Zeros and scale are the same for a whole recording; the gyroscope's zero wanders a little, as
-in a part that warms up. That of a wrist device sits on the forearm, at the wrist joint (`OnForearm`).
-
-Vive tracker on a simulated object.
-
-It reports what base stations would measure, in a frame of their own, y up.
-
-Where T_rig_tracking and T_object_tracker are not measured yet they are as somebody would have set them up, so that the
-procedure that measures them has something to find. The noise is that of Lighthouse: 0.3 mm and 0.05 degrees that
-wander within a tenth of a second, beside some white noise (Niehorster, Li & Lappe, i-Perception 2017, found 0.2 mm RMS
-at rest); and now and then something stands between tracker and base station for half a second.
+Vive tracker: what base stations would measure, in a frame of their own, y up. Where T_rig_tracking and
+T_object_tracker are not measured yet they are as somebody would have set them up, so that the procedure that measures
+them has something to find. The noise is that of Lighthouse: 0.3 mm and 0.05 degrees that wander within a tenth of a
+second, beside some white noise (Niehorster, Li & Lappe, i-Perception 2017, found 0.2 mm RMS at rest); and now and
+then something stands between tracker and base station for half a second.
 """
 
 from collections.abc import Iterator
@@ -52,10 +45,7 @@ _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it
 
 @dataclass(frozen=True, slots=True)
 class InertialPart:
-    """Errors of a kind of inertial sensor, one sigma.
-
-    Noise per root hertz; zero and scale of its gyroscope.
-    """
+    """Errors of an inertial sensor, one sigma: noise per root hertz, zero, scale."""
 
     gyro_noise: float
     accel_noise: float
@@ -64,30 +54,21 @@ class InertialPart:
 
 
 LSM6DSO = InertialPart(radians(3.8e-3), 70e-6 * GRAVITY_M_S2, radians(1.0), 0.01)  # ST, DS12140, table 2
-ICM20948 = InertialPart(
-    radians(0.015), 230e-6 * GRAVITY_M_S2, radians(2.5), 0.015
-)  # TDK, DS-000189, tables 1, 2
+# TDK, DS-000189, tables 1, 2
+ICM20948 = InertialPart(radians(0.015), 230e-6 * GRAVITY_M_S2, radians(2.5), 0.015)
 
 
 class SimulatedImu:
-    """Simulated IMU of a rig during a motion.
-
-    Pure in time: holds the errors of this recording.
-    """
+    """Simulated IMU of a rig during a motion; pure in time."""
 
     def __init__(
         self, motion: HandMotion, imu: ImuCalibration, seed: int, part: InertialPart = LSM6DSO
     ) -> None:
-        """Draw the errors of one recording.
-
-        Args:
-            motion: Of what it is mounted on, as a palm's (`OnForearm` for a forearm).
-            imu: How it is mounted.
-            seed: Same seed, same errors.
-            part: Which sensor.
+        """Draw the errors of one recording of a palm (`OnForearm`: of a forearm).
 
         Raises:
-            CalibrationError: The rig's file does not state how the IMU is mounted, or how its world lies to the rig.
+            CalibrationError: The rig's file does not state how the IMU is mounted, or how its world lies to
+                the rig.
         """
         if imu.q_palm_imu is None or imu.q_rig_world is None:
             raise CalibrationError(_UNPLACED)
@@ -107,9 +88,7 @@ class SimulatedImu:
 
     @classmethod
     def of(cls, scene: Scene | WristScene) -> "SimulatedImu":
-        """Return the IMU of a scene's rig.
-
-        On the palm in a marker rig, on the forearm in a wrist device.
+        """IMU of a scene's rig: on the palm, or of a wrist device on the forearm.
 
         Raises:
             CalibrationError: The rig has none, or it is not known how that is mounted.
@@ -122,12 +101,7 @@ class SimulatedImu:
         return cls(motion, scene.rig.imu, scene.seed)
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
-        """Yield all samples of a span of scene time [s] and of a lead-in before it.
-
-        The lead-in is as long as a filter takes to settle.
-
-        `t_ns` counts from scene time 0 at `zero_ns`; there is none before that.
-        """
+        """Yield samples of a span [s] and a filter's lead-in; scene time 0 is `zero_ns`."""
         rate = self._imu.rate_hz
         before_s, after_s = 2.0, 0.1  # a filter has to settle before the first frame
         for seq in range(max(ceil((start_s - before_s) * rate), 0), floor((stop_s + after_s) * rate) + 1):
@@ -148,9 +122,8 @@ class SimulatedImu:
         step = matrix_to_rotation_vector(last.T @ now[:3, :3])  # palm axes
         moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / half_step_s**2
         new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
-        rate = (
-            self._palm_imu.T @ step * self._imu.rate_hz
-        )  # the mean since the last sample, as a low-pass leaves it
+        # the mean since the last sample, as a low-pass leaves it
+        rate = self._palm_imu.T @ step * self._imu.rate_hz
         return ImuSample(
             source=self._imu.name,
             session=0,
@@ -179,12 +152,9 @@ SET_UP_TRACKER = rigid(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTracker:
-    """Simulated tracker that reports its pose at any time of a scene.
-
-    Pure in time: the same seed gives the same reports.
+    """Simulated tracker that reports its pose at any time of a scene; pure in time.
 
     Attributes:
-        scene: What happens.
         name: Object that it sits on.
         T_rig_tracking: (4, 4) frame of the base stations -> rig.
         T_object_tracker: (4, 4) tracker -> object.
@@ -199,9 +169,7 @@ class SimulatedTracker:
 
     @classmethod
     def of(cls, scene: Scene, profile: ObjectProfile, seed: int) -> "SimulatedTracker":
-        """Create the tracker of an object of the scene's rig.
-
-        It sits where the files of the rig and the object state.
+        """Create the tracker of an object, where the files of rig and object state it.
 
         Raises:
             CalibrationError: The scene does not know the object.
@@ -211,10 +179,7 @@ class SimulatedTracker:
         return cls(scene, profile.name, tracking_of(scene.rig), tracker_of(profile), seed)
 
     def pose(self, t_s: float) -> Float | None:
-        """Return the pose `T_tracking_device` of the tracker at a time of the scene.
-
-        Shape (4, 4) [m], time in [s]; None: it sees no base station.
-        """
+        """`T_tracking_device` (4, 4) [m] at scene time [s]; None: no station is seen."""
         hidden_every_s, hidden_s = 17.0, 0.5
         phase = np.random.default_rng([self.seed, 5]).uniform(0.0, hidden_every_s)
         if (t_s + phase) % hidden_every_s < hidden_s:
@@ -236,17 +201,11 @@ class SimulatedTracker:
 
 
 def tracking_of(rig: RigCalibration) -> Float:
-    """Return `T_rig_tracking` of a rig's file, or a simulated one.
-
-    Shape (4, 4); that of a simulated rig where it is not measured yet.
-    """
+    """`T_rig_tracking` (4, 4) of a rig's file; a simulated one where not measured."""
     return SET_UP_TRACKING if rig.T_rig_tracking is None else np.array(rig.T_rig_tracking, dtype=np.float64)
 
 
 def tracker_of(profile: ObjectProfile) -> Float:
-    """Return `T_object_tracker` of an object's file, or a simulated one.
-
-    Shape (4, 4); that of a simulated object where it is not measured yet.
-    """
+    """`T_object_tracker` (4, 4) of a file; a simulated one where not measured."""
     mounted = profile.T_object_tracker
     return SET_UP_TRACKER if mounted is None else np.array(mounted, dtype=np.float64)

@@ -1,19 +1,14 @@
 """Surfaces shape the simulated hand, its markers and the things it takes.
 
-Skin and markers of a simulated hand, as few points as a fast renderer needs.
+Few points, as a fast renderer needs. The hand is spheres joined to tapered capsules (phalanges) and hulls (palm,
+thumb web, sleeve). All places that move are *key points* of one array, so that a camera can bring each to the moment
+at which its own row is exposed.
 
-The hand is spheres joined to tapered capsules (phalanges) and hulls (palm, thumb web, sleeve). All places that
-move are *key points* of one array, so that a camera can bring each to the moment at which its own row is exposed.
-
-A painted cap is the rounded end of a finger: half a sphere of radius R and a cylinder of length 0.7 R behind it,
-its axis along the tip joint's -z. The area of a sphere between parallel planes equals that of the cylinder around
-it (Archimedes), so the centroid of the painted surface is the middle of its length, 0.15 R ahead of the sphere's
-centre: the cap is placed so that this is exactly the profile's marker offset. The back marker is a box painted on
-top and sides, placed by its area centroid likewise.
-
-Things that a hand takes, as one camera sees them.
-
-Outlines, light, and the depth of each behind each pixel.
+A painted cap is the rounded end of a finger: half a sphere of radius R and a cylinder of length 0.7 R behind it, its
+axis along the tip joint's -z. The area of a sphere between parallel planes equals that of the cylinder around it
+(Archimedes), so the centroid of the painted surface is the middle of its length, 0.15 R ahead of the sphere's centre:
+the cap is placed so that this is exactly the profile's marker offset. The back marker is a box painted on top and
+sides, placed by its area centroid likewise.
 """
 
 from collections.abc import Callable
@@ -55,10 +50,7 @@ _JOINTS, _AXES, _PALM = _UNIT_ROWS[:20], _UNIT_ROWS[20:80].reshape(20, 3, 83), _
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cap:
-    """Painted finger end.
-
-    Marker index, finger, radius [m]; key points of sphere centre and base centre.
-    """
+    """Painted finger end: marker, finger, radius [m], key points of centre and base."""
 
     marker: int
     finger: int
@@ -69,10 +61,7 @@ class Cap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """Painted box: marker index and its eight key points.
-
-    The four top key points (in ring order) come first.
-    """
+    """Painted box: marker index and its eight key points, the top ring first."""
 
     marker: int
     corners: slice
@@ -85,8 +74,8 @@ class HandSurface:
     Attributes:
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
-        weights: (K, 80) and still: (K, 3) [m]: key points, palm frame, as sums of `_chain_rows`, and of what stands
-            still; of the sleeve's far end, the way there that the palm asks for.
+        weights: (K, 80) and still: (K, 3) [m]: key points, palm frame, as sums of `_chain_rows`, and of what
+            stands still; of the sleeve's far end, the way there that the palm asks for.
     """
 
     radius_m: Float
@@ -102,12 +91,11 @@ class HandSurface:
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
-        """Lay out the key points of a hand with these markers.
-
-        Markers that sit on no hand are omitted.
+        """Lay out the key points of a hand with these markers; `free` are on no hand.
 
         Raises:
-            CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
+            CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the
+                palm.
         """
         radius = _sphere_radii(model)
         rows = _spheres(model)
@@ -139,10 +127,7 @@ class HandSurface:
         return cls(radius, tuple(caps), tuple(boxes), table[:, :80].copy(), table[:, 80:].copy())
 
     def key_points(self, T_rig_palm: Float, chains: Chains) -> Float:
-        """Return the key points of a hand in the rig frame.
-
-        Key points (..., K, 3) [m], of palm poses (..., 4, 4) and flexed fingers.
-        """
+        """Key points (..., K, 3) [m], rig frame, of palm poses and flexed fingers."""
         R, (cuff, end) = np.swapaxes(T_rig_palm[..., :3, :3], -1, -2), SLEEVE_SPHERES
         points = (self.weights @ _chain_rows(chains) + self.still) @ R
         way = unit(points[..., end, :] + TO_ELBOW)
@@ -153,10 +138,7 @@ class HandSurface:
 
 
 def _chain_rows(chains: Chains) -> Float:
-    """Return the positions, then the axes, of the joints of all chains.
-
-    Finger by finger (..., 80, 3), positions in [m], palm frame.
-    """
+    """Positions [m], then axes, of the joints of all chains (..., 80, 3), palm frame."""
     batch = chains.position_m.shape[:-3]
     axes = np.swapaxes(chains.rotation, -1, -2)
     return np.concatenate([chains.position_m.reshape(*batch, 20, 3), axes.reshape(*batch, 60, 3)], axis=-2)
@@ -193,18 +175,12 @@ def _sphere_radii(model: HandModel) -> Float:
 
 
 def cap_centroid_ahead(radius_m: float) -> float:
-    """Return how far the painted surface's centroid is ahead of the sphere's centre.
-
-    Distance [m]: the middle of [-0.7 R, R].
-    """
+    """How far [m] a cap's centroid is ahead of its centre: middle of [-0.7 R, R]."""
     return 0.5 * (1.0 - CYLINDER_SHARE) * radius_m
 
 
 def box_corners() -> Float:
-    """Return the corners of a box around the area centroid of its top and sides.
-
-    Shape (8, 3) [m]; palm axes, top ring first.
-    """
+    """Corners (8, 3) [m], palm axes, top first, about the painted area's centroid."""
     x, y, z = BOX_M
     top, sides = x * z, 2.0 * (x + z) * y
     above = sides * 0.5 * y / (top + sides)  # the top lies this far above the centroid
@@ -213,17 +189,15 @@ def box_corners() -> Float:
 
 
 def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> Float:
-    """Return points whose projections' convex hull is the outline of a cap.
+    """Points (C, 2 n, 3), camera frame; hulls of their projections outline the caps.
 
-    Points (C, 2 n, 3), camera frame; the hull is exactly the outline of each cap.
+    The sphere's part is its contact circle with the cone of rays. Behind the sphere's equator the cylinder
+    hides it: those points are moved onto the rim.
 
     Args:
         centre: Sphere centres (C, 3) [m]; base: centres of the rims (C, 3) [m].
         radius_m: (C,) radius of both.
         circle: `unit_circle` (n, 2).
-
-    The sphere's part is its contact circle with the cone of rays. Behind the sphere's equator the cylinder hides
-    it: those points are moved onto the rim.
     """
     axis = unit(centre - base)
     d2 = (centre * centre).sum(axis=-1)
@@ -270,8 +244,10 @@ class SeenThing:
     """One cylinder in one image.
 
     Attributes:
-        layers: Outlines (N, 2) [px]: its own, then the parts of its side where the light falls more and more steeply.
-        face: Outline (N, 2) [px] of the end that is turned to the camera, and the cosine of its normal to the light.
+        layers: Outlines (N, 2) [px]: its own, then the parts of its side where the light falls more and more
+            steeply.
+        face: Outline (N, 2) [px] of the end that is turned to the camera, and the cosine of its normal to the
+            light.
         velocity: (2,) [px/s].
         ends_uv: (2, 2) [px] middles of its ends, ends_depth: (2,) [m].
     """
@@ -295,16 +271,7 @@ class SeenThing:
 
 
 def tube_rims(centre: Float, axis: Float, radius_m: float, to_light: Float, circle: Float) -> Float:
-    """Return the edges of a tube's shading where it is cut at `centre`.
-
-    Edges (LAYERS, n, 3) [m]: the tube's own edge, then those where it is lit more.
-
-    Args:
-        centre: (3,) [m]; axis: unit vector (3,) of the tube.
-        radius_m: Its radius.
-        to_light: Unit vector (3,).
-        circle: `unit_circle` (n, 2).
-    """
+    """Shading edges (LAYERS, n, 3) [m] of a tube with unit axis, cut at (3,) [m]."""
     across = to_light - (to_light @ axis) * axis
     middle = centre + radius_m * LAYER_COSINES[:, None] * across
     return middle[:, None] + rim(
@@ -323,13 +290,8 @@ def seen(
 ) -> SeenThing:
     """What a camera sees of a thing, which `later_s` [s] on is at `later`.
 
-    Args:
-        thing, later: At two times.
-        later_s: The time between them [s].
-        T_camera_rig: (4, 4).
-        to_light: Unit vector (3,), camera frame.
-        circle: `unit_circle` (n, 2).
-        project: Points (..., 3) [m] of the camera frame to pixels (..., 2).
+    `to_light` is a unit vector (3,), camera frame; `circle` is `unit_circle` (n, 2); `project` takes points
+    (..., 3) [m] of the camera frame to pixels (..., 2).
     """
     ends, after = (_ends(item, T_camera_rig) for item in (thing, later))
     axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])

@@ -6,7 +6,7 @@ All of them are pure in time, smooth (C2) and closed over their period, and the 
 device sits on the forearm (`common.hand.wrist`; limits of the bend as flexion / deviation):
 
     grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 3 degrees flexed, +-7 / +-8 about that
-    both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
+    both-poses    the six study poses, the palm in a new place and turned another way each (`StudyPoses`); +-8 / +-5
     both-curl     all fingers curl slowly from straight to PIP 105 degrees and back; +-8 / +-5
     both-travel   the hand goes to and fro at a peak of 1 m/s, its fingers slowly moving; +-8 / +-5
     gestures      pinches, knobs, keys, pointing and free motion for 75 s (`gestures`); +-5 / +-3
@@ -50,12 +50,10 @@ MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
 def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """Return the motion of the given name about a centre, or None if there is none.
+    """Motion of a name of `TOGETHER` about (3,) [m], rig frame; None: no such.
 
-    Names are those of `TOGETHER`; the centre is (3,) [m], rig frame.
-
-    The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the bend of
-    the wrist and the shifts are the same.
+    The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the
+    bend of the wrist and the shifts are the same.
     """
     if name == "gestures":
         return Gestures(model, centre_m, seed)
@@ -73,20 +71,12 @@ def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> 
 
 
 class FlexedWrist:
-    """Motion during which the wrist also flexes as in normal use.
-
-    The seed decides which way the wrist bends, and the object holds it.
-    """
+    """Motion during which the wrist also flexes as in normal use."""
 
     def __init__(self, motion: HandMotion, seed: int) -> None:
         """Of a motion with the usual period."""
-        self._motion = motion
+        self._motion, self.period_s = motion, motion.period_s
         self._waves = Waves(np.random.default_rng([seed, 19]), 2, motion.period_s)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return self._motion.period_s
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -95,10 +85,9 @@ class FlexedWrist:
 
 
 class Curls:
-    """All fingers curl and stretch periodically while the palm slowly rotates.
+    """All fingers curl and stretch six times a minute while the palm slowly rotates."""
 
-    Six times a minute. It holds its script.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
@@ -109,11 +98,6 @@ class Curls:
         self._most = curl_pip_deg * (1.0 - rng.uniform(0.0, 0.06, 4))
         mcp_per_pip = 0.54  # Kamper's ratio, in Kim et al. 2012
         self._ratio = mcp_per_pip * (1.0 + rng.normal(0.0, 0.06, 4))
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -134,10 +118,9 @@ class Curls:
 
 
 class Travel:
-    """The hand moves to and fro while its fingers move slowly.
+    """The hand moves to and fro, ten ways a minute, while its fingers move slowly."""
 
-    Ten ways a minute. It holds its script.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
@@ -148,11 +131,6 @@ class Travel:
         way = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (count, 3)) * np.array([0.2, 0.4, 0.6])
         self._way = way / np.linalg.norm(way, axis=1, keepdims=True)
         self._rate_hz = rng.uniform(*TRAVEL_HZ, count)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -172,10 +150,9 @@ class Travel:
 
 
 class Moves:
-    """Ten seconds of all motions that reveal the mounting.
+    """Ten seconds of all motions that reveal the mounting."""
 
-    It holds its script, fixed by the constructor.
-    """
+    period_s = MOVES_S
 
     def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
@@ -189,11 +166,6 @@ class Moves:
             [rng.permutation([3, 4, 5]), rng.permutation([2, 3, 4]), rng.permutation([4, 5])]
         )
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 8)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return MOVES_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""

@@ -1,18 +1,9 @@
 """Tracked objects of a scene have poses, ground truth and a surface.
 
-Tracked objects of a scene: poses, detectable points and ground truth.
-
-Where each object is at a given time, and which of its points a camera can find.
-
-The first object of a rig is what the motion moves: the one that travels (`travel`), or the thing that the hand takes,
-in whose place it then is. Any other, and all of them in a scene that moves none, stand still beside the hand.
-
-Surface of a tracked object, as few points as a fast renderer can live with.
-
-Rods, blocks, balls, beads, tags.
-
-All places are key points of one array, as those of the hand (`surface`), so that a camera brings each to the moment at
-which its own row is exposed.
+The first object of a rig is what the motion moves: the one that travels (`scenes.ObjectTravel`), or the thing that
+the hand takes, in whose place it then is. Any other, and all of them in a scene that moves none, stand still beside
+the hand. The surface is rods, blocks, balls, beads and tags; all places are key points of one array, as those of the
+hand (`surface`), so that a camera brings each to the moment at which its own row is exposed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,16 +28,12 @@ from common.sim.motion import HandState
 
 RESTING_M = np.array([0.19, 0.13, 0.12])  # of an object that nothing moves, against the middle of the view
 TILT_RAD = np.radians(20.0)
-_FACING = np.array(
-    [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-)  # its y to the cameras, its z to the left
+# its y to the cameras, its z to the left
+_FACING = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def facing(tilt_rad: float) -> Float:
-    """Return the rotation of an object whose y axis points to the cameras.
-
-    Rotation (3, 3), object -> rig; its z axis points to the left, raised by a tilt [rad].
-    """
+    """Rotation (3, 3), object -> rig: y to the cameras, z left, up by a tilt [rad]."""
     return np.asarray(axis_rotation(2, tilt_rad) @ _FACING)
 
 
@@ -84,10 +71,7 @@ class TrackedObjects:
         return cls(tuple(profiles), beads)
 
     def poses(self, state: HandState, centre_m: Float) -> tuple[Float, ...]:
-        """Return the pose `T_rig_object` of each object.
-
-        Poses (4, 4) [m], of a scene whose centre is at (3,) [m], rig frame.
-        """
+        """`T_rig_object` (4, 4) [m] of each object; scene centre (3,) [m], rig frame."""
         moved = state.objects or tuple(thing.T_rig_object for thing in state.things)
         return tuple(
             moved[k] if k < len(moved) else resting_pose(k, centre_m) for k in range(len(self.profiles))
@@ -101,10 +85,7 @@ class TrackedObjects:
 
 
 def resting_pose(which: int, centre_m: Float) -> Float:
-    """Return the rest pose of an object, where nothing moves it.
-
-    Pose (4, 4) [m], rig frame, of the object of that number.
-    """
+    """Pose (4, 4) [m], rig frame, of an object by number where nothing moves it."""
     side = np.array([-1.0 if which % 2 == 0 else 1.0, 1.0 if which % 4 < 2 else -1.0, 1.0])
     return rigid(facing(TILT_RAD), centre_m + side * RESTING_M)
 
@@ -129,10 +110,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """Ball, given by the key point of its centre and its radius.
-
-    The key point is a slice of one, the radius is in [m]; a painted bead also has its marker (index in the rig).
-    """
+    """Ball: key point of its centre (slice of one), radius [m], of a bead its marker."""
 
     middle: slice
     radius_m: float
@@ -141,9 +119,7 @@ class Ball:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Printed tag: four key points of its paper, then the four of its black square.
-
-    The order is that of `tag_corners`.
+    """Printed tag: key points of paper, then black square, as `tag_corners` goes.
 
     Attributes:
         on: Place of the block that it is stuck on among the parts; None: on nothing that could be before it.
@@ -219,10 +195,7 @@ class _Layout:
         self.which = 0
 
     def add(self, points: Float) -> slice:
-        """Add points to the key points and return their slice.
-
-        Points (n, 3) [m] in the frame of the present object.
-        """
+        """Add points (n, 3) [m] in the frame of the present object; return their slice."""
         start = len(self.owner)
         self.points.append(points)
         self.owner += [self.which] * len(points)
@@ -258,10 +231,7 @@ def _sheets(profile: ObjectProfile, first: int, layout: _Layout) -> list[Sheet]:
 
 
 def _block_under(shapes: Sequence[Shape], point: Float) -> int | None:
-    """Return the index of the box on whose surface a point of the object lies.
-
-    The point is (3,); the index is the box's place among the shapes.
-    """
+    """Place among the shapes of the box on whose surface a point (3,) lies."""
     for k, shape in enumerate(shapes):
         if isinstance(shape, BoxShape):
             own = (

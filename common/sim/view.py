@@ -1,16 +1,8 @@
 """A view is the scene in front of one camera, with what occludes what.
 
-Scene in front of one camera at one frame.
-
-Every part is where it is when its own row is exposed.
-
 Rolling shutter: the middle of the exposure of row v is `t + v row_time`, so a part's place and its row are found
 together, by two rounds of projecting and moving (the hand moves far less than a row per row time). Between three
 exact times the key points follow a parabola.
-
-Occluders of a marker, a bead or a tag in one image.
-
-Outlines of skin, sleeve, things and other markers.
 """
 
 from collections.abc import Sequence
@@ -26,7 +18,7 @@ from common.geometry.transforms import invert, transform
 from common.sim import raster
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
 from common.sim.motion import Cylinder, HandState
-from common.sim.objects_seen import Appearances, Points, SeenObjects, SeenPart
+from common.sim.objects_seen import Appearances, Points, SeenObjects, SeenPart, project_all
 from common.sim.raster import Int32, Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
@@ -71,8 +63,8 @@ class Snapshot:
         cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
         rim_uv: (C, n, 2) [px] the cap's edge towards the finger, and the finger's girth at its last joint.
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
-        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the marker mirrors
-            the lamp, in OpenCV's numbers (`raster.fixed`).
+        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the
+            marker mirrors the lamp, in OpenCV's numbers (`raster.fixed`).
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
         palm_speed: (2,) [px/s] of the palm.
         palm, web, sleeve: Hulls (N, 2) [px] of each layer, the first the outline.
@@ -103,17 +95,10 @@ class Snapshot:
 
 
 class View:
-    """Projection of one scene into one camera.
-
-    It holds what never changes; every call is pure.
-    """
+    """Projection of one scene into one camera; every call is pure."""
 
     def __init__(self, scene: Scene, camera: str) -> None:
-        """Prepare.
-
-        Raises:
-            CalibrationError: The scene has no such camera, or a marker cannot be painted.
-        """
+        """Prepare; CalibrationError: no such camera, or a marker cannot be painted."""
         if camera not in scene.optics:
             raise CalibrationError(f"camera {camera!r}: the scene has only {', '.join(scene.optics)}")
         self.scene = scene
@@ -158,10 +143,7 @@ class View:
         return other
 
     def project(self, points: Float) -> Float:
-        """Project points in the camera frame to pixels.
-
-        Points (..., 3) [m] to pixels (..., 2); points too near or too far outside are clamped there.
-        """
+        """Pixels (..., 2) of points (..., 3) [m], camera frame, clamped far outside."""
         uv = self.optics.distort(points[..., :2] / np.maximum(points[..., 2:], NEAREST_M))
         furthest_px = 4000.0
         return np.minimum(np.maximum(uv, -furthest_px), furthest_px)
@@ -183,7 +165,7 @@ class View:
             centre + self.cap_radius[:, None] * half,
             self._cuff(points),
         )
-        discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = self._project_all(parts)
+        discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = project_all(self.project, parts)
         a, b, own = self._from, self._to, slice(self.surface.count, None)
         outlines = raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b])
         shine_share = 0.17  # radius of the glossy spot, share of the cap's
@@ -216,19 +198,13 @@ class View:
         )
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
-        """Return the outline of the last phalanx where it lies in front of its own cap.
-
-        For cap number `cap`: this is so where the finger points away; None otherwise.
-        """
+        """Outline of the last phalanx where it lies before its own cap; None elsewhere."""
         if not snapshot.from_behind[cap]:
             return None
         return Shape(raster.hull(snapshot.rim_uv[cap]), snapshot.speed_uv[self.cap_base[cap]])
 
     def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
-        """Check whether the plane of the palm passes between the camera and points.
-
-        Points (..., 3) [m], camera frame.
-        """
+        """Whether the palm's plane passes before points (..., 3) [m], camera frame."""
         normal, offset = _palm_plane(snapshot)
         # The plane meets the ray at (offset / (normal . p)) p: before p if that factor is between 0 and 1.
         along = points @ normal
@@ -249,11 +225,7 @@ class View:
         return tuple(shapes)
 
     def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float, tuple[Cylinder, ...]]:
-        """Return the key points, each at its own moment, with pixels and speeds.
-
-        Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,); also the things, halfway through
-        these moments.
-        """
+        """Key points (K, 3), pixels, speeds (K, 2), own moments (K,), things halfway."""
         readout_s = self.optics.height_px * self.row_s
         t_middle = t_s + 0.5 * readout_s
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
@@ -281,10 +253,7 @@ class View:
         return np.concatenate([hand, self.objects.key_points(poses)], axis=1)
 
     def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
-        """Return each thing at the moment of the row of its centre.
-
-        `things` is where they are halfway through the frame.
-        """
+        """Each of `things` halfway, at the moment of the row of its centre."""
         views: list[SeenThing] = []
         for k, thing in enumerate(things):
             middle = transform(self.T_camera_rig, thing.T_rig_object[:3, 3])
@@ -294,21 +263,10 @@ class View:
         return tuple(views)
 
     def _cuff(self, points: Float) -> Float:
-        """Return the front edges of the sleeve's shading.
-
-        Shape (LAYERS, n, 3); the first is the sleeve's own edge.
-        """
+        """Front edges (LAYERS, n, 3) of the sleeve's shading, its own edge first."""
         start, end = points[SLEEVE_SPHERES[0]], points[SLEEVE_SPHERES[1]]
         radius = float(self.surface.radius_m[SLEEVE_SPHERES[0]])
         return tube_rims(start, unit(start - end), radius, self.to_light, self.circle)
-
-    def _project_all(self, parts: tuple[Float, ...]) -> list[Float]:
-        """Project arrays of points (..., 3) in one call."""
-        uv = self.project(np.concatenate([part.reshape(-1, 3) for part in parts]))
-        ends = np.cumsum([part.size // 3 for part in parts])[:-1]
-        return [
-            flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)
-        ]
 
 
 def _hulls(discs: Float) -> tuple[Float, ...]:
@@ -317,19 +275,13 @@ def _hulls(discs: Float) -> tuple[Float, ...]:
 
 
 def _looks_into(cuff: Float, end: Float) -> bool:
-    """Check whether a camera sees the opening of a sleeve, not its side.
-
-    The sleeve goes from `cuff` to `end` (3,) [m], camera frame.
-    """
+    """Whether a camera sees into a sleeve `cuff` - `end` (3,) [m], camera frame."""
     along = end - cuff
     return float(along @ cuff) > INTO_COSINE * float(np.linalg.norm(along) * np.linalg.norm(cuff))
 
 
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
-    """Return the plane through the wrist, index knuckle and little knuckle.
-
-    Normal (3,) and offset, camera frame.
-    """
+    """Normal (3,) and offset, camera frame, of wrist, index and little knuckle."""
     wrist, index, little = snapshot.points[20], snapshot.points[4], snapshot.points[16]
     (ax, ay, az), (bx, by, bz) = index - wrist, little - wrist
     normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
@@ -361,10 +313,7 @@ class Places:
 
 
 def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
-    """Return the outlines of hand parts that may occlude each marker.
-
-    The phalanges, the sleeve and the palm.
-    """
+    """Outlines of phalanges, sleeve and palm that may occlude each marker."""
     surface = _phalanges_before(snapshot, places)
     speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)
     sleeve = Shape(snapshot.sleeve[0], snapshot.speed_uv[SLEEVE_SPHERES[0]])
@@ -384,12 +333,7 @@ def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
 def things_before(
     snapshot: Snapshot, places: Places, k: int, depth_m: float, but: SeenPart | None = None
 ) -> Sequence[Shape]:
-    """Return the outlines of things that pass before marker `k`.
-
-    Nearer than a depth; parts of tracked objects are included.
-
-    `but` cannot hide it: its own bead, or what it is stuck on.
-    """
+    """Outlines of things and parts, but one, nearer than a depth before marker `k`."""
     if not (snapshot.things or snapshot.tracked.solid):
         return ()
     uv = places.uv[k]
@@ -416,10 +360,7 @@ def _sleeve_before(snapshot: Snapshot, places: Places) -> Bool:
 
 
 def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
-    """Return the depth (...) [m] of lines where they pass nearest to `uv`.
-
-    Lines from key points `a` to `b`; `uv` (..., 2) [px].
-    """
+    """Depth (...) [m] of lines `a` - `b` nearest to `uv` (..., 2) [px]."""
     start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
     share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
     share = np.minimum(np.maximum(share, 0.0), 1.0)

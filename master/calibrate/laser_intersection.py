@@ -1,15 +1,15 @@
 """Intersect the laser's fan with the skin of a finger, as the camera sees it.
 
-This is the forward function of a pose.
-
 The skin (`common.hand.skin`) is cut by a fan of rays from the laser; each lights what it meets first, the
-nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the image is
-put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are ignored.
+nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the
+image is put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover
+it, are ignored.
 
-**Smooth.** Whoever inverts it follows the point over hundredths of a degree, so nothing may jump by a ray. The fan ends
-at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing ray moves along the
-skin with the root of its angle. Where the line goes out of the camera's sight, the chord between the last ray that is
-seen and the first that is not counts by share: as far as the edge of the phalanx that hides the rest, or of its own.
+**Smooth.** Whoever inverts it follows the point over hundredths of a degree, so nothing may jump by a ray.
+The fan ends at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing
+ray moves along the skin with the root of its angle. Where the line goes out of the camera's sight, the chord
+between the last ray that is seen and the first that is not counts by share: as far as the edge of the phalanx
+that hides the rest, or of its own.
 
 Arrays within have the N fingers last: what is done is done to all of them.
 """
@@ -29,24 +29,15 @@ from master.rig.wrist import WristSetup
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserLine:
-    """The lit and seen line on fingers (...).
+    """The lit and seen line on fingers (...)."""
 
-    Attributes:
-        point_m: (..., 2) its centroid on the plane (across, along) [m]; NaN where the laser misses.
-        length_px: (...) of it in the undistorted image.
-        place: (...) mean number of the cone that it lies on; NaN where the laser misses.
-    """
-
-    point_m: Float
-    length_px: Float
-    place: Float
+    point_m: Float  # (..., 2) its centroid on the plane (across, along) [m]; NaN where the laser misses
+    length_px: Float  # (...) of it in the undistorted image
+    place: Float  # (...) mean number of the cone that it lies on; NaN where the laser misses
 
 
 class LaserIntersection:
-    """Intersection of one hand's fingers with one device's laser.
-
-    Its state was prepared by the constructor.
-    """
+    """Intersection of one hand's fingers with one device's laser."""
 
     def __init__(self, setup: WristSetup, rays: int = 64) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
@@ -60,12 +51,9 @@ class LaserIntersection:
         return other
 
     def __call__(self, angles_rad: Float) -> tuple[Float, Float, Float]:
-        """Return the laser points for joint angles and their places on the fingers.
+        """Points (5, C, A, 2) [m], lengths and places (5, C, A) for angles (C, A, 5, 4).
 
-        Points (5, C, A, 2) [m] of angles (C, A, 5, 4).
-
-        Returns:
-            As of `LaserLine`: points, lengths (5, C, A), places (5, C, A).
+        As of `LaserLine`.
         """
         spheres = self._surface.spheres(self._setup.model.chains(angles_rad))
         spheres = np.moveaxis(transform(self._setup.T_camera_palm, spheres), 2, 0)  # (5, C, A, K, 3)
@@ -77,7 +65,7 @@ class LaserIntersection:
         )
 
     def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> LaserLine:
-        """Compute the laser line on fingers given as spheres.
+        """The laser line on fingers given as spheres.
 
         Spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...).
         """
@@ -103,8 +91,7 @@ class LaserIntersection:
         step = points[:, 1:] - points[:, :-1]
         whole = lit[1:] & lit[:-1]
         # share of the finger's breadth that one chord may span: more is a jump from part to part
-        stretch = 0.25
-        whole &= (step * step).sum(axis=0) < (stretch * broad) ** 2
+        whole &= (step * step).sum(axis=0) < (0.25 * broad) ** 2
         first, last = _seen_part(clear[:-1], clear[1:])
         edges = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
         _at_edge(first, last, edges, clear, lines_of_sight, before, from_camera)
@@ -130,12 +117,11 @@ class LaserIntersection:
         return np.sin(angle) * across + np.cos(angle) * along
 
     def _tangents(self, spheres: Float, radius: Float, known: Float) -> tuple[Float, Float]:
-        """Return the angles (N,) [rad] of the first and last rays that touch a finger.
+        """Angles (N,) [rad] in the plane of the rays that touch a finger; 0: none does.
 
-        Rays in the plane; 0 where none does.
-
-        The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its quadric
-        (`common.geometry.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
+        The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its
+        quadric (`common.geometry.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2,
+        is 0.
         """
         flat = self._axes.flat(spheres)
         height = spheres @ self._setup.normal - self._setup.offset_m
@@ -148,10 +134,7 @@ class LaserIntersection:
         return np.nan_to_num(low), np.nan_to_num(high)
 
     def _sides(self, known: Float) -> tuple[Float, Float]:
-        """Return the angles (K - 1, N) of both rays that touch the side of each cone.
-
-        NaN where none does.
-        """
+        """Angles (K - 1, N) of both rays that touch the side of each cone; NaN: none."""
         d2, k0, lean, shift = known[6:10]
         axis = np.tensordot(self._axes.axes, known[:3], 1)  # (2, K - 1, N): across, along
         slope = d2 * np.tensordot(self._axes.axes, known[3:6], 1) + lean * axis
@@ -175,19 +158,13 @@ def _known(chain: Capsules, origin: Float) -> Float:
 
 
 def _hits(known: Float, rays: Float) -> Float:
-    """Return how far along the rays (3, R, N) the cones begin.
-
-    Cones of terms (12, K - 1, N); result (K - 1, R, N); inf: missed.
-    """
+    """Distance (K - 1, R, N) of cones along rays (3, R, N), by terms; inf: missed."""
     hits: Float = first_hits(known[:, :, None], rays[:, None])
     return hits
 
 
 def _seen_part(here: Float, there: Float) -> tuple[Float, Float]:
-    """Return the visible section (...) of chords from the clearance at their ends.
-
-    The section's first and last place; an end is visible where its clearance is above 0.
-    """
+    """Visible part, first and last place, of chords by the clearance at their ends."""
     with np.errstate(invalid="ignore", divide="ignore"):
         gone = here / (here - there)
     edges = (here > 0.0) != (there > 0.0)
@@ -210,7 +187,7 @@ def _at_edge(
         first, last: (R - 1, N) seen part of each chord, which is changed.
         edges: Indices of the chords of which one end is seen.
         clear: (R, N) how clearly rays are seen.
-        sights: (3, R, N) unit rays of the camera.
+        lines_of_sight: (3, R, N) unit rays of the camera.
         before: (K - 1, R, N) where the cones begin on them.
         from_camera: (12, K - 1, N) terms of the cones.
     """
@@ -234,11 +211,9 @@ def _at_edge(
 
 
 def _depths(known: Float, rays: Float) -> tuple[Float, Float]:
-    """Return the depths at which rays pass into both spheres and the side of cones.
+    """Depths (3, M) of rays (3, M) in spheres and side of cones; below 0: beside.
 
-    Rays (3, M), cones of terms (12, M), depths (3, M); below 0: beside them.
-
-    Also the feet (M,) of their hits of the side, as in `common.geometry.tapered_capsules`.
+    Cones of terms (12, M). Also the feet (M,) of hits of the side, as in `common.geometry.tapered_capsules`.
     """
     d2, k0, lean, shift, c1, c2 = known[6:]
     m2, m3 = (rays * known[:3]).sum(axis=0), (rays * known[3:6]).sum(axis=0)

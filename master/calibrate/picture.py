@@ -1,24 +1,7 @@
 """A calibration is drawn as a plot: what was seen, and what was fitted to it.
 
-Plots of a wrist device's calibration.
-
-Lines on boards, light of the LEDs, curls of the fingers.
-
-Plot of a guided motion: seen and fitted points.
-
-From above and in the image.
-
-Plot of a measured object: its beads from three sides.
-
-Also the residuals of each over time.
-
-Plot of a registration: the object's path by cameras and by tracker.
-
-Also the residuals over time.
-
-Plot of a mounting: laser points and tips, seen and fitted.
-
-Also how the wrist was flexed meanwhile.
+One PNG for laser plane, flat field, curls, subject, object, registration or mounting. Every `draw_...` raises
+RecordingError where the file cannot be written.
 """
 
 from collections.abc import Sequence
@@ -26,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from common.calibration.files import replacing
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import field_at
-from common.errors import RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import fit_rigid
 from master.calibrate.extrinsics.extrinsics import Extrinsics
+from master.calibrate.figures import figure_of, save_figure
 from master.calibrate.object.measure import Measurement
 from master.calibrate.tracker.registration import Registration
 from master.calibrate.wrist.curl import FingerCurl
@@ -48,13 +28,7 @@ BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
 def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
-    """Draw the laser lines and each view's distance from the plane, as PNG.
-
-    Lines in the image; from above, in the plane.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw laser lines in the image and from above, and each view's plane distance."""
     figure = figure_of((15.0, 4.6))
     figure.suptitle(
         f"laser plane: normal ± {np.degrees(fit.normal_sigma_rad):.3f} deg,"
@@ -75,17 +49,11 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
     bars.axhline(0.0, color=GREY, linewidth=0.8)
     bars.set(title="views off the plane [mm]; orange: left out", xlabel="view")
     bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
-    saved(figure, path)
+    save_figure(figure, path)
 
 
 def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
-    """Draw the flat field over the image and its residuals, as PNG.
-
-    Shown where white paper was seen.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw the flat field over the image, and its residuals where paper was seen."""
     figure = figure_of((15.0, 4.2))
     figure.suptitle(
         f"flat field: residual {100 * fit.rms:.2f} %, cross-validated {100 * fit.cross_validated_rms:.2f} %"
@@ -100,32 +68,18 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     figure.colorbar(drawn, ax=field)
     framed(left, optics, "residual [%]")
     limit = max(300.0 * fit.rms, 1.0)
-    dots = left.scatter(
-        samples.uv[:, 0],
-        samples.uv[:, 1],
-        c=100 * fit.residual,
-        s=6,
-        cmap="coolwarm",
-        vmin=-limit,
-        vmax=limit,
-    )
+    dots = left.scatter(*samples.uv.T, c=100 * fit.residual, s=6, cmap="coolwarm", vmin=-limit, vmax=limit)
     figure.colorbar(dots, ax=left)
     law.plot(np.linalg.norm(samples.xy, axis=1), 100 * fit.residual, ".", markersize=2, color=BLUE)
     law.axhline(0.0, color=GREY, linewidth=0.8)
     law.set(
         title="residual [%] by distance from the axis", xlabel="tangent of the angle", ylim=(-limit, limit)
     )
-    saved(figure, path)
+    save_figure(figure, path)
 
 
 def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
-    """Draw the fingers' laser points from above, and their lines, as PNG.
-
-    Lines from straight (o) to bent (x).
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw the laser points from above, with lines from straight (o) to bent (x)."""
     figure = figure_of((8.0, 6.5))
     axes = figure.subplots()
     for found, colour in zip(curls, FINGER_COLOURS, strict=True):
@@ -144,14 +98,7 @@ def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
         axes.plot(ends[1:, 0], ends[1:, 2], "x", color=colour)
     axes.set(title="laser points from above [mm]: o straight, x bent", xlabel="x", ylabel="z", aspect="equal")
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)  # not on the fingers
-    saved(figure, path)
-
-
-def figure_of(size: tuple[float, float]) -> Figure:
-    """An empty figure of a size [inches]."""
-    figure = Figure(figsize=size, dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    save_figure(figure, path)
 
 
 def framed(axes: Axes, optics: CameraModel, title: str) -> None:
@@ -159,27 +106,8 @@ def framed(axes: Axes, optics: CameraModel, title: str) -> None:
     axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
 
 
-def saved(figure: Figure, path: Path) -> None:
-    """Write a figure.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
-    try:
-        with replacing(path) as file:
-            figure.savefig(file, format="png")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write the picture: {error.strerror}") from error
-
-
 def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
-    """Draw laser points, fingertips and knuckles, seen and fitted, as PNG.
-
-    Laser points on their plane, fingertips and knuckles in the image; seen (dots) and fitted (rings).
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw laser points, fingertips and knuckles, seen (dots) and fitted (rings)."""
     model, fit, seen = found.model, found.fit, found.seen
     shown = model(fit.x, fit.angles_rad)
     used = np.isfinite(fit.off[..., 0])
@@ -198,17 +126,11 @@ def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
     image.plot(*optics.project(model.knuckles(found.unknown)).T, "x", color=BLUE, markersize=10)
     above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
     above.set_aspect("equal")
-    saved(figure, path)
+    save_figure(figure, path)
 
 
 def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
-    """Draw the beads with every observation, and the residuals over time, as PNG.
-
-    Object frame, from above, ahead and aside; the residuals are distances left over time.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw beads and observations in the object's frame, and residuals over time."""
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
     # Where each observation lies in the object: the bead less its residual, turned into its frame.
     rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
@@ -236,20 +158,14 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     time.set(title="from the rigid body [mm]; crosses: outliers", xlabel="time [s]")
     time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
     time.legend(fontsize=8, markerscale=3)
-    saved(figure, path)
+    save_figure(figure, path)
 
 
 _GREEN = "#2f855a"
 
 
 def draw_registration(path: Path, found: Registration) -> None:
-    """Draw the object's path and the offsets of position and rotation, as PNG.
-
-    From above and from the side (dots: cameras; lines: tracker); offsets over time.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw the object's path (dots: cameras; lines: tracker), and offsets over time."""
     fit = found.fit
     figure = figure_of((17.0, 8.4))
     figure.suptitle("\n".join(found.report[:2]))
@@ -257,10 +173,7 @@ def draw_registration(path: Path, found: Registration) -> None:
     seen = 1e3 * (fit.p_m + fit.off[:, :3])
     track_mm = 1e3 * fit.p_m.copy()
     track_mm[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
-    for axes, (a, b), title in (
-        (above, (0, 2), "from above [mm]"),
-        (side, (2, 1), "from the side [mm]"),
-    ):
+    for axes, (a, b), title in ((above, (0, 2), "from above [mm]"), (side, (2, 1), "from the side [mm]")):
         axes.plot(track_mm[:, a], track_mm[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
         axes.plot(
             seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
@@ -282,17 +195,11 @@ def draw_registration(path: Path, found: Registration) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.8)
         axes.set(title=title, xlabel="time [s]")
         axes.legend(fontsize=8)
-    saved(figure, path)
+    save_figure(figure, path)
 
 
 def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
-    """Draw observed and fitted points of a mounting, and the wrist over time, as PNG.
-
-    Laser points on their plane and fingertips in the image, seen (dots) and fitted (rings).
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Draw laser points and tips, seen (dots) and fitted (rings), and the wrist."""
     fit, cycles = found.fit, found.cycles
     seen = fit.shown + fit.off * fit.sigma  # tips as they were when the laser shone
     figure = figure_of((17.0, 5.4))
@@ -315,4 +222,4 @@ def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
         wrist.plot(cycles.t_s, np.degrees(values), ".", color=colour, label=name)
     wrist.set(title="the wrist [deg]", xlabel="time [s]")
     wrist.legend(fontsize=8)
-    saved(figure, path)
+    save_figure(figure, path)

@@ -1,15 +1,8 @@
 """The command `phalanx calibrate time` measures how late camera frames are.
 
-Delay of each camera's frames relative to its time stamps.
-
-From a recording of a moving hand.
-
-The estimator is that of the running master (`master.monitor.clocks`), over the whole recording and every frame. It is
-linear in the offset, so the recording is measured again, and a third time, with the stamps as they were found before.
-
-`phalanx calibrate time`: offsets of the cameras' time stamps.
-
-From a recording of a moving hand.
+A recording of a moving hand enters, offsets of the cameras' stamps leave. The estimator is that of the
+running master (`master.monitor.clocks`), over the whole recording and every frame. It is linear in the
+offset, so the recording is measured again, and a third time, with the stamps as they were found before.
 """
 
 from argparse import Namespace
@@ -26,14 +19,19 @@ from common.errors import CalibrationError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from common.recording.frame_recording import FrameRecording, open_recording
-from master.calibrate.tree_files import load_marker_rig, provenance, rig_in_tree, write_rig
-from master.commands.summary import write_summary
+from master.calibrate.tree_files import (
+    load_marker_rig,
+    print_lines,
+    provenance,
+    rig_in_tree,
+    write_report,
+    write_rig,
+)
 from master.monitor.clocks import ResidualTiming
 from master.monitor.timing_fit import TimeOffset
 from master.replay.recorded import recorded_detections
 
-"""Less sure than this an offset is not written: 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)."""
-SIGNIFICANT = 3.0
+SIGNIFICANT = 3.0  # standard deviations
 _ADVICE = (
     "record ten seconds of an open hand that all cameras see, swung to and fro about twice a second, up and down as "
     "well as sideways, half a metre from the cameras, with the fingers kept still"
@@ -42,27 +40,19 @@ _ADVICE = (
 
 @dataclass(frozen=True, slots=True)
 class CameraTime:
-    """Timing of one camera from a recording.
-
-    Attributes:
-        camera: Its name.
-        offset: How much later its frames are than its stamps, against the reference camera.
-    """
+    """Lag of one camera's frames behind its stamps, against the reference camera."""
 
     camera: str
     offset: TimeOffset
 
     @property
     def significant(self) -> bool:
-        """Whether the offset is not nought by chance."""
+        """Whether the offset is distinct from noise."""
         return abs(self.offset.offset_ns) > SIGNIFICANT * self.offset.sigma_ns
 
     @property
     def to_write_us(self) -> float:
-        """Return the offset for the rig file [us].
-
-        Nothing is corrected by a number that may be noise.
-        """
+        """The offset for the rig file [us]; 0 where it may be noise."""
         return round(1e-3 * self.offset.offset_ns, 1) if self.significant else 0.0
 
 
@@ -73,26 +63,21 @@ def measure_times(
 ) -> tuple[CameraTime, ...]:
     """Offsets of all cameras but the reference, which is the first.
 
-    Args:
-        models: Camera name -> model, in the rig's order.
-        frame_rate_hz: Camera name -> nominal rate.
-        messages: Detections of all cameras by their stamps, uncorrected.
+    Models and nominal rates are by camera, in the rig's order; detections by their stamps, uncorrected.
 
     Raises:
         CalibrationError: There is too little motion, or too little of it is seen by both cameras.
     """
     found = _pass(models, frame_rate_hz, messages)
-    passes = 3
-    for _ in range(passes - 1):
+    for _ in range(2):
         before = {camera: offset.offset_ns for camera, offset in found.items()}
         rest = _pass(models, frame_rate_hz, shifted(messages, before))
         found = {
             camera: replace(of, offset_ns=of.offset_ns + before.get(camera, 0.0))
             for camera, of in rest.items()
         }
-    for camera in tuple(models)[1:]:
-        sigma_at_most_ns = 1e6
-        if camera not in found or found[camera].sigma_ns > sigma_at_most_ns:
+    for camera in tuple(models)[1:]:  # 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)
+        if camera not in found or found[camera].sigma_ns > 1e6:
             raise CalibrationError(_refusal(next(iter(models)), camera, found.get(camera), messages))
     return tuple(CameraTime(camera, offset) for camera, offset in found.items())
 
@@ -102,9 +87,8 @@ def _pass(
     frame_rate_hz: Mapping[str, float],
     messages: Sequence[MarkerDetections],
 ) -> dict[str, TimeOffset]:
-    """Return the time offsets of the cameras for which they can be estimated."""
-    kept_blocks = 3600  # an hour of motion
-    machine = ResidualTiming(models, frame_rate_hz, kept_blocks=kept_blocks, rate_hz=np.inf)
+    """Time offsets of the cameras for which they can be estimated."""
+    machine = ResidualTiming(models, frame_rate_hz, kept_blocks=3600, rate_hz=np.inf)  # an hour of motion
     for message in messages:
         machine.push(message)
     machine.flush()
@@ -113,24 +97,15 @@ def _pass(
 
 
 def shifted(messages: Sequence[MarkerDetections], late_ns: Mapping[str, float]) -> list[MarkerDetections]:
-    """Shift the messages to their true times.
-
-    For frames of a camera that are `late_ns` later than its stamps.
-    """
+    """The messages at their true times, for frames `late_ns` later than their stamps."""
     late = {camera: round(ns) for camera, ns in late_ns.items()}
-    moved = [
-        msgspec.structs.replace(message, t_ns=message.t_ns + late[message.camera])
-        if late.get(message.camera)
-        else message
-        for message in messages
-    ]
+    moved = [msgspec.structs.replace(one, t_ns=one.t_ns + late.get(one.camera, 0)) for one in messages]
     return sorted(moved, key=lambda message: message.t_ns)
 
 
 def _refusal(
     reference: str, camera: str, offset: TimeOffset | None, messages: Sequence[MarkerDetections]
 ) -> str:
-    """Explain why a camera's time offset cannot be estimated, and what to do."""
     known = "" if offset is None else f", only to {1e-6 * offset.sigma_ns:.1f} ms (standard deviation)"
     parts = ", ".join(
         f"{name}: {seconds:.1f} s, {speed:.0f} px/s"
@@ -142,10 +117,7 @@ def _refusal(
 def _motion(
     messages: Sequence[MarkerDetections], cameras: tuple[str, str]
 ) -> list[tuple[str, tuple[float, float]]]:
-    """Return how long each camera saw markers [s], and their rms speed [px/s].
-
-    Speed: root of the mean square.
-    """
+    """How long each camera saw markers [s], and their rms speed [px/s]."""
     out: list[tuple[str, tuple[float, float]]] = []
     for camera in cameras:
         frames = [message for message in messages if message.camera == camera]
@@ -163,16 +135,12 @@ def _motion(
 
 
 def time_command(options: Namespace) -> None:
-    """Measure how much later a camera's frames are than its time stamps.
-
-    From a hand that moves.
-    """
+    """Measure how much later frames are than their stamps, from a moving hand."""
     opened = open_recording(options.recording)
     used, cameras = geometry_of(opened, options.rig, options.calibration)
     base = rig_in_tree(options.out, options.rig or used.name, used)
     times = measure(opened, used, cameras, options.detections)
-    for line in report_lines(used, times):
-        echo(line)
+    print_lines(report_lines(used, times))
     written: Path | None = None
     if options.out is None:
         echo("nothing written: give --out DIR")
@@ -181,11 +149,7 @@ def time_command(options: Namespace) -> None:
             options.out, options.rig or used.name, base, times, options.recording.resolve().name
         )
         echo(f"wrote {written}: stamp_offset_us")
-    if options.json_file is not None:
-        write_summary(
-            options.json_file,
-            report_json(used, times) | {"written": None if written is None else str(written)},
-        )
+    write_report(options.json_file, report_json(used, times), written)
 
 
 def geometry_of(
@@ -210,10 +174,7 @@ def geometry_of(
 
 
 def measure(
-    recording: FrameRecording,
-    rig: RigCalibration,
-    cameras: Mapping[str, CameraCalibration],
-    detections: Path,
+    recording: FrameRecording, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], detections: Path
 ) -> tuple[CameraTime, ...]:
     """Offsets of the cameras of a recording, by their stamps as they were recorded.
 
@@ -228,11 +189,20 @@ def measure(
     if len(rig.cameras) < 2:
         raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
     models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
+    rates = {name: cameras[name].frame_rate_hz for name in rig.cameras}
+    return measure_times(models, rates, detections_of(rig, detections))
+
+
+def detections_of(rig: RigCalibration, detections: Path) -> list[MarkerDetections]:
+    """Recorded detections of a rig's cameras, by their stamps.
+
+    Raises:
+        RecordingError: A detections file is missing or broken.
+    """
     messages = [
         message for name in rig.cameras for message in recorded_detections(detections, name, len(rig.markers))
     ]
-    messages.sort(key=lambda message: message.t_ns)
-    return measure_times(models, {name: cameras[name].frame_rate_hz for name in rig.cameras}, messages)
+    return sorted(messages, key=lambda message: message.t_ns)
 
 
 def report_lines(rig: RigCalibration, times: tuple[CameraTime, ...]) -> list[str]:
@@ -267,9 +237,7 @@ def report_json(rig: RigCalibration, times: tuple[CameraTime, ...]) -> dict[str,
 def write_offsets(
     out: Path, file_name: str, rig: RigCalibration, times: tuple[CameraTime, ...], data: str
 ) -> Path:
-    """Write rigs/<file_name>.json with the offsets and their provenance.
-
-    Offsets within noise are written as 0.
+    """Write rigs/<file_name>.json with the offsets (noise as 0) and their provenance.
 
     Raises:
         CalibrationError: The file cannot be written; the old one is untouched.

@@ -1,14 +1,11 @@
 """A calibration tree keeps cameras, rigs and hands as files.
 
-Reading from and writing to a calibration tree.
-
-Which rig file gets a result, and where it comes from. A file is written whole or not at all.
-
-Conversion of lenses and poses between fit arrays and calibration file types.
-
-Numbers are rounded as they are written.
+Which rig file gets a result, its provenance, and the conversion between fit arrays and file types. A file is
+written whole or not at all; numbers are rounded as they are written.
 """
 
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,11 +19,15 @@ from common.calibration import (
     Matrix4,
     Provenance,
     RigCalibration,
+    Vector3,
     load,
     save,
 )
-from common.errors import CalibrationError
+from common.calibration.object_profile import ObjectProfile
+from common.command_line import echo
+from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
+from master.commands.summary import write_summary
 
 
 def date_now() -> str:
@@ -35,13 +36,9 @@ def date_now() -> str:
 
 
 def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], note: str = "") -> Provenance:
-    """Of a result that was made now.
+    """Provenance of a result that was made now, by a command as "calibrate depth".
 
-    Args:
-        tool: The command, such as "calibrate depth".
-        data: Names of what it was measured from.
-        residual: Quantity with its unit -> value.
-        note: What else a reader should know.
+    `data` are names of what it was measured from, `residual` a quantity with its unit -> value.
     """
     return Provenance(date=date_now(), tool=tool, data=data, residual=residual, note=note)
 
@@ -60,9 +57,7 @@ def load_marker_rig(calibration: Path, name: str) -> RigCalibration:
 
 
 def rig_in_tree(out: Path | None, file_name: str, rig: RigCalibration) -> RigCalibration:
-    """Return the rig file that gets a result.
-
-    The one in the tree `out` where there is one, else `rig` itself.
+    """The rig file that gets a result: the one in `out` if there, else `rig` itself.
 
     Raises:
         CalibrationError: The one in `out` is broken, or has other cameras, or another first one.
@@ -87,6 +82,11 @@ def write_rig(out: Path, file_name: str, rig: RigCalibration) -> Path:
     return _write(_path(out, "rigs", file_name), rig)
 
 
+def write_object(out: Path, profile: ObjectProfile) -> Path:
+    """Write objects/<name>.json of the tree `out`; as `write_rig`."""
+    return _write(_path(out, "objects", profile.name), profile)
+
+
 def write_camera(out: Path, file_name: str, camera: CameraCalibration) -> Path:
     """Write cameras/<file_name>.json of the tree `out`; as `write_rig`."""
     return _write(_path(out, "cameras", file_name), camera)
@@ -101,13 +101,44 @@ def _path(out: Path, folder: str, name: str) -> Path:
     return out / folder / f"{name}.json"
 
 
-def _write(path: Path, value: RigCalibration | CameraCalibration | HandProfile) -> Path:
+def _write(path: Path, value: RigCalibration | CameraCalibration | HandProfile | ObjectProfile) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
     save(path, value)
     return path
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines for a person."""
+    for line in lines:
+        echo(line)
+
+
+def write_report(file: Path | None, report: dict[str, object], written: Path | None) -> None:
+    """Write the figures of a calibration as JSON, if asked for, and where it is.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    if file is not None:
+        write_summary(file, report | {"written": None if written is None else str(written)})
+
+
+@contextmanager
+def refusals_named(where: object) -> Generator[None, None, None]:
+    """Refusals (FitError) in the block begin with what was measured."""
+    try:
+        yield
+    except FitError as error:
+        raise FitError(f"{where}: {error}") from error
+
+
+def vector_of(value: Float) -> Vector3:
+    """A position (3,) [m], rounded to a tenth of a micrometre."""
+    x, y, z = (round(float(number), 7) + 0.0 for number in value)
+    return x, y, z
 
 
 _FIGURES = 9  # decimals: nanometres, and far below any standard deviation
@@ -120,7 +151,7 @@ def intrinsics_of(lens: Float) -> Intrinsics:
 
 
 def lens_of(intrinsics: Intrinsics) -> Float:
-    """The same back (9,)."""
+    """The lens (9,) in the order of `bundle.LENS`."""
     return np.array(
         [intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *intrinsics.distortion]
     )

@@ -1,17 +1,4 @@
-"""Facts of the checklist: plan, present state, slaves' reports, recent counts.
-
-Inputs of the checklist: the plan and the present state.
-
-How things were planned (the files), and how the master finds them at one look.
-
-Counter increments over the last second or so.
-
-The counters only rise; the increments show what happens now, not since the start.
-
-Reports of a slave about itself.
-
-Its last reports, and what happened between two of them.
-"""
+"""Facts of the checklist: plan, present state, slaves' reports, recent counts."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,101 +11,67 @@ from master.run.link_senders import MarkerCounts, RejectedPeer
 
 @dataclass(frozen=True, slots=True)
 class CameraPlan:
-    """What a camera is to be, by the files that the master uses.
-
-    Attributes:
-        name: Camera.
-        rate_hz: Frames per second.
-        size_px: Width and height.
-        wrist: It belongs to a wrist device and sends strobe cycles.
-        hands: Of each hand that it watches, the markers that sit on it.
-        markers: All that its rigs name, those on objects too: what it reports of others is none of the rig's.
-    """
+    """What a camera is to be, by the files that the master uses."""
 
     name: str
     rate_hz: float
     size_px: tuple[int, int]
-    wrist: bool
-    hands: tuple[tuple[str, ...], ...]
+    wrist: bool  # it belongs to a wrist device and sends strobe cycles
+    hands: tuple[tuple[str, ...], ...]  # of each hand that it watches, the markers that sit on it
+    # all that its rigs name, those on objects too: what it reports of others is none of the rig's
     markers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Who is to be there.
+    """Who is to be there."""
 
-    Attributes:
-        cameras: All cameras, each once.
-        imus: All IMUs.
-        groups: Of each hand the marker cameras whose rays meet, and how many markers they watch.
-    """
-
-    cameras: tuple[CameraPlan, ...]
+    cameras: tuple[CameraPlan, ...]  # each once
     imus: tuple[str, ...]
+    # of each hand the marker cameras whose rays meet, and how many markers they watch
     groups: tuple[tuple[tuple[str, ...], int], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SenderNow:
-    """State of one camera or IMU, as received by the master.
+    """State of one camera or IMU, as received by the master."""
 
-    Attributes:
-        connected: Received within the last second.
-        received, missed: Messages that were taken, and that were sent and could not be (lost, or too late), so far.
-        clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
-        duplicate: Where a second process under its name was rejected lately; None: there was none.
-        unknown_peer: Where it speaks another wire version, and which; None: it does not.
-        unproven: Where somebody claims to be it, without its secret; None: nobody does.
-        markers: How many markers it sends where its rig has another number; None: as many as the rig has.
-    """
-
-    connected: bool
-    received: int
-    missed: int
-    clock_sigma_ns: float | None
+    connected: bool  # received within the last second
+    received: int  # messages that were taken so far
+    missed: int  # messages that were sent and could not be taken (lost, or too late) so far
+    clock_sigma_ns: float | None  # standard deviation of its clock's offset now [ns]; None: not known
+    # where a second process under its name was rejected lately; None: there was none
     duplicate: RejectedPeer | None = None
+    # where it speaks another wire version, and which; None: it does not
     unknown_peer: RejectedPeer | None = None
+    # where somebody claims to be it, without its secret; None: nobody does
     unproven: RejectedPeer | None = None
+    # how many markers it sends where its rig has another number; None: as many as the rig has
     markers: MarkerCounts | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MasterNow:
-    """What the master counted by one look.
+    """What the master counted by one look."""
 
-    Attributes:
-        started: The start was given: cameras send.
-        senders: Camera or IMU -> how it is received.
-        groups: Of each group of the plan what its pipeline counted.
-        disk_free_mb: Left on the disk that the master writes to [MB]; None: not known.
-        files: What is wrong with the files.
-    """
-
-    started: bool
+    started: bool  # the start was given: cameras send
     senders: Mapping[str, SenderNow]
-    groups: Sequence[Mapping[str, int]]
-    disk_free_mb: float | None
-    files: tuple[CheckItem, ...] = ()
+    groups: Sequence[Mapping[str, int]]  # of each group of the plan what its pipeline counted
+    disk_free_mb: float | None  # left on the disk that the master writes to [MB]; None: not known
+    files: tuple[CheckItem, ...] = ()  # what is wrong with the files
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Verdict of one rule on one subject at one look.
-
-    Attributes:
-        code, subject, sentence, fix: As of `CheckItem`.
-        wrong: None: not known, or between the two bounds.
-        senders: Which cameras or IMUs are concerned; none named: the subject itself.
-        markers: Which of their markers; none named: all of the sender.
-    """
+    """Verdict of one rule on one subject at one look; fields as in `CheckItem`."""
 
     code: CheckCode
     subject: str
-    wrong: bool | None
+    wrong: bool | None  # None: not known, or between the two bounds
     sentence: str
     fix: str
-    senders: tuple[str, ...] = ()
-    markers: tuple[str, ...] = ()
+    senders: tuple[str, ...] = ()  # which cameras or IMUs are concerned; none named: the subject itself
+    markers: tuple[str, ...] = ()  # which of their markers; none named: all of the sender
 
     @property
     def key(self) -> tuple[CheckCode, str]:
@@ -137,10 +90,7 @@ class Verdict:
 
 
 def beyond(value: float, show: float, clear: float) -> bool | None:
-    """Compare `value` with two thresholds, with hysteresis.
-
-    Above `show`: wrong; below `clear`: well; between them nothing changes.
-    """
+    """Compare with hysteresis: `show` or more: wrong; below `clear`: well; else None."""
     return True if value >= show else False if value < clear else None
 
 
@@ -165,10 +115,7 @@ def plan_of(setups: Iterable[RigSetup]) -> Plan:
 
 
 class Window:
-    """Push machine that holds recent snapshots of counters.
-
-    It keeps the snapshots of the last `span_ns` and one before.
-    """
+    """Push machine that keeps counters of the last `span_ns`, and one look before."""
 
     def __init__(self, span_ns: int) -> None:
         """Look back so far [ns]."""
@@ -176,10 +123,7 @@ class Window:
         self._looks: deque[tuple[int, tuple[int, ...]]] = deque()
 
     def push(self, t_ns: int, *counters: int) -> None:
-        """Add a snapshot of the counters.
-
-        A counter that has fallen belongs to another process, so the window then starts again.
-        """
+        """Add a look; where a counter has fallen, another process counts: start again."""
         if self._looks and any(now < old for now, old in zip(counters, self._looks[-1][1], strict=True)):
             self._looks.clear()
         self._looks.append((t_ns, counters))
@@ -213,20 +157,14 @@ class Window:
 
 
 class SlaveReports:
-    """Push machine over the reports of one process.
-
-    Holds the newest report, and the one that it is compared with.
-
-    Attributes:
-        number: How many comparisons there were: a rule looks at each once.
-    """
+    """Push machine over the reports of one process."""
 
     def __init__(self) -> None:
         """Start with no report received."""
         self._now: Health | None = None
         self._before: Health | None = None
         self._came_ns = 0
-        self.number = 0
+        self.number = 0  # of comparisons: a rule looks at each once
 
     def push(self, health: Health, t_ns: int) -> None:
         """Take a report that came at `t_ns` [ns]."""
@@ -244,13 +182,13 @@ class SlaveReports:
         self._now = health
 
     def is_recent(self, t_ns: int) -> bool:
-        """Return true if the newest report is recent."""
+        """Whether the newest report is recent."""
         stale_ns = 3_000_000_000  # reports come twice a second; of an older one nothing is concluded
         return self._now is not None and t_ns - self._came_ns < stale_ns
 
     @property
     def session(self) -> int | None:
-        """Return the session of the process that sent the newest report."""
+        """Session of the process that sent the newest report."""
         return None if self._now is None else self._now.session
 
     @property
@@ -269,10 +207,7 @@ class SlaveReports:
         return {} if self._now is None else self._now.counts
 
     def increase(self, event: str) -> int | None:
-        """Return how often an event happened between the last two reports.
-
-        None: it is not reported, or there are no two.
-        """
+        """How often an event happened between the last two reports; None: not known."""
         if self._now is None or self._before is None or event not in self._now.counts:
             return None
         return max(self._now.counts[event] - self._before.counts.get(event, 0), 0)

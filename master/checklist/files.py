@@ -1,12 +1,7 @@
 """Check the files of a rig, before it runs or while it does.
 
-`phalanx check`: the checklist of a running master in the terminal.
-
-The exit code states whether all is well.
-
-Problems of the calibration files on the disk.
-
-Missing, or older than what they rest on.
+Calibration files may be missing, or older than what they rest on. `phalanx check` prints the checklist of a
+running master; the exit code states whether all is well.
 """
 
 from argparse import Namespace
@@ -48,11 +43,7 @@ def check(options: Namespace) -> int:
 
 
 def newest(lists: Subscription, where: str) -> tuple[CheckItem, ...]:
-    """The next list.
-
-    Raises:
-        BusError: None comes.
-    """
+    """The next list; BusError: none comes."""
     answer = lists.get(ANSWER_S)
     if not isinstance(answer, Checklist):
         raise BusError(f"no checklist on {where} for {ANSWER_S:g} s: does a master run there?")
@@ -83,10 +74,7 @@ PartT = TypeVar("PartT", bound=Struct)
 
 
 class FileMonitor:
-    """Monitor of the files of the running rigs.
-
-    Holds how they were, and what was wrong with them.
-    """
+    """Monitor of the files of the running rigs."""
 
     def __init__(self, calibration: Path, rigs: tuple[str, ...]) -> None:
         """Watch these rigs of a calib_json tree, and what they name."""
@@ -108,13 +96,7 @@ class FileMonitor:
 
 
 def judge(calibration: Path, rigs: tuple[str, ...], plan: Plan) -> tuple[CheckItem, ...]:
-    """What is wrong with the files of these rigs, each code and subject once.
-
-    Args:
-        calibration: calib_json tree.
-        rigs: Names of rigs that run.
-        plan: What the files in use state.
-    """
+    """What is wrong with the files of rigs; `plan` is what the files in use state."""
     found: dict[tuple[str, str], CheckItem] = {}
     for name in rigs:
         for item in _judge_rig(calibration, name, {one.name: one for one in plan.cameras}):
@@ -192,10 +174,7 @@ _NEEDS_LENS = {
 
 
 def _older(part: Provenance | None, base: Provenance | None) -> bool:
-    """Return true if `part` was measured before `base`, on which it rests.
-
-    Of a part without a date nothing is known.
-    """
+    """Whether `part` was measured before its `base`; undated: not known, False."""
     if part is None or base is None:
         return False
     return datetime.fromisoformat(part.date) + TOGETHER < datetime.fromisoformat(base.date)

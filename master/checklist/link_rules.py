@@ -29,9 +29,8 @@ class _Received:
         self.came_ns = 0  # last message
         span_ns = 1_400_000_000  # what counts as now: with two looks to notice it stays below two seconds
         self.messages = Window(span_ns)
-        self.frames = Window(
-            span_ns
-        )  # of the slave's reports: of a wrist device not every frame is a message
+        # of the slave's reports: of a wrist device not every frame is a message
+        self.frames = Window(span_ns)
         self.report = 0
 
     def push(self, t_ns: int, now: SenderNow) -> None:
@@ -52,10 +51,7 @@ class _Received:
 
 
 class LinkRules:
-    """Push machine of the link rules.
-
-    Holds when the first look was, and how each sender was received.
-    """
+    """Push machine of the link rules."""
 
     def __init__(self) -> None:
         """Start with no sender received."""
@@ -133,10 +129,7 @@ class LinkRules:
         )
 
     def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
-        """Return true if a sender is not received.
-
-        At once where it was there, after a grace period where it never was.
-        """
+        """Whether a sender is not received; with a grace period if it never was."""
         assert self._first_ns is not None
         if sender.connected:
             return False

@@ -1,21 +1,14 @@
 """Publisher sends the checklist that a monitor derives from all rules.
 
-Checklist as a push machine.
-
-Reports and counts in, current problems out. No clock, no socket.
-
-Four things keep it quiet:
+The monitor is a push machine: reports and counts in, current problems out; no clock, no socket. The publisher
+feeds and publishes it five times a second, on a thread of its own, since the one that reports stands still
+while changed files are read. Four things keep the list quiet:
 
 - *Bounds*: what is wrong above one bound is well only below a lower one (`facts.beyond`).
 - *Time*: what may be the consequence of something else is reported `HOLD_NS` later than that would be.
-- *Causes*: while one thing is wrong, what follows from it is not reported, nor for `AFTER_NS` (`BACK_NS`) after, while
-  windows still hold what was. A camera that is away is not slow, loses nothing, sees nothing; its table is `_FOLLOWS`.
+- *Causes*: while one thing is wrong, what follows from it is not reported, nor for a while after, while windows still
+  hold what was. A camera that is away is not slow, loses nothing, sees nothing (`_FOLLOWS`).
 - *Coming up*: a sender that has just come, or the master, is given the time that its first numbers take.
-
-Publisher of the checklist of a running master.
-
-Feeds it and publishes it five times a second, on a thread of its own, since the one that reports stands still while
-changed files are read.
 """
 
 import threading
@@ -71,10 +64,7 @@ _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
 
 
 class _Latch:
-    """Latch that decides if one thing is wrong.
-
-    Holds since when it seems to be, and what was last reported of it.
-    """
+    """Decides if one thing is wrong, and holds since when and what was reported."""
 
     def __init__(self) -> None:
         self.since_ns: int | None = None
@@ -93,10 +83,7 @@ class _Latch:
 
 
 class ChecklistMonitor:
-    """Monitor that evaluates all checklist rules.
-
-    Holds the state of each rule, what is wrong, and until when each cause silences what follows from it.
-    """
+    """Monitor that evaluates all checklist rules."""
 
     def __init__(self, plan: Plan) -> None:
         """Watch who is to be there by `plan`."""
@@ -108,20 +95,14 @@ class ChecklistMonitor:
         self.follow(plan)
 
     def follow(self, plan: Plan) -> None:
-        """Continue with other files of the same senders.
-
-        What slaves report is judged anew.
-        """
+        """Continue with other files of the same senders; slaves are judged anew."""
         self._plan = plan
         cameras = {camera.name: camera for camera in plan.cameras}
         self._slaves = {name: SlaveRules(cameras.get(name)) for name in (*cameras, *plan.imus)}
         self._moved = [MovedRule() for _ in plan.groups]
 
     def push_health(self, health: Health, t_ns: int) -> None:
-        """Take the report of a slave that came at `t_ns` [ns].
-
-        Reports of anybody else are ignored.
-        """
+        """Take a report that came at `t_ns` [ns]; ignored where it is of no slave."""
         if health.source in self._slaves:
             self._reports.setdefault(health.source, SlaveReports()).push(health, t_ns)
 
@@ -130,10 +111,7 @@ class ChecklistMonitor:
         self._now = now
 
     def look(self, t_ns: int) -> tuple[CheckItem, ...]:
-        """Return the current problems at `t_ns` [ns], which rises.
-
-        Each code and subject once, in the codes' order.
-        """
+        """Current problems at rising `t_ns` [ns], each once, in the codes' order."""
         if self._now is None:
             return ()
         judged: set[tuple[CheckCode, str]] = set()
@@ -151,11 +129,8 @@ class ChecklistMonitor:
         self._causes = {key: cause for key, cause in self._causes.items() if cause[1] > t_ns}
         reported = [verdict for verdict in shown if not self._follows(verdict, shown)]
         for verdict in reported:
-            # after ns
-            back_ns = 500_000_000
-            after_ns = (
-                back_ns if verdict.code in _ABSENT else 2_500_000_000
-            )  # who comes back settles by its own rules
+            back_ns, settled_ns = 500_000_000, 2_500_000_000  # who comes back settles by its own rules
+            after_ns = back_ns if verdict.code in _ABSENT else settled_ns
             self._causes[verdict.key] = verdict, t_ns + after_ns
         reported.sort(key=lambda one: (CODES.index(one.code), one.subject))
         return tuple(one.item() for one in reported[:MAX_CHECKS])
@@ -184,90 +159,50 @@ class ChecklistMonitor:
         )
 
 
-class Received(Protocol):
-    """Interface to what the master receives; an `Ingest`."""
+class _Received(Protocol):
+    """What the publisher needs of an `Ingest`."""
 
     @property
-    def quarantine(self) -> Quarantine:
-        """Where faults are counted and logged."""
-        ...
-
+    def quarantine(self) -> Quarantine: ...
     @property
-    def started(self) -> bool:
-        """Whether the start was given."""
-        ...
-
+    def started(self) -> bool: ...
     @property
-    def connected(self) -> frozenset[str]:
-        """Return the senders received within the last second."""
-        ...
-
-    def counts_of(self, sender: str) -> CameraCounts:
-        """What became of its messages."""
-        ...
-
-    def clock_of(self, camera: str) -> ClockEstimate | None:
-        """How its clock runs."""
-        ...
-
+    def connected(self) -> frozenset[str]: ...
+    def counts_of(self, sender: str) -> CameraCounts: ...
+    def clock_of(self, camera: str) -> ClockEstimate | None: ...
     def rejected_peers(
         self,
-    ) -> tuple[Mapping[str, RejectedPeer], Mapping[str, RejectedPeer], Mapping[str, RejectedPeer]]:
-        """Return the rejected processes of each sender, by reason.
-
-        Sender -> where a second process of its name was rejected lately; where it speaks another version; where
-        somebody sends a hello without its secret.
-        """
-        ...
-
-    def marker_counts(self) -> Mapping[str, MarkerCounts]:
-        """Camera -> how many markers its slave sent lately and its rig has here.
-
-        Of those cameras alone where the two differ.
-        """
-        ...
+    ) -> tuple[Mapping[str, RejectedPeer], Mapping[str, RejectedPeer], Mapping[str, RejectedPeer]]: ...
+    def marker_counts(self) -> Mapping[str, MarkerCounts]: ...
 
 
-class Counting(Protocol):
-    """The pipeline of one hand; a `LivePipeline`."""
+class _Counting(Protocol):
+    """What the publisher needs of a `LivePipeline`."""
 
     @property
-    def counts(self) -> Mapping[str, int]:
-        """Events since the start."""
-        ...
+    def counts(self) -> Mapping[str, int]: ...
 
 
 class ChecklistPublisher:
-    """Publisher of the checklist; belongs to one thread.
-
-    Holds the monitor, its subscription, and what was published last.
-    """
+    """Publisher of the checklist; belongs to one thread."""
 
     def __init__(
         self,
         bus: Bus,
         clock: Clock,
-        received: Received,
+        received: _Received,
         setups: Sequence[RigSetup],
-        pipelines: Sequence[Counting],
+        pipelines: Sequence[_Counting],
         files: FileMonitor | None,
         session: int,
         writes_to: Path,
     ) -> None:
-        """Begin.
+        """Begin, with the setups and pipelines of all hands in one order.
 
         Args:
-            bus: Where slaves report and the list is published.
-            clock: The master's.
-            received: What is received of the senders.
-            setups: Of each hand, as they are in use.
-            pipelines: Of each setup.
             files: Of the rigs; None: nobody watches them.
             session: Random id of the master.
             writes_to: A folder on the disk that results go to.
-
-        Raises:
-            BusError: The bus is closed.
         """
         self._bus, self._clock, self._received, self._files = bus, clock, received, files
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
@@ -280,10 +215,7 @@ class ChecklistPublisher:
         self._published_ns = 0
 
     def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]] | None) -> None:
-        """Look again and again until the stop.
-
-        `setups` returns which are in use.
-        """
+        """Look again and again until the stop; `setups` returns which are in use."""
         poll_s = 0.2
         while not stop.wait(poll_s):
             try:
@@ -297,13 +229,7 @@ class ChecklistPublisher:
                 self._received.quarantine.note(MASTER, error)
 
     def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
-        """Look once, and publish where it is due.
-
-        `setups` that are in use now, None: as before.
-
-        Raises:
-            BusError: The bus is closed.
-        """
+        """Look once, publish where due; `setups` None: as before; BusError: bus closed."""
         t_ns = self._clock.now_ns()
         if setups is not None and tuple(setups) != self._setups:
             self._setups = tuple(setups)
@@ -343,8 +269,5 @@ class ChecklistPublisher:
 
 
 def _keys(items: tuple[CheckItem, ...] | None) -> list[tuple[str, str]] | None:
-    """Return code and subject of each published item, without its sentence.
-
-    The numbers in the sentences change all the time.
-    """
+    """Code and subject of each item: the numbers in sentences change all the time."""
     return None if items is None else [(item.code, item.subject) for item in items]

@@ -1,25 +1,13 @@
 """Rules judge what slaves report, what their cameras miss, and who moved.
 
-Markers of a hand that one camera does not find though it finds the others.
+A hand hides its own markers all the time, so what is not seen now means nothing. Three things mean that a
+colour, a range of colours or a cap is wrong:
 
-The cause is a wrong marker colour, or a wrong range of colours.
-
-A hand hides its own markers all the time, so what is not seen now means nothing. Three things mean something:
-
-1. It was seen, its colours were changed, and now it is not: that was the change. Reported after `CHANGED_S`.
-2. It was never seen since this slave, or these colours, began: a hand that comes shows all of its caps soon. After
-   `NEVER_S`.
+1. It was seen, its colours were changed, and now it is not: that was the change. Reported after 0.9 s.
+2. It was never seen since this slave, or these colours, began: a hand soon shows all of its caps. After 5 s.
 3. It has not been seen for as long as no pose hides it: `GONE_S`. The cap has come off, or is dirty.
 
 Only time counts in which at least three others (all, of a hand with fewer) are found in half of the frames.
-
-Rules on the reports of slaves about themselves.
-
-Camera settings, light, colours, markers, temperature, disk, strobe.
-
-Rule that detects a moved camera.
-
-Checks that the rays of the cameras still meet: those of a camera that was knocked miss those of the others.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,8 +23,6 @@ SEEN = "seen."
 
 
 class _Marker:
-    """What became of one marker."""
-
     def __init__(self) -> None:
         self.colour: float | None = None
         self.ever = self.before_change = False
@@ -50,10 +36,7 @@ class _Marker:
 
 
 class UnseenMarkers:
-    """Push machine that times how long each marker of one hand has been missing.
-
-    It reads the reports of one slave.
-    """
+    """Push machine on one slave's reports: how long each marker has been missing."""
 
     def __init__(self, camera: str, markers: tuple[str, ...]) -> None:
         """Watch these markers."""
@@ -92,10 +75,7 @@ class UnseenMarkers:
 
     @staticmethod
     def _recoloured(one: _Marker, colour: float | None) -> bool:
-        """Store the marker's colour number and return whether it has changed.
-
-        After a change the timing starts again.
-        """
+        """Store the marker's colour; True: it changed, and the timing starts again."""
         changed = one.colour is not None and colour is not None and colour != one.colour
         if changed:
             one.before_change = one.ever or one.before_change
@@ -129,10 +109,7 @@ FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is thrott
 
 
 class SlaveRules:
-    """Push machine over the reports of one slave.
-
-    Holds what each rule that needs two reports found last.
-    """
+    """Push machine over the reports of one slave."""
 
     def __init__(self, camera: CameraPlan | None) -> None:
         """Of a camera, or of an IMU (None)."""
@@ -142,10 +119,7 @@ class SlaveRules:
         self._kept: list[Verdict] = []
 
     def look(self, name: str, reports: SlaveReports, t_ns: int) -> Iterator[Verdict]:
-        """Return all verdicts from the last reports of a slave.
-
-        Nothing where they are old.
-        """
+        """All verdicts from the last reports of a slave; nothing where they are old."""
         if not reports.is_recent(t_ns):
             return
         if reports.number != self._judged:
@@ -333,10 +307,7 @@ def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 
 
 class MovedRule:
-    """Push machine over the counters of one pipeline.
-
-    Holds its counters of the last second.
-    """
+    """Push machine over the counters of one pipeline: whether the rays still meet."""
 
     def __init__(self) -> None:
         """Nothing was counted yet."""

@@ -7,14 +7,20 @@ from common.command_line import number, whole
 from master.commands.options import (
     add_bus,
     add_calibration,
+    add_choice,
+    add_flag,
     add_joints,
     add_json,
     add_keys,
     add_link,
+    add_names,
+    add_number,
     add_out,
+    add_path,
     add_picture,
     add_recording_rig,
     add_rig,
+    add_text,
 )
 
 
@@ -40,88 +46,55 @@ def add_board(command: ArgumentParser, size: str | None = None, square_mm: float
 
 def add_markers_of_board(command: ArgumentParser) -> None:
     """The markers of a ChArUco board."""
-    command.add_argument(
-        "--marker-mm", type=number(), metavar="MM", help="side of a marker: the board is a ChArUco board"
-    )
+    add_number(command, "--marker-mm", "MM", "side of a marker: the board is a ChArUco board")
     add_dictionary(command)
 
 
 def add_dictionary(command: ArgumentParser) -> None:
     """The family of these markers."""
-    command.add_argument(
-        "--dictionary", default="4X4_50", metavar="NAME", help="family of its markers (default: %(default)s)"
-    )
+    add_text(command, "--dictionary", "NAME", "family of its markers", default="4X4_50")
 
 
 def add_pictures(command: ArgumentParser) -> None:
     """The pictures of a board."""
-    command.add_argument(
-        "source",
-        type=Path,
-        metavar="SOURCE",
-        help="folder: CAMERA*.png|jpg, or a folder per camera, or a recording",
-    )
+    add_path(command, "source", "SOURCE", "folder: CAMERA*.png|jpg, or a folder per camera, or a recording")
 
 
 def add_cameras(command: ArgumentParser) -> None:
     """Which cameras."""
-    command.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a camera; once for each (default: all that have images)",
-    )
+    add_names(command, "--camera", "NAME", "a camera; once for each (default: all that have images)")
 
 
 def add_board_shape(command: ArgumentParser) -> None:
     """What is known of the board's own shape."""
-    command.add_argument(
+    add_flag(
+        command,
         "--flat-board",
-        action="store_true",
-        help="the board is exact and flat (glass, screen): do not estimate its shape (default: as views held "
+        "the board is exact and flat (glass, screen): do not estimate its shape (default: as views held "
         "out show)",
     )
-    command.add_argument(
-        "--bent-board",
-        action="store_true",
-        help="estimate the board's own shape (default: as views held out show)",
-    )
+    add_flag(command, "--bent-board", "estimate the board's own shape (default: as views held out show)")
 
 
 def add_sweep(command: ArgumentParser) -> None:
     """A target at known distances, and the pair of cameras that saw it."""
-    command.add_argument(
-        "source",
-        nargs="?",
-        type=Path,
-        metavar="SOURCE",
-        help="folder of a recording, or a .csv; none with --live",
-    )
-    command.add_argument(
-        "--detections", type=Path, metavar="DIR", help="folder with detections_<camera>.npz of the recording"
-    )
-    command.add_argument(
-        "--marker", metavar="NAME", help="marker whose paint the target has; default: the only one seen"
-    )
-    command.add_argument(
-        "--distances",
-        metavar="METRES",
-        help="FIRST:LAST:STEP in metres, a list, or a .csv; default: truth.npz",
+    add_path(command, "source", "SOURCE", "folder of a recording, or a .csv; none with --live", nargs="?")
+    add_path(command, "--detections", "DIR", "folder with detections_<camera>.npz of the recording")
+    add_text(command, "--marker", "NAME", "marker whose paint the target has; default: the only one seen")
+    add_text(
+        command, "--distances", "METRES", "FIRST:LAST:STEP in metres, a list, or a .csv; default: truth.npz"
     )
     add_recording_rig(command)
     add_calibration(command, "rigs/ and cameras/")
-    command.add_argument(
+    add_text(
+        command,
         "--target",
+        "SHAPE",
+        "its shape, WIDTHxHEIGHT or round: the lens shifts its centroid",
         default="75x50",
-        metavar="SHAPE",
-        help="its shape, WIDTHxHEIGHT or round: the lens shifts its centroid (default: %(default)s)",
     )
-    command.add_argument(
-        "--fov-deg",
-        type=number(),
-        metavar="DEG",
-        help="nominal horizontal field of view, for cameras without intrinsics",
+    add_number(
+        command, "--fov-deg", "DEG", "nominal horizontal field of view, for cameras without intrinsics"
     )
 
 
@@ -143,25 +116,17 @@ def board(command: ArgumentParser) -> None:
     command.add_argument(
         "--out", "-o", type=Path, required=True, metavar="FILE", help="file to write, .pdf or .svg"
     )
-    command.add_argument(
-        "--kind",
-        choices=("checkerboard", "charuco"),
-        default="checkerboard",
-        help="kind of board (default: %(default)s)",
-    )
-    command.add_argument(
-        "--paper", default="A4", metavar="PAPER", help="a4, A3, A2 or letter (default: %(default)s)"
-    )
-    command.add_argument(
+    add_choice(command, "--kind", ("checkerboard", "charuco"), "kind of board", default="checkerboard")
+    add_text(command, "--paper", "PAPER", "a4, A3, A2 or letter", default="A4")
+    add_text(
+        command,
         "--board",
+        "SIZE",
+        "COLUMNSxROWS: inner corners, of a ChArUco board squares. Default: 9x6, 9x6",
         dest="size",
-        metavar="SIZE",
-        help="COLUMNSxROWS: inner corners, of a ChArUco board squares. Default: 9x6, 9x6",
     )
-    command.add_argument("--square-mm", type=number(), metavar="MM", help="side of a square. Default: 25, 29")
-    command.add_argument(
-        "--marker-mm", type=number(), metavar="MM", help="side of a marker. Default: 3/4 square"
-    )
+    add_number(command, "--square-mm", "MM", "side of a square. Default: 25, 29")
+    add_number(command, "--marker-mm", "MM", "side of a marker. Default: 3/4 square")
     add_dictionary(command)
 
 
@@ -201,15 +166,8 @@ def stereo(command: ArgumentParser) -> None:
     add_pictures(command)
     add_board(command)
     add_cameras(command)
-    command.add_argument(
-        "--rig",
-        default="desk",
-        metavar="NAME",
-        help="name of the rig's file, without .json (default: %(default)s)",
-    )
-    command.add_argument(
-        "--keep-intrinsics", action="store_true", help="keep the lenses that the camera files have"
-    )
+    add_text(command, "--rig", "NAME", "name of the rig's file, without .json", default="desk")
+    add_flag(command, "--keep-intrinsics", "keep the lenses that the camera files have")
     add_board_shape(command)
     add_calibration(command)
     add_out(command)
@@ -229,13 +187,9 @@ def capture(command: ArgumentParser) -> None:
       phalanx calibrate cameras capture --rig desk --board 9x6 --square-mm 25 --out views
       phalanx calibrate cameras stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json      then
     """
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="new or empty folder for the pictures"
-    )
+    add_path(command, "--out", "DIR", "new or empty folder for the pictures", required=True)
     add_board(command, size="9x6", square_mm=25.0)
-    command.add_argument(
-        "--views", type=whole(5, 200), default=25, metavar="N", help="views to keep (default: %(default)s)"
-    )
+    add_number(command, "--views", "N", "views to keep", whole(5, 200), default=25)
     add_rig(command)
     add_calibration(command)
     add_link(command)
@@ -254,35 +208,15 @@ def depth(command: ArgumentParser) -> None:
     """
     add_sweep(command)
     add_out(command)
-    command.add_argument(
-        "--use",
-        choices=("power_law", "affine_disparity", "stereo"),
-        help="also make this the rig's depth_model",
+    add_choice(
+        command, "--use", ("power_law", "affine_disparity", "stereo"), "also make this the rig's depth_model"
     )
     add_json(command)
     add_picture(command, "the errors")
-    command.add_argument("--live", action="store_true", help="measure now, with the running slaves")
-    command.add_argument(
-        "--save",
-        dest="save_table",
-        type=Path,
-        metavar="FILE",
-        help="with --live: keep the readings in this .csv",
-    )
-    command.add_argument(
-        "--frames",
-        type=whole(8),
-        default=30,
-        metavar="N",
-        help="with --live: frames to average, at least (default: %(default)s)",
-    )
-    command.add_argument(
-        "--seconds",
-        type=number(1.0, 60.0),
-        default=1.0,
-        metavar="S",
-        help="with --live: time to average (default: %(default)s)",
-    )
+    add_flag(command, "--live", "measure now, with the running slaves")
+    add_path(command, "--save", "FILE", "with --live: keep the readings in this .csv", dest="save_table")
+    add_number(command, "--frames", "N", "with --live: frames to average, at least", whole(8), default=30)
+    add_number(command, "--seconds", "S", "with --live: time to average", number(1.0, 60.0), default=1.0)
     add_link(command)
     add_keys(command)
 
@@ -299,32 +233,15 @@ def verify(command: ArgumentParser) -> None:
       phalanx calibrate verify --rig desk
     """
     add_sweep(command)
-    command.add_argument(
-        "--sigma-px",
-        type=number(),
-        default=0.1,
-        metavar="N",
-        help="noise of a centroid, one camera, per axis, in px (default: %(default)s)",
-    )
-    command.add_argument(
-        "--speed-m-s",
-        type=number(),
-        default=1.0,
-        metavar="N",
-        help="sideways speed for the budget, in m/s (default: %(default)s)",
-    )
-    command.add_argument(
-        "--skew-ms",
-        type=number(),
-        default=0.5,
-        metavar="N",
-        help="uncorrected time between the two exposures, in ms (default: %(default)s)",
-    )
-    command.add_argument(
+    add_number(command, "--sigma-px", "N", "noise of a centroid, one camera, per axis, in px", default=0.1)
+    add_number(command, "--speed-m-s", "N", "sideways speed for the budget, in m/s", default=1.0)
+    add_number(command, "--skew-ms", "N", "uncorrected time between the two exposures, in ms", default=0.5)
+    add_text(
+        command,
         "--angles",
+        "ANGLES",
+        "angles to the side, in degrees, for the off-axis table",
         default="-20:20:10",
-        metavar="ANGLES",
-        help="angles to the side, in degrees, for the off-axis table (default: %(default)s)",
     )
     add_json(command)
     add_picture(command, "the errors")
@@ -341,16 +258,8 @@ def time(command: ArgumentParser) -> None:
       phalanx calibrate time RECORDING --detections DIR
       phalanx calibrate time RECORDING --detections DIR --rig desk --out calib_json
     """
-    command.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder of a raw-frame recording: a hand that moves"
-    )
-    command.add_argument(
-        "--detections",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder with detections_<camera>.npz of it",
-    )
+    add_path(command, "recording", "RECORDING", "folder of a raw-frame recording: a hand that moves")
+    add_path(command, "--detections", "DIR", "folder with detections_<camera>.npz of it", required=True)
     add_recording_rig(command)
     add_calibration(command, "rigs/ and cameras/, for --rig")
     add_out(command)
@@ -367,71 +276,49 @@ def hand(command: ArgumentParser) -> None:
       phalanx calibrate hand --live --side right --name me --out calib_json               step by step
       phalanx calibrate hand --from me.bvh --side right --name me --out calib_json        joints of others
     """
-    command.add_argument(
-        "--poses",
-        type=Path,
-        metavar="FILE",
-        help="poses.npz of the routine, from `replay` or a running master",
-    )
-    command.add_argument(
-        "--name",
-        default="me",
-        metavar="NAME",
-        help="name of the new hand file, without .json (default: %(default)s)",
-    )
-    command.add_argument(
+    add_path(command, "--poses", "FILE", "poses.npz of the routine, from `replay` or a running master")
+    add_text(command, "--name", "NAME", "name of the new hand file, without .json", default="me")
+    add_choice(
+        command,
         "--side",
-        choices=("left", "right"),
-        help="which hand; default: right, with --from: from names or geometry",
+        ("left", "right"),
+        "which hand; default: right, with --from: from names or geometry",
     )
-    command.add_argument(
+    add_number(
+        command,
         "--length-mm",
-        type=number(),
-        metavar="MM",
-        help="millimetres from the wrist crease to the end of the middle finger; alone: a quick start",
+        "MM",
+        "millimetres from the wrist crease to the end of the middle finger; alone: a quick start",
     )
-    command.add_argument(
-        "--hand",
-        dest="base",
-        type=Path,
-        metavar="FILE",
-        help="hand file to begin with: proportions, marker places",
-    )
-    command.add_argument(
-        "--rig",
-        default="desk",
-        metavar="NAME",
-        help="rig whose markers the poses have (default: %(default)s)",
-    )
+    add_path(command, "--hand", "FILE", "hand file to begin with: proportions, marker places", dest="base")
+    add_text(command, "--rig", "NAME", "rig whose markers the poses have", default="desk")
     add_calibration(command)
-    command.add_argument(
+    add_number(
+        command,
         "--dip-per-pip",
-        type=number(0.0, 2.0),
-        metavar="N",
-        help="how far the last joint bends per middle joint, where it was measured",
+        "N",
+        "how far the last joint bends per middle joint, where it was measured",
+        number(0.0, 2.0),
     )
-    command.add_argument("--out", type=Path, metavar="DIR", help="tree to write hands/NAME.json into")
+    add_path(command, "--out", "DIR", "tree to write hands/NAME.json into")
     add_json(command)
     add_picture(command, "lengths and residuals")
-    command.add_argument(
-        "--three-back",
-        action="store_true",
-        help="with three markers on the back; only with --length-mm alone",
-    )
-    command.add_argument("--steps", action="store_true", help="only print the steps of the routine")
-    command.add_argument("--live", action="store_true", help="do the routine now, before the running master")
+    add_flag(command, "--three-back", "with three markers on the back; only with --length-mm alone")
+    add_flag(command, "--steps", "only print the steps of the routine")
+    add_flag(command, "--live", "do the routine now, before the running master")
     add_bus(command)
-    command.add_argument(
+    add_path(
+        command,
         "--from",
+        "FILE",
+        "motion capture of the hand's joints: .csv, .tsv, .bvh, .c3d",
         dest="source",
-        type=Path,
-        metavar="FILE",
-        help="motion capture of the hand's joints: .csv, .tsv, .bvh, .c3d",
     )
     add_joints(command)
-    command.add_argument(
+    add_choice(
+        command,
         "--unit",
-        choices=("m", "cm", "mm"),
-        help="of length in --from; default: as the file says, else by the size of the hand",
+        ("m", "cm", "mm"),
+        "of length in --from; default: as the file says, else by the size of the hand",
     )
-    command.add_argument("--rate", type=number(), metavar="HZ", help="of a --from table without times")
+    add_number(command, "--rate", "HZ", "of a --from table without times")

@@ -1,9 +1,4 @@
-"""Options of `phalanx calibrate` for wrist device, object and tracker.
-
-Options of `phalanx calibrate wrist`.
-
-Options of `phalanx calibrate object`, `cube` and `tracker`.
-"""
+"""Options of `phalanx calibrate` for wrist device, object and tracker."""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -13,20 +8,25 @@ from master.cli.calibrate import add_board, add_markers_of_board
 from master.commands.options import (
     add_bus,
     add_calibration,
+    add_choice,
+    add_flag,
     add_json,
+    add_number,
     add_out,
+    add_path,
     add_picture,
     add_recording_rig,
+    add_text,
 )
 
 
 def add_lit_views(command: ArgumentParser) -> None:
     """Strobed views of a board."""
-    command.add_argument(
+    add_path(
+        command,
         "source",
-        type=Path,
-        metavar="SOURCE",
-        help="a recording, or a folder of VIEW_ambient.png, VIEW_laser.png and, if there are, VIEW_led.png",
+        "SOURCE",
+        "a recording, or a folder of VIEW_ambient.png, VIEW_laser.png and, if there are, VIEW_led.png",
     )
 
 
@@ -85,15 +85,13 @@ def curl(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist curl RECORDING --detections found --rig wrist --out calib_json --picture curl.png
     """
-    command.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder of a recording: a hand that curls slowly"
-    )
-    command.add_argument(
+    add_path(command, "recording", "RECORDING", "folder of a recording: a hand that curls slowly")
+    add_path(
+        command,
         "--detections",
-        type=Path,
+        "DIR",
+        "folder with detections_<camera>.npz of it, from `replay --detect-only`",
         required=True,
-        metavar="DIR",
-        help="folder with detections_<camera>.npz of it, from `replay --detect-only`",
     )
     add_recording_rig(command)
     add_calibration(command)
@@ -113,47 +111,33 @@ def palm(command: ArgumentParser) -> None:
     Examples:
       phalanx calibrate wrist palm RECORDING --board 7x4 --square-mm 10 --wrist-mm 70 --depth-mm 22 --rig wrist
     """
-    command.add_argument(
+    add_path(
+        command,
         "source",
-        type=Path,
-        metavar="SOURCE",
-        help="a recording of the board on the palm; or images VIEW_ambient.png, VIEW_led.png",
+        "SOURCE",
+        "a recording of the board on the palm; or images VIEW_ambient.png, VIEW_led.png",
     )
-    command.add_argument(
-        "--board", required=True, metavar="BOARD", help="COLUMNSxROWS: inner corners, columns across the hand"
+    add_text(
+        command, "--board", "BOARD", "COLUMNSxROWS: inner corners, columns across the hand", required=True
     )
-    command.add_argument(
-        "--square-mm",
-        type=number(),
-        required=True,
-        metavar="MM",
-        help="side of a square in mm, measured on the print",
-    )
-    command.add_argument(
+    add_number(command, "--square-mm", "MM", "side of a square in mm, measured on the print", required=True)
+    add_number(
+        command,
         "--wrist-mm",
-        type=number(),
+        "MM",
+        "mm along the hand from the wrist crease to the nearest row of inner corners",
         required=True,
-        metavar="MM",
-        help="mm along the hand from the wrist crease to the nearest row of inner corners",
     )
-    command.add_argument(
-        "--depth-mm",
-        type=number(),
-        required=True,
-        metavar="MM",
-        help="mm from the axis of the wrist up to the print",
-    )
+    add_number(command, "--depth-mm", "MM", "mm from the axis of the wrist up to the print", required=True)
     add_markers_of_board(command)
-    command.add_argument(
+    add_number(
+        command,
         "--aside-mm",
-        type=number(),
+        "MM",
+        "mm from the middle finger's line to the board's middle, to the thumb +",
         default=0.0,
-        metavar="MM",
-        help="mm from the middle finger's line to the board's middle, to the thumb + (default: %(default)s)",
     )
-    command.add_argument(
-        "--hand", type=Path, metavar="FILE", help="hand file; default: the rig's `hand` in CALIBRATION/hands"
-    )
+    add_path(command, "--hand", "FILE", "hand file; default: the rig's `hand` in CALIBRATION/hands")
     add_recording_rig(command)
     add_calibration(command)
     add_out(command)
@@ -174,22 +158,16 @@ def subject(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist subject RECORDING --detections found --rig wrist --name me --out calib_json
     """
-    command.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder of a recording: the guided motion"
-    )
-    command.add_argument(
+    add_path(command, "recording", "RECORDING", "folder of a recording: the guided motion")
+    add_path(
+        command,
         "--detections",
-        type=Path,
+        "DIR",
+        "folder with detections_<camera>.npz of it, from `replay --detect-only`",
         required=True,
-        metavar="DIR",
-        help="folder with detections_<camera>.npz of it, from `replay --detect-only`",
     )
-    command.add_argument(
-        "--hand", type=Path, metavar="FILE", help="hand file; default: the rig's `hand` in CALIBRATION/hands"
-    )
-    command.add_argument(
-        "--name", metavar="NAME", help="of the new hand file; default: that of the hand file"
-    )
+    add_path(command, "--hand", "FILE", "hand file; default: the rig's `hand` in CALIBRATION/hands")
+    add_text(command, "--name", "NAME", "of the new hand file; default: that of the hand file")
     add_recording_rig(command)
     add_calibration(command)
     add_out(command)
@@ -210,25 +188,15 @@ def extrinsics(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
       phalanx calibrate wrist extrinsics RECORDING --detections found --out calib_json
     """
-    command.add_argument(
-        "recording",
-        type=Path,
-        metavar="RECORDING",
-        help="folder of a recording of kind `both`: the joint motion",
-    )
-    command.add_argument(
+    add_path(command, "recording", "RECORDING", "folder of a recording of kind `both`: the joint motion")
+    add_path(
+        command,
         "--detections",
-        type=Path,
+        "DIR",
+        "folder with detections_<camera>.npz of all its cameras, from `replay --detect-only`",
         required=True,
-        metavar="DIR",
-        help="folder with detections_<camera>.npz of all its cameras, from `replay --detect-only`",
     )
-    command.add_argument(
-        "--hand",
-        type=Path,
-        metavar="FILE",
-        help="hand file; default: the marker rig's `hand` in CALIBRATION/hands",
-    )
+    add_path(command, "--hand", "FILE", "hand file; default: the marker rig's `hand` in CALIBRATION/hands")
     add_recording_rig(command)
     add_calibration(command)
     add_out(command)
@@ -249,32 +217,23 @@ def tracker(command: ArgumentParser) -> None:
       phalanx calibrate tracker cube --live --rig desk-cube --keep motion.npz --out calib_json
       phalanx calibrate tracker cube --motion motion.npz --rig desk-cube --picture tracker.png
     """
-    command.add_argument("name", metavar="NAME", help="the object: a file of CALIBRATION/objects")
-    command.add_argument(
-        "--motion",
-        type=Path,
-        metavar="FILE",
-        help="an .npz of object and tracker poses, as --keep writes (docs/tracker.md)",
+    add_text(command, "name", "NAME", "the object: a file of CALIBRATION/objects")
+    add_path(
+        command, "--motion", "FILE", "an .npz of object and tracker poses, as --keep writes (docs/tracker.md)"
     )
-    command.add_argument("--live", action="store_true", help="do the motion now, before the running master")
-    command.add_argument(
-        "--rig",
-        default="desk-cube",
-        metavar="NAME",
-        help="rig whose cameras see the object (default: %(default)s)",
-    )
+    add_flag(command, "--live", "do the motion now, before the running master")
+    add_text(command, "--rig", "NAME", "rig whose cameras see the object", default="desk-cube")
     add_calibration(command)
-    command.add_argument(
-        "--device", metavar="NAME", help="name of the device on it; default: `tracker` of the object's file"
-    )
-    command.add_argument(
+    add_text(command, "--device", "NAME", "name of the device on it; default: `tracker` of the object's file")
+    add_number(
+        command,
         "--seconds",
-        type=number(10.0),
+        "S",
+        "how many seconds a live motion may take at most",
+        number(10.0),
         default=90.0,
-        metavar="S",
-        help="how many seconds a live motion may take at most (default: %(default)s)",
     )
-    command.add_argument("--keep", type=Path, metavar="FILE", help="keep the live motion in this .npz")
+    add_path(command, "--keep", "FILE", "keep the live motion in this .npz")
     add_out(command)
     add_json(command)
     add_picture(command, "what was seen and left")
@@ -293,13 +252,12 @@ def cube(command: ArgumentParser) -> None:
     command.add_argument(
         "--out", "-o", type=Path, required=True, metavar="FILE", help="page to write, .pdf or .svg"
     )
-    command.add_argument(
-        "--name", default="box", metavar="NAME", help="name of the object (default: %(default)s)"
-    )
+    add_text(command, "--name", "NAME", "name of the object", default="box")
     add_calibration(command, "objects/")
-    command.add_argument(
+    add_choice(
+        command,
         "--family",
-        choices=(
+        (
             "apriltag_16h5",
             "apriltag_25h9",
             "apriltag_36h11",
@@ -307,21 +265,13 @@ def cube(command: ArgumentParser) -> None:
             "aruco_5x5_100",
             "aruco_6x6_250",
         ),
+        "family of the tags",
         default="aruco_5x5_100",
-        help="family of the tags (default: %(default)s)",
     )
-    command.add_argument(
-        "--first", type=whole(), default=0, metavar="N", help="number of the first tag (default: %(default)s)"
-    )
-    command.add_argument(
-        "--side-mm", type=number(), default=40.0, metavar="MM", help="side of the box (default: %(default)s)"
-    )
-    command.add_argument(
-        "--edge-mm",
-        type=number(),
-        default=30.0,
-        metavar="MM",
-        help="edge of the black squares, as measured on the print (default: %(default)s)",
+    add_number(command, "--first", "N", "number of the first tag", whole(), default=0)
+    add_number(command, "--side-mm", "MM", "side of the box", default=40.0)
+    add_number(
+        command, "--edge-mm", "MM", "edge of the black squares, as measured on the print", default=30.0
     )
 
 
@@ -339,45 +289,39 @@ def object_options(command: ArgumentParser) -> None:
       phalanx calibrate object wand --live --rig desk-wand --markers wand1,wand2,wand3 --radius-mm 9 --out TREE
       phalanx calibrate object wand --recording REC --detections DIR --picture wand.png --out TREE --add-to-rig
     """
-    command.add_argument("name", metavar="NAME", help="name of the object; its file is objects/NAME.json")
-    command.add_argument(
+    add_text(command, "name", "NAME", "name of the object; its file is objects/NAME.json")
+    add_text(
+        command,
         "--markers",
-        metavar="NAMES",
-        help="its beads, with commas; default: those of its file, else all free_markers of the rig",
+        "NAMES",
+        "its beads, with commas; default: those of its file, else all free_markers of the rig",
     )
-    command.add_argument(
+    add_number(
+        command,
         "--radius-mm",
-        type=number(0.5, 50.0),
-        metavar="MM",
-        help="radius of the beads; default: as its file has it, else 8",
+        "MM",
+        "radius of the beads; default: as its file has it, else 8",
+        number(0.5, 50.0),
     )
-    command.add_argument(
-        "--recording",
-        type=Path,
-        metavar="DIR",
-        help="folder of a raw-frame recording of the object that moves",
-    )
-    command.add_argument(
-        "--detections", type=Path, metavar="DIR", help="folder with detections_<camera>.npz of it"
-    )
-    command.add_argument("--live", action="store_true", help="do the motion now, before the running master")
+    add_path(command, "--recording", "DIR", "folder of a raw-frame recording of the object that moves")
+    add_path(command, "--detections", "DIR", "folder with detections_<camera>.npz of it")
+    add_flag(command, "--live", "do the motion now, before the running master")
     add_recording_rig(command)
     add_calibration(command)
-    command.add_argument(
+    add_path(
+        command,
         "--like",
-        type=Path,
-        metavar="FILE",
-        help="object file whose frame, shape, tags and tracker are kept; default: its own",
+        "FILE",
+        "object file whose frame, shape, tags and tracker are kept; default: its own",
     )
-    command.add_argument(
-        "--add-to-rig", action="store_true", help="name it under objects of the rig in --out"
-    )
-    command.add_argument(
+    add_flag(command, "--add-to-rig", "name it under objects of the rig in --out")
+    add_number(
+        command,
         "--seconds",
-        type=number(5.0),
+        "S",
+        "how many seconds a live motion may take at most",
+        number(5.0),
         default=60.0,
-        metavar="S",
-        help="how many seconds a live motion may take at most (default: %(default)s)",
     )
     add_out(command)
     add_json(command)

@@ -1,26 +1,24 @@
 """Options of commands that watch or set a running rig and its fleet.
 
-Options of `phalanx view`, `console`, `check` and `info`.
-
-Options of `phalanx camera` and `phalanx gestures`.
-
-Options of `phalanx fleet status`, `keys` and `relay`.
-
-Those of its other commands stand in `deploy.arguments`.
+Those of the other commands of `phalanx fleet` stand in `deploy.arguments`.
 """
 
 from argparse import ArgumentParser
-from pathlib import Path
 
 from common.command_line import number, whole
 from master.commands.options import (
     add_bus,
     add_calibration,
+    add_flag,
     add_hand,
     add_link,
+    add_names,
+    add_number,
+    add_path,
     add_rig,
     add_rigs,
     add_site,
+    add_text,
     site_name,
 )
 
@@ -41,19 +39,9 @@ def view(command: ArgumentParser) -> None:
     add_hand(command)
     add_bus(command)
     add_site(command)
-    command.add_argument(
-        "--web", action="store_true", help="serve the viewer to a browser on 127.0.0.1 instead of a window"
-    )
-    command.add_argument(
-        "--web-port",
-        type=whole(1, 65535),
-        default=9090,
-        metavar="PORT",
-        help="TCP port of that page (default: %(default)s)",
-    )
-    command.add_argument(
-        "--save", type=Path, metavar="FILE", help="write an .rrd instead of showing anything"
-    )
+    add_flag(command, "--web", "serve the viewer to a browser on 127.0.0.1 instead of a window")
+    add_number(command, "--web-port", "PORT", "TCP port of that page", whole(1, 65535), default=9090)
+    add_path(command, "--save", "FILE", "write an .rrd instead of showing anything")
 
 
 def console(command: ArgumentParser) -> None:
@@ -71,20 +59,17 @@ def console(command: ArgumentParser) -> None:
       phalanx console --host 0.0.0.0
     """
     add_calibration(command)
-    command.add_argument(
+    add_text(
+        command,
         "--rig",
+        "NAME",
+        "rig that runs, once for each (default: desk, once its file is there)",
         action="append",
-        metavar="NAME",
-        help="rig that runs, once for each (default: desk, once its file is there)",
     )
     add_bus(command)
     add_link(command)
-    command.add_argument(
-        "--port",
-        type=whole(0, 65535),
-        default=8080,
-        metavar="PORT",
-        help="TCP port of the page; 0: a free one (default: %(default)s)",
+    add_number(
+        command, "--port", "PORT", "TCP port of the page; 0: a free one", whole(0, 65535), default=8080
     )
     command.add_argument(
         "--host",
@@ -93,11 +78,11 @@ def console(command: ArgumentParser) -> None:
         help="address to serve on; elsewhere than on this machine the page asks for a password (default: "
         "%(default)s)",
     )
-    command.add_argument(
+    add_path(
+        command,
         "--password-file",
-        type=Path,
-        metavar="FILE",
-        help="ask for the password in the first line of this file (default: one is made and printed once)",
+        "FILE",
+        "ask for the password in the first line of this file (default: one is made and printed once)",
     )
 
 
@@ -115,9 +100,7 @@ def check(command: ArgumentParser) -> None:
     """
     add_bus(command)
     add_site(command)
-    command.add_argument(
-        "--watch", action="store_true", help="go on until Ctrl-C, and print the list whenever it changes"
-    )
+    add_flag(command, "--watch", "go on until Ctrl-C, and print the list whenever it changes")
 
 
 def info(command: ArgumentParser) -> None:
@@ -128,7 +111,7 @@ def info(command: ArgumentParser) -> None:
     Examples:
       phalanx info out/wave.mcap
     """
-    command.add_argument("file", type=Path, metavar="FILE.mcap", help="the recording")
+    add_path(command, "file", "FILE.mcap", "the recording")
 
 
 def camera(command: ArgumentParser) -> None:
@@ -146,32 +129,21 @@ def camera(command: ArgumentParser) -> None:
       phalanx camera left --pick index@310,204 --save
       phalanx camera left --load new/left.json --save
     """
-    command.add_argument("name", metavar="NAME", help="name of a camera whose slave is running")
-    command.add_argument("--exposure-us", type=number(), metavar="US", help="exposure in microseconds")
-    command.add_argument("--gain", type=number(), metavar="N", help="analogue gain")
-    command.add_argument("--colour-gains", metavar="RED,BLUE", help="gains of red and blue relative to green")
-    command.add_argument("--rate-hz", type=number(), metavar="HZ", help="frames a second")
-    command.add_argument(
-        "--roi-margin",
-        type=number(),
-        metavar="N",
-        help="how far a marker may be from where it is expected, share of the width",
+    add_text(command, "name", "NAME", "name of a camera whose slave is running")
+    add_number(command, "--exposure-us", "US", "exposure in microseconds")
+    add_number(command, "--gain", "N", "analogue gain")
+    add_text(command, "--colour-gains", "RED,BLUE", "gains of red and blue relative to green")
+    add_number(command, "--rate-hz", "HZ", "frames a second")
+    add_number(
+        command, "--roi-margin", "N", "how far a marker may be from where it is expected, share of the width"
     )
-    command.add_argument(
-        "--pick",
-        metavar="MARKER@U,V",
-        help="colour of a marker from a pixel on its paint, in the newest frame",
+    add_text(
+        command, "--pick", "MARKER@U,V", "colour of a marker from a pixel on its paint, in the newest frame"
     )
-    command.add_argument(
-        "--load",
-        dest="load_file",
-        type=Path,
-        metavar="FILE",
-        help="camera file to use in place of the present content",
+    add_path(
+        command, "--load", "FILE", "camera file to use in place of the present content", dest="load_file"
     )
-    command.add_argument(
-        "--save", action="store_true", help="write what is in use to the slave's camera file"
-    )
+    add_flag(command, "--save", "write what is in use to the slave's camera file")
     add_bus(command)
 
 
@@ -197,58 +169,41 @@ def gestures(command: ArgumentParser) -> None:
     what = command.add_mutually_exclusive_group()
     what.add_argument("--teach", metavar="NAME", help="teach this pose; one of that name is replaced")
     what.add_argument("--forget", metavar="NAME", help="take this pose out of the file")
-    command.add_argument(
+    add_path(
+        command,
         "--poses",
-        type=Path,
-        metavar="FILE",
-        help="poses.npz of a run: report its gestures; with --teach, where the examples are, each in a "
+        "FILE",
+        "poses.npz of a run: report its gestures; with --teach, where the examples are, each in a --range",
+    )
+    add_flag(command, "--every", "with --poses: every message as a line of JSON, too")
+    add_number(
+        command, "--examples", "N", "with --teach: how many, before a running master", whole(3, 10), default=5
+    )
+    add_names(
+        command,
         "--range",
-    )
-    command.add_argument(
-        "--every", action="store_true", help="with --poses: every message as a line of JSON, too"
-    )
-    command.add_argument(
-        "--examples",
-        type=whole(3, 10),
-        default=5,
-        metavar="N",
-        help="with --teach: how many, before a running master (default: %(default)s)",
-    )
-    command.add_argument(
-        "--range",
+        "FROM-TO",
+        "with --teach: seconds after the first pose of --poses; once for each example",
         dest="ranges",
-        action="append",
-        default=[],
-        metavar="FROM-TO",
-        help="with --teach: seconds after the first pose of --poses; once for each example",
     )
-    command.add_argument(
+    add_text(
+        command,
         "--within",
-        metavar="NAME",
-        help="with --teach: the pose is a special case of this one, and wins where both fit",
+        "NAME",
+        "with --teach: the pose is a special case of this one, and wins where both fit",
     )
-    command.add_argument(
-        "--settings",
-        type=Path,
-        metavar="FILE",
-        help="gestures file (default: CALIBRATION/gestures/default.json)",
+    add_path(command, "--settings", "FILE", "gestures file (default: CALIBRATION/gestures/default.json)")
+    add_path(
+        command, "--out", "FILE", "with --teach: gestures file to write (default: the one that was read)"
     )
-    command.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="with --teach: gestures file to write (default: the one that was read)",
+    add_path(
+        command, "--hand", "FILE", "hand profile (default: the one that the poses name, in CALIBRATION/hands)"
     )
-    command.add_argument(
-        "--hand",
-        type=Path,
-        metavar="FILE",
-        help="hand profile (default: the one that the poses name, in CALIBRATION/hands)",
-    )
-    command.add_argument(
+    add_text(
+        command,
         "--hand-name",
-        metavar="NAME",
-        help="with --teach: of two hands before a running master, the one that shows it",
+        "NAME",
+        "with --teach: of two hands before a running master, the one that shows it",
     )
     add_calibration(command, "gestures/ and hands/")
     add_bus(command)
@@ -272,26 +227,21 @@ def status(command: ArgumentParser) -> None:
       phalanx fleet status --wait wrist --wait imu --rig wrist --bind 0.0.0.0:47801 --beacon 192.168.1.255:47800
     """
     add_bus(command)
-    command.add_argument(
+    add_number(
+        command,
         "--seconds",
-        type=number(0.5, 3600.0),
-        metavar="S",
-        help="how long it listens (default: 3; with --wait at most 20)",
+        "S",
+        "how long it listens (default: 3; with --wait at most 20)",
+        number(0.5, 3600.0),
     )
-    command.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
-    command.add_argument(
+    add_flag(command, "--watch", "again each second, until Ctrl-C")
+    add_flag(
+        command,
         "--json",
+        "as JSON; with --wait datagrams a second by name, and whether a master runs",
         dest="as_json",
-        action="store_true",
-        help="as JSON; with --wait datagrams a second by name, and whether a master runs",
     )
-    command.add_argument(
-        "--wait",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="wait for datagrams of this camera or IMU; once for each",
-    )
+    add_names(command, "--wait", "NAME", "wait for datagrams of this camera or IMU; once for each")
     add_rig(command)
     add_calibration(command)
     add_link(command)
@@ -321,16 +271,13 @@ def keys(command: ArgumentParser) -> None:
       phalanx fleet keys ~/.config/phalanx/keys --renew --device left
       phalanx fleet keys ~/.config/phalanx/keys --revoke --device left
     """
-    command.add_argument(
-        "folder", type=Path, metavar="DIR", help="keys folder; keep it private, and out of calib_json"
-    )
-    command.add_argument(
+    add_path(command, "folder", "DIR", "keys folder; keep it private, and out of calib_json")
+    add_names(
+        command,
         "--device",
+        "NAME",
+        "name of a camera, IMU or tracker as the rig has it; once for each",
         dest="devices",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="name of a camera, IMU or tracker as the rig has it; once for each",
     )
     what = command.add_mutually_exclusive_group()
     what.add_argument("--make", action="store_true", help="make the folder, or add what is missing")
@@ -364,12 +311,6 @@ def relay(command: ArgumentParser) -> None:
     role.add_argument(
         "--site", type=site_name, metavar="NAME", help="be a relay: name of the site, as readers give it"
     )
-    command.add_argument(
-        "--connect",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="of a router: another one to be joined with; once for each",
-    )
-    command.add_argument("--router", metavar="ENDPOINT", help="of a relay: the router")
+    add_names(command, "--connect", "ENDPOINT", "of a router: another one to be joined with; once for each")
+    add_text(command, "--router", "ENDPOINT", "of a relay: the router")
     add_bus(command)

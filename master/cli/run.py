@@ -1,9 +1,4 @@
-"""Options of `phalanx run`, `replay`, `record`, `play`, `export` and `send`.
-
-Options of `phalanx run` and `phalanx replay`.
-
-Options of `phalanx record`, `play`, `export` and `send`.
-"""
+"""Options of `phalanx run`, `replay`, `record`, `play`, `export` and `send`."""
 
 from argparse import SUPPRESS, ArgumentParser
 from pathlib import Path
@@ -12,13 +7,19 @@ from common.command_line import number
 from master.commands.options import (
     add_bus,
     add_calibration,
+    add_choice,
+    add_flag,
     add_hand,
     add_joints,
     add_json,
     add_link,
+    add_names,
+    add_number,
+    add_path,
     add_rigs,
     add_site,
     add_span,
+    add_text,
 )
 
 
@@ -53,46 +54,37 @@ def run(command: ArgumentParser) -> None:
     add_hand(command)
     add_link(command)
     add_bus(command)
-    command.add_argument(
-        "--start-timeout-s",
-        type=number(),
-        default=5.0,
-        metavar="S",
-        help="how long the first camera waits for the others (default: %(default)s)",
+    add_number(
+        command, "--start-timeout-s", "S", "how long the first camera waits for the others", default=5.0
     )
-    command.add_argument(
+    add_path(
+        command,
         "--poses",
-        type=Path,
-        metavar="FILE",
-        help="write every pose to this .npz; of a second hand beside it, with its name, and in the same folder "
+        "FILE",
+        "write every pose to this .npz; of a second hand beside it, with its name, and in the same folder "
         "object_NAME.npz, contact_HAND_NAME.npz and gestures.jsonl",
     )
-    command.add_argument(
-        "--summary", type=Path, metavar="FILE", help="write the figures of the run to this .json"
-    )
-    command.add_argument(
+    add_path(command, "--summary", "FILE", "write the figures of the run to this .json")
+    add_path(
+        command,
         "--record",
-        type=Path,
-        metavar="FILE",
-        help="record all that is taken and solved to this .mcap, from the first message on: `play` solves it again, "
+        "FILE",
+        "record all that is taken and solved to this .mcap, from the first message on: `play` solves it again, "
         "bit for bit",
     )
-    command.add_argument(
+    add_names(
+        command,
         "--set",
+        "NAME=VALUE",
+        "try another number of the estimator, such as estimator.tracked_m=0.015; a wrong name lists all",
         dest="changes",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="try another number of the estimator, such as estimator.tracked_m=0.015; a wrong name lists all",
     )
     service = command.add_mutually_exclusive_group()
     service.add_argument(
         "--install", action="store_true", help="install it with these options as a service of this user"
     )
     service.add_argument("--uninstall", action="store_true", help="stop the service, and remove it")
-    command.add_argument(
-        "--dry-run", action="store_true", help="of --install and --uninstall: write nothing; print the unit"
-    )
+    add_flag(command, "--dry-run", "of --install and --uninstall: write nothing; print the unit")
 
 
 def replay(command: ArgumentParser) -> None:
@@ -121,36 +113,29 @@ def replay(command: ArgumentParser) -> None:
       phalanx replay RECORDING --detections found --out out/again    solves what was detected before
       phalanx replay out/wave.mcap --out out/wave                    recorded messages
     """
-    command.add_argument(
+    add_path(
+        command,
         "paths",
-        type=Path,
-        nargs="*",
-        metavar="RECORDING|VIDEO|FILE.mcap",
-        help="folder with recording.json; or a video or a folder of pictures for each camera, or a folder of these; or "
+        "RECORDING|VIDEO|FILE.mcap",
+        "folder with recording.json; or a video or a folder of pictures for each camera, or a folder of these; or "
         "a recording of messages",
+        nargs="*",
     )
-    command.add_argument(
+    add_names(
+        command,
         "--camera",
-        action="append",
-        default=[],
-        metavar="NAME=PATH",
-        help="whose a video or folder is (default: that of its name, else in the order of the rig)",
+        "NAME=PATH",
+        "whose a video or folder is (default: that of its name, else in the order of the rig)",
     )
-    command.add_argument(
+    add_names(
+        command,
         "--rig",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="of videos: rig in DIR/rigs (default: the one with these cameras); of a recording: once for each of its "
+        "NAME",
+        "of videos: rig in DIR/rigs (default: the one with these cameras); of a recording: once for each of its "
         "rigs that is solved (default: all)",
     )
-    command.add_argument(
-        "--times",
-        type=Path,
-        metavar="FILE.csv",
-        help="of videos: when each frame was taken; camera,frame,time",
-    )
-    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    add_path(command, "--times", "FILE.csv", "of videos: when each frame was taken; camera,frame,time")
+    add_path(command, "--out", "DIR", "folder for the results", required=True)
     which = command.add_mutually_exclusive_group()
     which.add_argument(
         "--detections",
@@ -163,31 +148,32 @@ def replay(command: ArgumentParser) -> None:
         action="store_true",
         help="write detections_CAMERA.npz, and solve nothing: cameras need no geometry",
     )
-    command.add_argument(
+    add_path(
+        command,
         "--calibration",
-        type=Path,
-        metavar="DIR",
-        help="calib_json tree: marker colours, hands, gestures, and objects that the recording does not carry; of "
+        "DIR",
+        "calib_json tree: marker colours, hands, gestures, and objects that the recording does not carry; of "
         "videos also cameras and rig",
     )
-    command.add_argument(
-        "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"
-    )
-    command.add_argument(
+    add_path(command, "--hand", "FILE", "hand profile; default: DIR/hands/<rig's hand>.json")
+    add_choice(
+        command,
         "--only",
-        choices=("markers", "wrist"),
-        help="of a recording of both: the cameras, or the wrist device alone",
+        ("markers", "wrist"),
+        "of a recording of both: the cameras, or the wrist device alone",
     )
-    command.add_argument(
+    add_choice(
+        command,
         "--solver-mode",
-        choices=("fk", "ik", "auto"),
-        help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
+        ("fk", "ik", "auto"),
+        "fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
         "there is (auto); default: what its rig says",
     )
-    command.add_argument(
+    add_choice(
+        command,
         "--solver",
-        choices=("estimator", "fabrik"),
-        help="of markers the hand of disparity, depth law, 1 € filter and FABRIK (fabrik), or the one that is fitted "
+        ("estimator", "fabrik"),
+        "of markers the hand of disparity, depth law, 1 € filter and FABRIK (fabrik), or the one that is fitted "
         "to all pixels from there (estimator); default: what its rig says",
     )
 
@@ -208,11 +194,11 @@ def record(command: ArgumentParser) -> None:
       phalanx record out/wave.mcap --rig desk --frames 2 --previews --reserve-mb 1000
       phalanx record out/wave.mcap --rig desk --raw
     """
-    command.add_argument("file", type=Path, metavar="FILE.mcap", help="the recording")
+    add_path(command, "file", "FILE.mcap", "the recording")
     add_rigs(command)
     add_calibration(command)
     add_hand(command)
-    command.add_argument("--seconds", type=number(0.0), metavar="S", help="length (default: until Ctrl-C)")
+    add_number(command, "--seconds", "S", "length (default: until Ctrl-C)", number(0.0))
     add_bus(command)
     command.add_argument(
         "--frames",
@@ -221,7 +207,7 @@ def record(command: ArgumentParser) -> None:
         metavar="HZ",
         help="keep whole frames of each camera, so many a second (default: %(default)g)",
     )
-    command.add_argument("--previews", action="store_true", help="keep the small pictures of the cameras")
+    add_flag(command, "--previews", "keep the small pictures of the cameras")
     command.add_argument(
         "--reserve-mb",
         type=number(0.0),
@@ -229,10 +215,8 @@ def record(command: ArgumentParser) -> None:
         metavar="MB",
         help="stay free on the disk (default: %(default)g)",
     )
-    command.add_argument(
-        "--raw",
-        action="store_true",
-        help="have every slave with --raw-folder keep its raw frames, in DIR/FILE'S NAME-CAMERA",
+    add_flag(
+        command, "--raw", "have every slave with --raw-folder keep its raw frames, in DIR/FILE'S NAME-CAMERA"
     )
     # A name to be announced when ready; then it ends with its standard input, too.
     command.add_argument("--owned", help=SUPPRESS)
@@ -253,26 +237,16 @@ def play(command: ArgumentParser) -> None:
       phalanx play out/wave.mcap --speed max --no-bus --out out/wave
       phalanx play out/wave.mcap --speed 0.5 --from 10 --to 20 --loop
     """
-    command.add_argument("file", type=Path, metavar="FILE.mcap", help="the recording")
-    command.add_argument(
-        "--speed",
-        default="1",
-        metavar="FACTOR",
-        help="1: as it was; 0.5: half as fast; max: as fast as it goes (default: %(default)s)",
+    add_path(command, "file", "FILE.mcap", "the recording")
+    add_text(
+        command, "--speed", "FACTOR", "1: as it was; 0.5: half as fast; max: as fast as it goes", default="1"
     )
     add_span(command, "", "--to")
     add_bus(command)
-    command.add_argument("--no-bus", action="store_true", help="publish nothing; with --out, or for the sums")
-    command.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder for poses.npz and what else there is, as of `run --poses`",
-    )
-    command.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
-    command.add_argument(
-        "--solved", action="store_true", help="publish what was solved live, instead of solving it again"
-    )
+    add_flag(command, "--no-bus", "publish nothing; with --out, or for the sums")
+    add_path(command, "--out", "DIR", "folder for poses.npz and what else there is, as of `run --poses`")
+    add_flag(command, "--loop", "begin again at the end, until Ctrl-C")
+    add_flag(command, "--solved", "publish what was solved live, instead of solving it again")
 
 
 def export(command: ArgumentParser) -> None:
@@ -293,20 +267,18 @@ def export(command: ArgumentParser) -> None:
       phalanx export out/me/poses.npz --compare motive.csv --side right --json errors.json
       phalanx export out/demo/poses.npz --compare truth.csv --aligned
     """
-    command.add_argument(
-        "source", type=Path, metavar="SOURCE", help="poses.npz of a run or a replay, or an .mcap recording"
-    )
-    command.add_argument(
+    add_path(command, "source", "SOURCE", "poses.npz of a run or a replay, or an .mcap recording")
+    add_choice(
+        command,
         "--to",
-        choices=("csv", "parquet", "bvh", "gltf", "rrd"),
-        help="csv, parquet: tables. bvh: motion capture. gltf: an animated, skinned hand. rrd: for Rerun",
+        ("csv", "parquet", "bvh", "gltf", "rrd"),
+        "csv, parquet: tables. bvh: motion capture. gltf: an animated, skinned hand. rrd: for Rerun",
     )
-    command.add_argument(
+    add_path(
+        command,
         "--compare",
-        type=Path,
-        metavar="FILE",
-        help="instead of --to: errors of the poses against motion capture of that hand, .csv, .tsv, .bvh, "
-        ".c3d",
+        "FILE",
+        "instead of --to: errors of the poses against motion capture of that hand, .csv, .tsv, .bvh, .c3d",
     )
     command.add_argument(
         "--out",
@@ -316,53 +288,50 @@ def export(command: ArgumentParser) -> None:
         help="file of the first hand, or folder. What else there is stands beside it, with a name behind its own: of "
         "another hand, object_NAME, contact_HAND_NAME, gestures (default: beside SOURCE)",
     )
-    command.add_argument(
-        "--only", action="append", default=[], metavar="NAME", help="this hand; once for each (default: all)"
-    )
-    command.add_argument(
+    add_names(command, "--only", "NAME", "this hand; once for each (default: all)")
+    add_path(
+        command,
         "--hand",
+        "FILE",
+        "hand profile, for bvh, gltf, rrd (default: that of an .mcap, else of CALIBRATION/hands)",
         action="append",
         default=[],
-        type=Path,
-        metavar="FILE",
-        help="hand profile, for bvh, gltf, rrd (default: that of an .mcap, else of CALIBRATION/hands)",
     )
     add_calibration(command)
-    command.add_argument(
+    add_names(
+        command,
         "--rig",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="of an rrd: rig of CALIBRATION/rigs; an .mcap knows its own; once for each. Of --compare: whose markers "
+        "NAME",
+        "of an rrd: rig of CALIBRATION/rigs; an .mcap knows its own; once for each. Of --compare: whose markers "
         "the poses have",
     )
-    command.add_argument(
+    add_number(
+        command,
         "--rate",
-        type=number(0.1, 1000.0),
-        metavar="HZ",
-        help="frames a second of bvh and gltf (default: that of the poses); of a --compare table without "
-        "times",
+        "HZ",
+        "frames a second of bvh and gltf (default: that of the poses); of a --compare table without times",
+        number(0.1, 1000.0),
     )
     add_span(command, " of SOURCE", "--until")
-    command.add_argument(
+    add_choice(
+        command,
         "--unit",
-        choices=("m", "cm", "mm"),
-        help="of length in a bvh, default cm (all others have metres); in --compare FILE, default as FILE says",
+        ("m", "cm", "mm"),
+        "of length in a bvh, default cm (all others have metres); in --compare FILE, default as FILE says",
     )
-    command.add_argument(
+    add_choice(
+        command,
         "--up",
-        choices=("y", "rig"),
-        help="of bvh and gltf. y (default): y up in the reference camera's picture, z out of it. rig: its own, y down, "
+        ("y", "rig"),
+        "of bvh and gltf. y (default): y up in the reference camera's picture, z out of it. rig: its own, y down, "
         "z into the scene",
     )
     add_joints(command)
-    command.add_argument(
-        "--side", choices=("left", "right"), help="of --compare: which hand of a file with both"
-    )
-    command.add_argument(
+    add_choice(command, "--side", ("left", "right"), "of --compare: which hand of a file with both")
+    add_flag(
+        command,
         "--aligned",
-        action="store_true",
-        help="FILE of --compare has the rig's frame, and the poses' clock or seconds from the beginning of SOURCE "
+        "FILE of --compare has the rig's frame, and the poses' clock or seconds from the beginning of SOURCE "
         "(default: both are fitted)",
     )
     add_json(command)
@@ -380,13 +349,8 @@ def send(command: ArgumentParser) -> None:
       phalanx send --only osc,vmc
       phalanx send --outputs stage --keys DIR --bus tls/192.168.1.2:47802
     """
-    command.add_argument(
-        "--outputs",
-        default="default",
-        metavar="NAME",
-        help="a file of CALIBRATION/outputs, without .json (default: %(default)s)",
-    )
-    command.add_argument("--only", metavar="NAMES", help="send to these, by commas, whatever the file has on")
+    add_text(command, "--outputs", "NAME", "a file of CALIBRATION/outputs, without .json", default="default")
+    add_text(command, "--only", "NAMES", "send to these, by commas, whatever the file has on")
     add_calibration(command, "outputs/")
     add_bus(command)
     add_site(command)

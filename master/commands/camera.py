@@ -1,7 +1,4 @@
-"""`phalanx camera`: show and change the settings of a running camera.
-
-Over the bus. No restart.
-"""
+"""`phalanx camera` shows and changes the settings of a running camera."""
 
 import time
 from argparse import Namespace
@@ -18,9 +15,8 @@ from common.messages import Command, Health
 from common.messages.streams import MASTER
 from master.run.process import join_bus
 
-ANSWER_S = (
-    15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table
-)
+# 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table.
+ANSWER_S = 15.0
 APPEAR_S = 4.0  # whoever has just connected is not known everywhere yet
 _ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us", "roi_margin")
 _MORE = ("control.", "marker.", "pick.")
@@ -28,10 +24,7 @@ _EVENTS = ("camera.", "reload.")
 
 
 def camera(options: Namespace) -> None:
-    """Show or change the settings of a running camera.
-
-    Changes apply at once, are read back and compared.
-    """
+    """Show or change a running camera's settings at once, read back and compared."""
     wanted = settings(
         options.exposure_us, options.gain, options.colour_gains, options.rate_hz, options.roi_margin
     )
@@ -74,9 +67,7 @@ def commands(
     load_file: Path | None = None,
     save: bool = False,
 ) -> list[Command]:
-    """Return the commands to send to the slave, one after the other.
-
-    The last answer reports how the camera is set then.
+    """Return the commands to the slave; the last answer is how the camera is set.
 
     Raises:
         CalibrationError: The file is broken or of another camera.
@@ -114,10 +105,7 @@ def send_all(bus: Bus, steps: list[Command]) -> Health:
 
 
 def table(health: Health) -> list[str]:
-    """Format the camera settings as lines for a person.
-
-    Each setting, what is wanted, what was read back; then what else the camera reports.
-    """
+    """Format each setting, wanted and read back, and what else the camera reports."""
     rows = [("setting", "wanted", "read back")]
     for metric, value in health.metrics.items():
         if metric.startswith(WANTED):
@@ -131,11 +119,7 @@ def table(health: Health) -> list[str]:
 
 
 def _appear(bus: Bus, name: str) -> None:
-    """Wait a moment for the camera.
-
-    Raises:
-        BusError: It is not there; the text names those that are.
-    """
+    """Wait a moment for the camera; else a BusError names those that are there."""
     step_s = 0.1
     for _ in range(round(APPEAR_S / step_s)):
         if name in bus.alive():

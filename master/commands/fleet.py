@@ -1,15 +1,9 @@
 """`phalanx fleet status` shows each process of a rig, or waits for senders.
 
-`phalanx fleet status --wait`: wait until cameras and IMUs are received.
-
-It reports whether these cameras and IMUs are received here; an installer rolls back if they are not.
-
-Where a master runs, it is asked what it takes. Where none does, this command gives the start and counts the
-datagrams that come. When it ends, slaves wait for their master again.
-
-`phalanx fleet status`: one row for each process of a rig.
-
-A row has what the process and the master report of it on the bus.
+A row has what a process and the master report of it on the bus. With --wait it reports whether senders are
+received here; an installer rolls back if they are not. Where a master runs, it is asked what it takes. Where
+none does, this command gives the start and counts the datagrams that come; when it ends, slaves wait for
+their master again.
 """
 
 import json
@@ -40,14 +34,10 @@ Received = dict[str, float]
 
 
 def wait_for_senders(options: Namespace) -> int:
-    """Wait until datagrams of all these senders arrive.
-
-    Returns the exit code, 1 if one of them is not received.
-    """
+    """Wait for datagrams of all these senders; return exit code 1 if one is missing."""
     stop = stop_on_signals()
     names: list[str] = options.wait
-    most_s = 20.0
-    seconds = options.seconds or most_s
+    seconds = options.seconds or 20.0
     connection = _running(options.bus)
     if connection is not None:
         try:
@@ -66,9 +56,7 @@ def wait_for_senders(options: Namespace) -> int:
 
 
 def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
-    """Return the rates at which the running master receives these senders.
-
-    A map name -> datagrams a second, of those whose count rises.
+    """Return name -> datagrams a second that the running master receives, if any.
 
     Raises:
         PhalanxError: It does not know one of them.
@@ -106,9 +94,7 @@ def here(
     seconds: float,
     stop: threading.Event,
 ) -> Received:
-    """Start the senders and count their datagrams on this machine.
-
-    Returns name -> datagrams a second, of those that are received.
+    """Start the senders and return name -> datagrams a second of those received here.
 
     Raises:
         PhalanxError: A name is none of the rig's.
@@ -120,8 +106,7 @@ def here(
             raise PhalanxError(f"rig {rig.name!r} has no camera or IMU {name!r}")
     wrists = rig.cameras if rig.kind == "wrist" else ()
     try:
-        start_s = 1.0
-        ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", start_s, imus=imus, wrists=wrists)
+        ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", 1.0, imus=imus, wrists=wrists)
     except BusError as error:
         raise BusError(f"{error}; if a master runs here, give its address: --bus ENDPOINT") from error
     try:
@@ -174,19 +159,16 @@ USUAL_KEYS = ".config/phalanx/keys"  # where `phalanx fleet deploy` makes them
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A process of the rig.
+    """A process of the rig: camera, IMU, tracker, master or another program.
 
     Attributes:
-        name: Camera, IMU, tracker, or the master.
-        state: streaming, waiting (it reports, and sends nothing), silent (no report any more) or unknown (never one);
-            running: the master, and what is no sender of it and has no keys of a device, as a recorder.
-        host: Machine that it runs on.
-        version: Of its program.
-        temperature_c: Of that machine [degrees C].
+        state: streaming, waiting (it reports, and sends nothing), silent (no report any more) or unknown
+            (never one); running: the master, and what is no sender of it and has no keys of a device, as a
+            recorder.
+        temperature_c: Of its machine [degrees C].
         throttled: Whether that machine lowers its clock now, or its supply is too weak.
         rate_hz: Messages a second that the master takes from it.
-        offset_us: Its clock against the master's [us].
-        sigma_us: How sure that is [us].
+        offset_us, sigma_us: Its clock against the master's, and how sure that is [us].
     """
 
     name: str
@@ -201,13 +183,9 @@ class Device:
 
 
 class Roll:
-    """Status reports of all processes as they arrive.
-
-    Holds the last two of each, and when the last one came.
-    """
+    """Status reports of all processes: the last two of each, and when the last came."""
 
     def __init__(self, expected: Sequence[str]) -> None:
-        """Expect these processes, which are shown as unknown until they report."""
         self._expected = tuple(expected)
         self._last: dict[str, Health] = {}
         self._before: dict[str, Health] = {}
@@ -249,15 +227,9 @@ class Roll:
         metrics = own.metrics
         throttled = metrics.get("throttled")
         return Device(
-            name,
-            state,
-            own.host,
-            own.version,
-            metrics.get("temperature_c"),
-            None if throttled is None else bool(throttled),
-            rate,
-            *clock,
-        )
+            name, state, own.host, own.version, metrics.get("temperature_c"),
+            None if throttled is None else bool(throttled), rate, *clock,
+        )  # fmt: skip
 
     def _is_program(self, name: str) -> bool:
         """Whether it is nothing that a master takes measurements from, as a recorder."""
@@ -265,10 +237,7 @@ class Roll:
         return name not in self._expected and last is not None and f"{name}.received" not in last.counts
 
     def _rate(self, name: str) -> float | None:
-        """Return the messages per second that the master took from a process.
-
-        They are counted since its report before; None: the master does not know it.
-        """
+        """Return the messages per second that the master took from a process; None: it does not know it."""
         last, before = self._last.get(MASTER), self._before.get(MASTER)
         event = f"{name}.received"
         if last is None or before is None or event not in last.counts:
@@ -284,9 +253,7 @@ def expected_devices(environment: Mapping[str, str]) -> list[str]:
 
 
 def status(options: Namespace) -> int:
-    """Show each process of the rig and return the exit code.
-
-    Can also wait until some processes have reported.
+    """Show each process of the rig, or wait for some; return the exit code.
 
     Raises:
         UsageError: `--wait` and `--watch` are both given.
@@ -295,11 +262,9 @@ def status(options: Namespace) -> int:
     if options.wait:
         if options.watch:
             raise UsageError("--watch has no meaning with --wait: leave it out")
-
         return wait_for_senders(options)
     show = _as_json if options.as_json else _as_table if not options.watch else _on_screen
-    once_s = 3.0
-    period_s = 1.0 if options.watch else options.seconds or once_s
+    period_s = 1.0 if options.watch else options.seconds or 3.0
     connection = join_bus(options.bus)
     try:
         _listen(
@@ -311,7 +276,7 @@ def status(options: Namespace) -> int:
 
 
 def _use_usual_keys(options: Namespace) -> None:
-    """Use the keys folder that a deployment makes, where no other is named."""
+    """Use the keys folder of deployments, where no other is named."""
     typical, bus = Path.home() / USUAL_KEYS, bus_end(HERE_BUS)
     if FOLDER in os.environ or not typical.is_dir():
         return
@@ -369,8 +334,7 @@ def _listen(
     inbox = bus.subscribe("health", depth=256)
     due_s = time.monotonic() + period_s
     while not stop.is_set():
-        poll_s = 0.1
-        health = inbox.get(poll_s)
+        health = inbox.get(0.1)
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
         if time.monotonic() >= due_s:

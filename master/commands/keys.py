@@ -1,31 +1,12 @@
 """Make, show and revoke keys, and relay masters of several sites.
 
-`phalanx fleet keys` makes, shows and renews the keys folder of a rig.
-
-Keys folder of a rig on its PC.
-
-It is made, shown and renewed, and a device is taken out of it. `common.bus.keys` states what is in it.
-
-A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
-So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for
-the rest.
-
-`phalanx fleet keys`: rig key, secrets and certificates of a rig.
-
-They are made and kept on the PC.
-
-`phalanx fleet relay` shows several masters in one place.
-
-Relay of a master's messages to a router under the name of its site.
-
-Read-only upward, nothing comes down.
-
-Each stream has a thread and a bounded queue of its own, so that a slow link holds up neither the master nor another
-stream; what did not fit is counted. Of the two ends of a relay only the lower one is asked anything.
-
-`phalanx fleet relay`: several masters, seen from one place.
-
-Nothing reaches down to the masters.
+`phalanx fleet keys`: keys folder of a rig on its PC; `common.bus.keys` states what is in it. A certificate
+cannot be called back one by one, and a device that is lost also has the rig key, which every device has. So
+whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet
+deploy` for the rest. `phalanx fleet relay`: repeats a master's messages to a router under the name of its
+site; nothing comes down. Each stream has a thread and a bounded queue of its own, so that a slow link holds
+up neither the master nor another stream; what did not fit is counted. Of the two ends of a relay only the
+lower one is asked anything.
 """
 
 import os
@@ -71,16 +52,10 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
-    """Make what is missing, and nothing else.
+    """Make what is missing, and nothing else; return the files made, below `folder`.
 
-    Returns the files that were made, below `folder`.
-
-    A folder of before there were secrets gets them for all of its devices.
-
-    Args:
-        folder: Made if it is not there; nobody but its owner may enter it.
-        devices: Names on the bus that are to have a certificate and a secret.
-        now: Where the ten years begin.
+    Nobody but its owner may enter the folder. `devices` are to have a certificate, whose ten years begin
+    `now`, and a secret; a folder of before there were secrets gets them for all of its devices.
 
     Raises:
         PhalanxError: A name that no device can have; a folder or file that cannot be written.
@@ -130,19 +105,10 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
 
 
 def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]:
-    """Make everything anew: rig key, secrets, authority, all certificates.
+    """Make all keys anew, which ends the old; return the devices to deploy to.
 
-    All earlier keys become invalid.
-
-    All is made first, then takes the place of the old; other files in the folder stay.
-
-    Args:
-        folder: Keys folder of the PC.
-        now: Where the ten years begin.
-        without: Devices that get nothing.
-
-    Returns:
-        The devices that have new keys and must be given them.
+    All is made first, then takes the place of the old; other files in the folder stay. Devices `without` get
+    nothing; the ten years of the certificates begin `now`.
 
     Raises:
         PhalanxError: No such folder or device; it cannot be written.
@@ -206,9 +172,7 @@ def files_of_device(name: str) -> tuple[str, ...]:
 
 
 def lacks_secrets(folder: Path) -> list[str]:
-    """Return the devices without a secret derived from `devices.key`.
-
-    It is all of them where there is no such key.
+    """Return the devices without a secret of `devices.key`; without that key, all.
 
     Raises:
         PhalanxError: It is not the keys folder of a PC; a file is broken, or cannot be read.
@@ -318,10 +282,7 @@ def _make(folder: Path, devices: Sequence[str]) -> None:
 
 
 def _show(folder: Path) -> None:
-    """Print the certificates and the devices without a secret.
-
-    For each certificate: who has it, what for, and until when.
-    """
+    """Print each certificate: who has it, what for, until when; and the devices without a secret."""
     certificates = certificates_of(folder)
     wide = max(len(one.name) for one in certificates)
     for one in certificates:
@@ -348,19 +309,12 @@ NAME = "relay"
 
 
 class Relay:
-    """Relay that repeats messages until it is closed.
+    """Relay that repeats messages from a master's bus `below` to a router's `above`.
 
-    Holds a thread for each stream, and the counts.
-
-    `below` is the bus of the master, `above` that of the router; both belong to the caller.
+    Both belong to the caller.
     """
 
     def __init__(self, below: Bus, above: Bus, clock: Clock) -> None:
-        """Start repeating, and report health below and above as `relay`.
-
-        Raises:
-            BusError: A bus is closed.
-        """
         self.session = secrets.randbits(63)
         self._below, self._above, self._clock = below, above, clock
         self._repeated: Counter[str] = Counter(dict.fromkeys(STREAMS, 0))
@@ -378,10 +332,7 @@ class Relay:
         below.serve(NAME, self._answer)
 
     def health(self) -> Health:
-        """Return the counts of each stream.
-
-        repeated.NAME, and dropped.NAME and refused.NAME where there are any.
-        """
+        """Return repeated.STREAM, and dropped. and refused.STREAM where there are any."""
         counts = {f"repeated.{stream}": number for stream, number in dict(self._repeated).items()}
         for stream, source in self._from.items():
             lost = {f"dropped.{stream}": source.dropped, f"refused.{stream}": source.refused}
@@ -389,13 +340,12 @@ class Relay:
         return Health(NAME, self.session, self._clock.now_ns(), counts, {}, *program())
 
     def report(self, notify: Callable[[str], None], stop: threading.Event) -> None:
-        """Report health once a second until `stop`.
+        """Report health once a second until `stop`, and a line each minute.
 
-        Health is published below, from where it is repeated above as all health is; a line is printed each minute.
+        Health is published below, from where it is repeated above as all health is.
         """
         minute = 0
-        report_s = 1.0
-        while not stop.wait(report_s):
+        while not stop.wait(1.0):
             health = self.health()
             self._below.publish("health", NAME, health)
             minute += 1
@@ -408,32 +358,24 @@ class Relay:
         for source in self._from.values():
             source.close()
         for thread in self._threads:
-            join_s = 2.0
-            thread.join(join_s)
+            thread.join(2.0)
 
     def _answer(self, command: Command) -> Health:
-        """How it is.
-
-        Raises:
-            ValueError: Another verb than "report"; the asker reads so.
-        """
+        """Return the health; a ValueError for another verb than "report", which the asker reads."""
         if command.verb != "report":
             raise ValueError(f"{NAME}: no command {command.verb!r}; there is report")
         return self.health()
 
     def _repeat(self, stream: str, source: Subscription) -> None:
         while not self._stop.is_set():
-            wait_s = 0.2
-            message = source.get(wait_s)
+            message = source.get(0.2)
             if message is not None:
                 self._above.publish(stream, sender_of(message), message)
                 self._repeated[stream] += 1
 
 
 def relay(options: Namespace) -> None:
-    """Run a router, or a relay beside a master.
-
-    Relays, readers and other routers connect to the router.
+    """Run a router, to which relays and readers connect, or a relay beside a master.
 
     Raises:
         UsageError: An option is of the other one.
@@ -472,8 +414,7 @@ def _route(listen: str, connect: Sequence[str]) -> None:
     try:
         _notify("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect))
         joined = 0
-        poll_s = 0.5
-        while not stop.wait(poll_s):
+        while not stop.wait(0.5):
             if bus.peers != joined:
                 joined = bus.peers
                 _notify("router", f"joined with {joined} of other routers")

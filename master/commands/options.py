@@ -1,9 +1,7 @@
-"""Options that several commands of the master share.
+"""Options that several commands of the master share, and what their texts mean.
 
-Also what the texts behind them mean.
-
-`--keys` and `--open` mean the same as their environment variables, and set them: programs that a command starts by
-itself, such as the recorder, or what the console's page begins, belong to the same rig.
+`--keys` and `--open` set their environment variables: programs that a command starts by itself, such as the
+recorder, or what the console's page begins, belong to the same rig.
 """
 
 import argparse
@@ -12,8 +10,9 @@ import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from common.command_line import number
+from common.command_line import Number, number
 from common.errors import PhalanxError
 
 CALIB_JSON = Path("calib_json")
@@ -23,14 +22,46 @@ _KEYS, _OPEN, _RIG_KEY = "PHALANX_KEYS", "PHALANX_OPEN", "PHALANX_RIG_KEY"
 _SITE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
+def add_text(command: ArgumentParser, name: str, metavar: str, text: str, **how: Any) -> None:
+    """An option or argument; its help is `text`, and its default if it has one."""
+    usual = "" if how.get("default") in (None, []) else " (default: %(default)s)"
+    command.add_argument(name, metavar=metavar, help=text + usual, **how)
+
+
+def add_names(command: ArgumentParser, name: str, metavar: str, text: str, **how: Any) -> None:
+    """An option that is given once for each name, as `add_text`."""
+    add_text(command, name, metavar, text, action="append", default=[], **how)
+
+
+def add_path(command: ArgumentParser, name: str, metavar: str, text: str, **how: Any) -> None:
+    """A file or folder, as `add_text`."""
+    add_text(command, name, metavar, text, type=Path, **how)
+
+
+def add_number(
+    command: ArgumentParser, name: str, metavar: str, text: str, bounds: Number | None = None, **how: Any
+) -> None:
+    """A number within `bounds`, as `add_text`."""
+    add_text(command, name, metavar, text, type=bounds or number(), **how)
+
+
+def add_choice(
+    command: ArgumentParser, name: str, choices: tuple[str, ...], text: str, default: str | None = None
+) -> None:
+    """One of some words, as `add_text`."""
+    usual = "" if default is None else " (default: %(default)s)"
+    command.add_argument(name, choices=choices, help=text + usual, default=default)
+
+
+def add_flag(command: ArgumentParser, name: str, text: str, **how: Any) -> None:
+    """A switch, off without it."""
+    command.add_argument(name, action="store_true", help=text, **how)
+
+
 def add_rigs(command: ArgumentParser) -> None:
     """Rigs that run together; `rigs_of` gives them."""
-    command.add_argument(
-        "--rig",
-        action="append",
-        metavar="NAME",
-        help="a file of CALIBRATION/rigs, without .json; once for each that runs (default: desk)",
-    )
+    text = "a file of CALIBRATION/rigs, without .json; once for each that runs (default: desk)"
+    add_text(command, "--rig", "NAME", text, action="append")
 
 
 def rigs_of(options: Namespace) -> list[str]:
@@ -40,37 +71,22 @@ def rigs_of(options: Namespace) -> list[str]:
 
 def add_rig(command: ArgumentParser) -> None:
     """One rig."""
-    command.add_argument(
-        "--rig",
-        default="desk",
-        metavar="NAME",
-        help="a file of CALIBRATION/rigs, without .json (default: %(default)s)",
-    )
+    add_text(command, "--rig", "NAME", "a file of CALIBRATION/rigs, without .json", default="desk")
 
 
 def add_recording_rig(command: ArgumentParser) -> None:
     """The rig of a recording."""
-    command.add_argument(
-        "--rig", metavar="NAME", help="a file of CALIBRATION/rigs (default: the recording's own rig)"
-    )
+    add_text(command, "--rig", "NAME", "a file of CALIBRATION/rigs (default: the recording's own rig)")
 
 
 def add_calibration(command: ArgumentParser, folders: str = "rigs/, cameras/ and hands/") -> None:
     """The calib_json tree."""
-    command.add_argument(
-        "--calibration",
-        type=Path,
-        default=CALIB_JSON,
-        metavar="DIR",
-        help=f"folder with {folders} (default: %(default)s)",
-    )
+    add_path(command, "--calibration", "DIR", f"folder with {folders}", default=CALIB_JSON)
 
 
 def add_hand(command: ArgumentParser) -> None:
     """The hand profile."""
-    command.add_argument(
-        "--hand", type=Path, metavar="FILE", help="hand profile (default: the one that the rig names)"
-    )
+    add_path(command, "--hand", "FILE", "hand profile (default: the one that the rig names)")
 
 
 def add_bus(command: ArgumentParser) -> None:
@@ -107,83 +123,43 @@ def add_keys(command: ArgumentParser) -> None:
 
 def add_site(command: ArgumentParser) -> None:
     """Which site is read, where the bus is that of a router."""
-    command.add_argument(
-        "--site",
-        type=site_name,
-        metavar="NAME",
-        help="which site is read, where --bus is a router of several (docs/scale.md)",
-    )
+    text = "which site is read, where --bus is a router of several (docs/scale.md)"
+    add_text(command, "--site", "NAME", text, type=site_name)
 
 
 def add_link(command: ArgumentParser) -> None:
-    """Add the options of the link to the slaves.
-
-    Where slaves receive the start signal, where their datagrams arrive, and by which key these are sealed.
-    """
-    command.add_argument(
-        "--beacon",
-        default=HERE_BEACON,
-        metavar="ADDRESS:PORT",
-        help="where slaves listen for the start (default: %(default)s)",
-    )
-    command.add_argument(
-        "--bind",
-        default=HERE_BIND,
-        metavar="ADDRESS:PORT",
-        help="own address for the data datagrams (default: %(default)s)",
-    )
-    command.add_argument(
-        "--key-file",
-        type=Path,
-        metavar="FILE",
-        help=f"file of the rig key alone (default: {_RIG_KEY}, then --keys)",
-    )
+    """Where slaves receive the start, where their datagrams arrive, and by which key."""
+    add_text(command, "--beacon", "ADDRESS:PORT", "where slaves listen for the start", default=HERE_BEACON)
+    add_text(command, "--bind", "ADDRESS:PORT", "own address for the data datagrams", default=HERE_BIND)
+    text = f"file of the rig key alone (default: {_RIG_KEY}, then --keys)"
+    add_path(command, "--key-file", "FILE", text)
 
 
 def add_out(command: ArgumentParser) -> None:
     """The tree of the results."""
-    command.add_argument(
-        "--out", type=Path, metavar="DIR", help="tree to write the files into; may be the one in use"
-    )
+    add_path(command, "--out", "DIR", "tree to write the files into; may be the one in use")
 
 
 def add_json(command: ArgumentParser) -> None:
     """A file for the numbers."""
-    command.add_argument(
-        "--json", dest="json_file", type=Path, metavar="FILE", help="write the numbers to this file"
-    )
+    add_path(command, "--json", "FILE", "write the numbers to this file", dest="json_file")
 
 
 def add_picture(command: ArgumentParser, what: str) -> None:
     """A file for a picture of `what`."""
-    command.add_argument("--picture", type=Path, metavar="FILE", help=f"draw {what} in this .png")
+    add_path(command, "--picture", "FILE", f"draw {what} in this .png")
 
 
 def add_joints(command: ArgumentParser) -> None:
     """Names of joints in a motion capture."""
-    command.add_argument(
-        "--joints",
-        type=Path,
-        metavar="FILE",
-        help='JSON of names in a motion capture: {"index-finger-tip": "NAME", ...}, null: not there',
-    )
+    text = 'JSON of names in a motion capture: {"index-finger-tip": "NAME", ...}, null: not there'
+    add_path(command, "--joints", "FILE", text)
 
 
 def add_span(command: ArgumentParser, whole: str, end: str) -> None:
-    """Add the options that select a part of `whole`.
-
-    The option `end` gives where the part ends.
-    """
-    command.add_argument(
-        "--from",
-        dest="from_s",
-        type=number(),
-        metavar="S",
-        help=f"begin S seconds after the beginning{whole}",
-    )
-    command.add_argument(
-        end, dest="to_s", type=number(), metavar="S", help=f"end S seconds after the beginning{whole}"
-    )
+    """Options that select a part of `whole`; the option `end` gives where it ends."""
+    add_number(command, "--from", "S", f"begin S seconds after the beginning{whole}", dest="from_s")
+    add_number(command, end, "S", f"end S seconds after the beginning{whole}", dest="to_s")
 
 
 def address(text: str, option: str) -> tuple[str, int]:
@@ -224,11 +200,6 @@ class _UseKeys(argparse.Action):
     def __call__(
         self, parser: ArgumentParser, _namespace: Namespace, values: str | Sequence[object] | None, *_: object
     ) -> None:
-        """Use it.
-
-        Raises:
-            PhalanxError: There is no such folder.
-        """
         folder = Path(str(values))
         if not folder.is_dir():
             raise PhalanxError(
@@ -239,8 +210,5 @@ class _UseKeys(argparse.Action):
 
 
 class _UseOpen(argparse.Action):
-    """Let the bus of this process leave the machine as plain text."""
-
     def __call__(self, _parser: ArgumentParser, _namespace: Namespace, *_: object) -> None:
-        """Allow it."""
         os.environ[_OPEN] = "1"

@@ -1,7 +1,4 @@
-"""`phalanx replay`: recorded frames, detections or messages to hands.
-
-The same bytes on every run.
-"""
+"""`phalanx replay`: recorded frames, detections or messages to hands, offline."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -34,18 +31,8 @@ def replay(options: Namespace) -> None:
 
 
 def _replay_messages(options: Namespace) -> None:
-    for name in (
-        "camera",
-        "rig",
-        "times",
-        "detections",
-        "detect_only",
-        "calibration",
-        "hand",
-        "only",
-        "level",
-        "solver",
-    ):
+    frames_only = "camera rig times detections detect_only calibration hand only solver_mode solver"
+    for name in frames_only.split():
         if getattr(options, name):
             raise UsageError(f"--{name.replace('_', '-')} has no meaning for recorded messages: leave it out")
     if len(options.paths) > 1:

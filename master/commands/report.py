@@ -1,6 +1,6 @@
-"""`python -m master.commands.report`: report of a simulated run.
+"""`python -m master.commands.report` compares a simulated run with the truth.
 
-What `phalanx demo` calls at its end; compares the run with the exact truth.
+What `phalanx demo` calls at its end.
 """
 
 import logging
@@ -18,9 +18,7 @@ from master.rig.setup import load_setups
 
 
 def report(words: Sequence[str]) -> None:
-    """Write figures, a picture and a Rerun file of a run.
-
-    Those of a second hand are in a folder of its name below OUT.
+    """Write figures, a picture and a Rerun file, of a second hand in its folder.
 
     Raises:
         PhalanxError: A file is missing or broken, or there is no such scene.

@@ -1,20 +1,6 @@
 """`phalanx run` tracks live until Ctrl-C, or installs that as a service.
 
-The unit that runs the master as a service of the user who installs it.
-
-Its text, and why each line of it is there. Pure.
-
-The services of a user, as `phalanx run --install` needs them.
-
-Its unit is written, started, looked at, and removed.
-
-`phalanx run --install`: the master as a service of this user.
-
-It needs no root, and the service starts again by itself.
-
-`phalanx run`: track live until Ctrl-C.
-
-Or install that as a service of this user.
+The service is a systemd unit of the user who installs it, which needs no root and starts again by itself.
 """
 
 import getpass
@@ -95,12 +81,9 @@ WantedBy=default.target
 
 
 def unit_text(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> str:
-    """Return the unit.
+    """Return the unit that runs `command`, of absolute paths, in `folder`.
 
-    Args:
-        command: Program and its words; paths are absolute.
-        folder: Where it runs.
-        environment: Variables that it needs; never a key itself, for every program of the user can read a unit.
+    `environment` never has a key itself, for every program of the user can read a unit.
 
     Raises:
         PhalanxError: A word that no unit can carry.
@@ -161,10 +144,9 @@ def systemctl(words: Sequence[str]) -> str:
 
 
 class UserServices:
-    """Of the user who asks. Holds how systemctl is called, which tests replace."""
+    """Services of this process's user; `run` calls systemctl, which tests replace."""
 
     def __init__(self, run: Callable[[Sequence[str]], str] = systemctl) -> None:
-        """Of the user of this process."""
         self._run = run
 
     @property
@@ -174,9 +156,7 @@ class UserServices:
         return (Path(config) if config else Path.home() / ".config") / "systemd/user" / UNIT
 
     def install(self, text: str) -> str:
-        """Write the unit and start it, now and at each login.
-
-        Returns a line that states what was done.
+        """Write the unit and start it, now and at each login; return what was done.
 
         Raises:
             PhalanxError: It does not run; with its last words. It goes on being tried.
@@ -297,7 +277,6 @@ def environment_of() -> dict[str, str]:
 
 
 def _given(options: Namespace) -> set[str]:
-    """Return the options of `KEPT` that differ from their defaults."""
     typical = defaults_of(declare_run)
     return {name for name in KEPT if getattr(options, name) != getattr(typical, name)}
 
@@ -312,8 +291,6 @@ def _program() -> Path:
 def run(options: Namespace) -> None:
     """Track live until Ctrl-C, or install or remove the service that does."""
     if options.install or options.uninstall:
-        pass
-
         change_service(options)
         return
     if options.dry_run:
@@ -336,7 +313,8 @@ def checked_ends(options: Namespace) -> tuple[Address, Address]:
     """Where the beacon goes and where datagrams come; the bus is checked as well.
 
     Raises:
-        PhalanxError: One of them is malformed; the bus would leave the machine as plain text, or its keys are missing.
+        PhalanxError: One of them is malformed; the bus would leave the machine as plain text, or its keys are
+            missing.
     """
     addresses = address(options.beacon, "--beacon"), address(options.bind, "--bind")
     access = access_of(os.environ, MASTER)

@@ -1,11 +1,4 @@
-"""A summary holds the figures of a run, as a file and as lines of text.
-
-Reads and writes summary.json: the figures of a run, by name.
-
-The figures of a run in lines that a person understands.
-
-Terminal output of the master's commands: text lines and progress.
-"""
+"""A summary holds the figures of a run, as a file and as lines of text."""
 
 import json
 import sys
@@ -18,7 +11,7 @@ from common.errors import RecordingError
 
 
 def write_summary(path: Path, value: dict[str, object]) -> None:
-    """Write a summary.
+    """Write summary.json: the figures of a run, by name.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -75,10 +68,7 @@ _LABELS = {
 
 
 def summary_lines(summary: Mapping[str, object]) -> list[str]:
-    """Format one line for each metric that a run has.
-
-    Those of poses come first, then objects and gestures.
-    """
+    """Format one line for each figure that a run has: poses, objects, then gestures."""
     lines = [
         f"{label:34s} {summary[key]:>9} {unit}".rstrip()
         for key, (label, unit) in _LABELS.items()

@@ -1,20 +1,10 @@
-"""`phalanx view` and `phalanx console` show a running master on a screen.
-
-`phalanx view`: a running master in the Rerun viewer.
-
-Command `phalanx console`: the master in a browser.
-
-The page itself is `master.console`, loaded when it is served.
-"""
+"""`phalanx view` and `phalanx console` show a running master on a screen."""
 
 import os
 from argparse import Namespace
 
 from common.bus.keys import ENVIRONMENT, keys_folder, rig_key
-from master.commands.options import (
-    address,
-    rigs_of,
-)
+from master.commands.options import address, rigs_of
 from master.commands.summary import print_line
 from master.rig.setup import load_setups
 from master.run.process import bus_of_master, stop_on_signals

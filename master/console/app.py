@@ -1,10 +1,7 @@
-"""Console program serves its pages in their common frame.
+"""Console program serves its pages in their common frame, behind guards.
 
-Common frame of every console page.
-
-It has a header with connection and checklist, navigation, and light and dark mode.
-
-Console program: its pages, the shell around them, and the guarded server.
+The frame has a header (connection, checklist, theme), the navigation and a logout. The server admits own
+pages only (`serving`), then a login, or the same user of this machine (`login`).
 """
 
 import os
@@ -21,6 +18,7 @@ from fastapi import FastAPI
 from nicegui import ui
 
 from common.errors import PhalanxError
+from master.console.controls import every
 from master.console.login import LOGOUT, LoginRequired, PasswordHash, kept_password, password_from
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
 from master.console.serving import OwnPagesOnly, console_server, names_of, same_user
@@ -29,7 +27,7 @@ from master.console.sockets import serve_sockets
 from master.console.state import ConsoleSettings, ConsoleState
 from master.outputs.web.listening import is_loopback, page_certificate, places_of, private_folder
 
-_UPDATE_S = 1.0
+TITLE = "Phalanx"
 _PRIMARY = "#1b6ac9"  # white on it, and itself on a dark panel, can be read
 _STYLE = Path(__file__).parent / "static" / "console.css"
 _THEMES: dict[str, bool | None] = {"auto": None, "light": False, "dark": True}
@@ -43,27 +41,25 @@ _SESSION_OVER = """<script>setInterval(async () => {
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """One entry of the navigation."""
+class Page:
+    """One console page: its path, title, Material icon and content."""
 
     route: str
     title: str
     icon: str
+    build: Callable[[ConsoleState], None]
 
 
 @contextmanager
-def shell(state: ConsoleState, entries: Sequence[Entry], here: str, logout: bool = False) -> Generator[None]:
-    """Build header and navigation, and a way to log out.
-
-    What is built within stands in the middle of the page.
-    """
+def shell(state: ConsoleState, pages: Sequence[Page], here: str, logout: bool = False) -> Generator[None]:
+    """Build header and navigation; what is built within is the middle of the page."""
     ui.add_css(_STYLE)
     ui.colors(primary=_PRIMARY)
     with ui.header(elevated=False).classes("console-header items-center gap-2 q-px-md"):
         ui.label("Phalanx").classes("console-name gt-sm")
         with ui.element("nav").classes("console-nav").props('aria-label="Pages"'):
-            for entry in entries:
-                _entry(entry, entry.route == here)
+            for page in pages:
+                _entry(page, page.route == here)
         ui.space()
         _connection(state)
         _badge(state)
@@ -78,12 +74,12 @@ def shell(state: ConsoleState, entries: Sequence[Entry], here: str, logout: bool
     ui.skip_link("Skip to the page", target=main)
 
 
-def _entry(entry: Entry, here: bool) -> None:
-    link = ui.link(target=entry.route).classes("console-entry" + (" here" if here else ""))
-    link.props(f'aria-label="{entry.title}"' + (' aria-current="page"' if here else ""))
+def _entry(page: Page, here: bool) -> None:
+    link = ui.link(target=page.route).classes("console-entry" + (" here" if here else ""))
+    link.props(f'aria-label="{page.title}"' + (' aria-current="page"' if here else ""))
     with link:
-        ui.icon(entry.icon).props("aria-hidden=true")
-        ui.label(entry.title).classes("console-entry-title")
+        ui.icon(page.icon).props("aria-hidden=true")
+        ui.label(page.title).classes("console-entry-title")
 
 
 def _connection(state: ConsoleState) -> None:
@@ -99,8 +95,7 @@ def _connection(state: ConsoleState) -> None:
         names = ", ".join(sorted(state.alive - {"master"})) or "no slaves"
         hint.set_text(names if state.link.up else state.link.reason)
 
-    update()
-    ui.timer(_UPDATE_S, update)
+    every(1.0, update)
 
 
 def _badge(state: ConsoleState) -> None:
@@ -119,8 +114,7 @@ def _badge(state: ConsoleState) -> None:
         text.set_text(words)
         link.props(f'aria-label="Checklist: {words}"')
 
-    update()
-    ui.timer(_UPDATE_S, update)
+    every(1.0, update)
 
 
 def _logout() -> None:
@@ -159,22 +153,6 @@ def _theme() -> None:
     show()
 
 
-TITLE = "Phalanx"
-
-
-@dataclass(frozen=True, slots=True)
-class Page:
-    """One console page: its path, title, icon and content.
-
-    The icon is a name of the Material font.
-    """
-
-    route: str
-    title: str
-    icon: str
-    build: Callable[[ConsoleState], None]
-
-
 PAGES: tuple[Page, ...] = (
     Page("/live", "Live", "visibility", live.build),
     Page("/tune", "Tune", "tune", tune.build),
@@ -187,23 +165,16 @@ PAGES: tuple[Page, ...] = (
 
 
 def start_page(state: ConsoleState) -> str:
-    """Return the page on which the console opens.
-
-    It is the set-up page while no rig can be used.
-    """
+    """Return the page on which the console opens: set-up while no rig can be used."""
     return PAGES[0].route if state.rigs() else "/setup"
 
 
 def register(state: ConsoleState, logout: bool = False) -> None:
-    """Register every page with NiceGUI.
-
-    The pages have a logout button where there is a login. Call it once in a process.
-    """
-    entries = tuple(Entry(page.route, page.title, page.icon) for page in PAGES)
+    """Register every page with NiceGUI, once in a process; `logout`: with its button."""
 
     def add(page: Page) -> None:
         def show() -> None:
-            with shell(state, entries, page.route, logout=logout):
+            with shell(state, PAGES, page.route, logout=logout):
                 page.build(state)
 
         ui.page(page.route, title=f"{page.title} · {TITLE}", response_timeout=20.0)(show)
@@ -218,26 +189,17 @@ def register(state: ConsoleState, logout: bool = False) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LoginPage:
-    """What stands before the pages.
-
-    Attributes:
-        password: Who knows it may come in; None: whoever is the same user of this machine.
-        tls: Encrypts; None: plain.
-    """
+    """What stands before the pages; no password: same user here; no TLS: plain."""
 
     password: PasswordHash | None = None
     tls: ssl.SSLContext | None = None
 
 
 def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], None]) -> LoginPage:
-    """Return the login page of a console.
+    """Return the login of a console.
 
-    There is none on this machine alone; elsewhere it asks for a password, and uses TLS unless it is to be open.
-
-    Args:
-        settings: How the console was started.
-        folder: Where password and certificate are kept.
-        notify: Called with the password when it is made, and how to know the certificate.
+    On this machine alone there is none; elsewhere it has a password, and TLS unless it is to be open. Both
+    are kept in `folder`; `notify` gets the password when it is made, and how to know the certificate.
 
     Raises:
         PhalanxError: A file of the password or of the certificate cannot be used.
@@ -286,10 +248,7 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, notify: Callab
 
 
 def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> FastAPI:
-    """Return the complete console application behind its guards.
-
-    The guards admit own pages only, then check the login (or: the same user).
-    """
+    """Return the application behind its guards: own pages only, login or same user."""
     app = FastAPI(openapi_url=None)
     serve_sockets(app, state)
     away_s = 30.0  # a page that sent nothing for so long, as on a busy machine, goes on where it was

@@ -1,41 +1,10 @@
 """Controls change settings of the running rig, and tune them.
 
-Controls, camera views and labels serve all pages of the console.
-
-Controls that the pages share.
-
-They include a labelled slider with a number beside it, and the value that was read back.
-
-Queue that sends a page's changes to a process, one at a time, newest only.
-
-Dragging a slider therefore floods nobody.
-
-Elements of the console's pages that NiceGUI does not have.
-
-They are a camera's picture and the hand in 3D.
-
-Plain-text labels for the state of hands, objects and gestures.
-
-Pure: messages in, text out.
-
-Tuner tries settings of cameras and filters, then saves them to files.
-
-Camera settings as the page tunes them.
-
-They are what was read back and what it was when the tuning began, with a way back to that.
-
-Every method asks the slave over the bus and waits for its answer: never on the thread of the page.
-
-Copy of a camera's file on this machine, updated after its slave saved.
-
-The master and the wizards read this copy.
-
-A slave of this machine has written the very file; one of another machine has written its own, and only what its answer
-contains can be copied: settings and colour ranges, not the calibration.
-
-Trial of a rig's 1 € filter on a running master, then saved to the rig's file.
-
-It blocks, so do not call it on the page's thread.
+Sliders, camera views and labels that the pages share; `CommandQueue` sends a page's changes one at a time,
+newest only. `Tuner` tries settings of a camera over the bus; functions beside it try and save a rig's filter.
+These block: never call them on the thread of the page. The master and the wizards read this machine's copy of
+a camera's file: after a slave of another machine saved its own, settings and colour ranges are copied, not
+the calibration (`update_copy`).
 """
 
 import asyncio
@@ -62,10 +31,14 @@ from common.messages.streams import MASTER
 from master.calibrate.tree_files import provenance
 
 
-class Setting:
-    """Slider and number field for one value, with the value last shown.
+def every(period_s: float, update: Callable[[], None]) -> None:
+    """Update a part of the page now, and again and again while the page is open."""
+    update()
+    ui.timer(period_s, update)
 
-    The slider is logarithmic where the value spans decades.
+
+class Setting:
+    """Slider (logarithmic where a value spans decades) and number field of one value.
 
     A change by a person is passed once to `on_change`; `show` changes the controls and calls nothing.
     """
@@ -83,13 +56,8 @@ class Setting:
     ) -> None:
         """Build one row of the form.
 
-        Args:
-            title: What it is.
-            unit: Its unit, may be empty.
-            low, high: What the slider spans; a number beyond may be typed, and whoever gets it may refuse.
-            on_change: Called with each new value.
-            digits: Decimals shown.
-            log: Whether the slider is logarithmic.
+        The slider spans `low` to `high`; a number beyond may be typed, and `on_change`, which gets each new
+        value, may refuse.
         """
         self._low, self._high, self._log, self._digits = low, high, log, digits
         self._on_change = on_change
@@ -148,7 +116,6 @@ class Setting:
         self._on_change(value)
 
     def _place(self, value: float) -> float:
-        """Where on the slider a value is, on its steps."""
         inside = min(max(value, self._low), self._high)
         if not self._log:
             return round(inside, self._digits)
@@ -172,10 +139,8 @@ class CommandQueue(Generic[AnswerT]):
     ) -> None:
         """Start with an empty queue.
 
-        Args:
-            send: Sends a change and waits for the answer, on a thread.
-            on_answer: Called with the answer, on the page's loop, unless more is to be sent already.
-            on_error: Called with the error's text as it is.
+        `send` sends a change and waits for the answer, on a thread. `on_answer` is called with it on the
+        page's loop, unless more is to be sent already; `on_error` with the error's text.
         """
         self._send, self._on_answer, self._on_error = send, on_answer, on_error
         self._waiting: dict[tuple[str, str | None], object] = {}
@@ -187,10 +152,7 @@ class CommandQueue(Generic[AnswerT]):
         return self._task is not None and not self._task.done()
 
     def change(self, key: str, value: object, part: str | None = None) -> None:
-        """Send `key: value` soon.
-
-        With `part`, only one entry of the map `key` is sent. The newest value of each counts.
-        """
+        """Send `key: value` soon, the newest; with `part` one entry of the map `key`."""
         self._waiting[key, part] = value
         if not self.busy:
             self._task = background_tasks.create(self._work(), name="commands")
@@ -210,7 +172,6 @@ class CommandQueue(Generic[AnswerT]):
 
 
 def _merged(waiting: Mapping[tuple[str, str | None], object]) -> dict[str, object]:
-    """Keys and values; the parts of one key as a map."""
     out: dict[str, object] = {key: value for (key, part), value in waiting.items() if part is None}
     for key in {key for key, part in waiting if part is not None}:
         out[key] = {
@@ -220,20 +181,14 @@ def _merged(waiting: Mapping[tuple[str, str | None], object]) -> dict[str, objec
 
 
 class CameraView(Element, component="static/camera_view.js"):
-    """Live camera picture, shown as long as the page is visible.
-
-    With `on_pick`, a click, or a cross moved by keys, picks a point.
-    """
+    """Live camera picture while the page is visible; `on_pick`: points can be picked."""
 
     def __init__(
         self, camera: str, label: str, on_pick: Callable[[float, float, int], object] | None = None
     ) -> None:
-        """Show `camera`.
+        """Show `camera`, to a screen reader as `label`.
 
-        Args:
-            camera: Its name.
-            label: What a screen reader reads.
-            on_pick: Called with the place in the picture, as shares (0..1) of its width and height, and its time [ns].
+        `on_pick` gets the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
         super().__init__()
         self._props["camera"] = camera
@@ -262,10 +217,7 @@ def _place(event: GenericEventArguments) -> tuple[float, float, int]:
 
 
 def full_frame_uv(x: float, y: float, width_px: int, height_px: int) -> tuple[float, float]:
-    """Convert shares of a picture to a pixel of the whole frame.
-
-    (0, 0) is the centre of the top-left pixel.
-    """
+    """Convert shares of a picture to a pixel (u, v); 0: the centre of the first."""
     return x * width_px - 0.5, y * height_px - 0.5
 
 
@@ -287,10 +239,7 @@ FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 def joint_states(pose: HandPose) -> list[tuple[str, str, bool]]:
-    """Return (joint, state, tracked now) for all 26 joints.
-
-    The state is `unknown` where the joint is not valid.
-    """
+    """Return (joint, state, tracked now) for all 26 joints; not valid: `unknown`."""
     return [
         (name, SOURCES[Source(int(source))] if valid else "unknown", bool(tracked))
         for name, source, valid, tracked in zip(JOINTS, pose.source, pose.valid, pose.tracked, strict=True)
@@ -358,10 +307,7 @@ GAINS = ("red_gain", "blue_gain")
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Marker colour range in OpenCV's HSV (H 0-179).
-
-    If low[0] is above high[0], the range wraps through red.
-    """
+    """Marker colours in OpenCV's HSV (H 0-179); low[0] > high[0] wraps through red."""
 
     low: tuple[int, int, int]
     high: tuple[int, int, int]
@@ -407,10 +353,7 @@ class InUse:
 
 
 def markers_over(used: InUse, known: Iterable[str]) -> dict[str, object]:
-    """Return the part `markers` of the command "set" that restores `used`.
-
-    After it those of `used` hold and no other of `known`.
-    """
+    """Return `markers` of the command "set": those of `used`, no other of `known`."""
     out: dict[str, object] = {}
     out.update(dict.fromkeys(sorted(set(known) - used.markers.keys())))
     out.update({name: colour_body(colour) for name, colour in used.markers.items()})
@@ -423,13 +366,12 @@ def colour_body(colour: Range) -> dict[str, list[int]]:
 
 
 class Tuner:
-    """Tuner of one camera.
+    """Tuner of one camera; holds what was in use when it began or was saved last.
 
-    It holds what was in use when the tuning began or was saved last.
+    Each method asks the slave, waits, and raises a BusError if it does not answer or refuses.
     """
 
     def __init__(self, camera: str, ask: Callable[[Command], Health]) -> None:
-        """Nothing was asked yet; `ask` sends a command and waits."""
         self.camera = camera
         self._ask = ask
         self._begun: InUse | None = None
@@ -440,11 +382,7 @@ class Tuner:
         return self._begun
 
     def refresh(self) -> InUse:
-        """What is in use now.
-
-        Raises:
-            BusError: The slave does not answer, or refuses; as all methods here.
-        """
+        """What is in use now."""
         now = self._send("settings", "")
         if self._begun is None:
             self._begun = now
@@ -456,10 +394,7 @@ class Tuner:
         return self._send("set", json.dumps(change))
 
     def pick(self, marker: str, uv: Sequence[float], t_ns: int | None = None) -> InUse:
-        """Sample a marker's colour around a pixel of the whole frame.
-
-        The frame is the one taken at `t_ns` [ns], if that is known.
-        """
+        """Sample a marker's colour around a full-frame pixel, taken at `t_ns` if known."""
         self._begin()
         pick = ColourPick(marker=marker, uv=(round(float(uv[0]), 2), round(float(uv[1]), 2)), t_ns=t_ns)
         return self._send("pick", msgspec.json.encode(pick).decode())
@@ -500,7 +435,8 @@ def update_copy(path: Path, saved: InUse) -> bool:
     """Bring the file to what the slave saved. Whether anything differed.
 
     Raises:
-        CalibrationError: The file is missing, broken or read-only, or the slave has what a file must not contain.
+        CalibrationError: The file is missing, broken or read-only, or the slave has what a file must not
+            contain.
     """
     camera = load(path, CameraCalibration)
     body = saved.body() | {"markers": markers_over(saved, camera.markers or {})}
@@ -513,9 +449,6 @@ def update_copy(path: Path, saved: InUse) -> bool:
     made = provenance("console", (), {}, "as the slave saved it")
     save(path, msgspec.structs.replace(new, provenance=camera.provenance | {"markers": made}))
     return True
-
-
-NAMES = ("min_cutoff_hz", "beta", "d_cutoff_hz", "jitter_m")
 
 
 def saved_filter(rig_path: Path) -> FilterCalibration:
@@ -537,9 +470,7 @@ def try_filter(ask: Callable[[Command], Health], rig: str, values: Mapping[str, 
 
 
 def save_filter(rig_path: Path, values: Mapping[str, float]) -> None:
-    """Write the filter settings to the rig's file, with when and by what.
-
-    A running master follows its files.
+    """Write the filter settings to the rig's file, which a running master follows.
 
     Raises:
         CalibrationError: The file is missing, broken or read-only, or a value is out of range.

@@ -1,17 +1,9 @@
 """Link connects the console to the bus and leases camera previews.
 
-Connection of the console to the bus.
-
-It reopens by itself whenever a master comes or goes.
-
-Request camera previews while somebody looks at them, and not longer.
-
-Decide which previews may be shown, by the size that they claim.
-
-None is shown that claims to be larger than the camera's own picture.
+It reopens by itself whenever a master comes or goes. Previews are requested while somebody looks; one that
+claims to be larger than the camera's own picture is not shown.
 """
 
-import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -26,22 +18,17 @@ from common.recording.pictures import Size, jpeg_size
 POLL_S = 0.5  # between two looks at who is alive
 ANSWER_S = 20.0  # a slow camera shows its new settings after some seconds
 
-_LOG = logging.getLogger(__name__)
 Take = Callable[[Message], None]
 
 
 class Link:
-    """Bus connection that also holds which processes are alive.
-
-    It holds the bus while there is one, and one thread keeps both up to date.
-    """
+    """Bus connection, and which processes are alive; one thread updates both."""
 
     def __init__(self, open_bus: Callable[[], Bus], take: Mapping[str, Take]) -> None:
         """Begin to connect.
 
-        Args:
-            open_bus: Opens the bus, or raises `BusError` while nobody listens there.
-            take: Stream -> what is called with each of its messages, on a thread of its own; must not raise.
+        `open_bus` raises `BusError` while nobody listens there. `take`: stream -> what is called with each of
+        its messages, on a thread of its own; must not raise.
         """
         self._open_bus, self._take = open_bus, dict(take)
         self._bus: Bus | None = None
@@ -129,20 +116,15 @@ class Link:
 
 def _read(inbox: Subscription, take: Take, ended: threading.Event) -> None:
     while not ended.is_set():
-        read_s = 0.2
-        message = inbox.get(read_s)
+        message = inbox.get(0.2)
         if message is not None:
             take(message)
 
 
 class PreviewLeases:
-    """Viewers of each camera, with the time until which each looks.
-
-    It holds one thread per camera as long as somebody looks.
-    """
+    """Until when each camera is looked at; one thread per camera while it is."""
 
     def __init__(self, ask: Callable[[Command, float], Health]) -> None:
-        """Nobody looks yet; `ask` sends a command and waits for the answer."""
         self._ask = ask
         self._lock = threading.Lock()
         self._until: dict[str, dict[tuple[str, ...], float]] = {}
@@ -150,10 +132,7 @@ class PreviewLeases:
         self._errors: dict[str, str] = {}
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
-        """Request the preview of `camera` for the next 3 s.
-
-        The pixels of these markers are tinted. Never waits.
-        """
+        """Request a camera's preview for 3 s, with these markers tinted. Never waits."""
         with self._lock:
             lease_s = 3.0  # so long a lease holds: whoever still looks renews it before
             self._until.setdefault(camera, {})[mask] = time.monotonic() + lease_s
@@ -177,8 +156,7 @@ class PreviewLeases:
         while (mask := self._mask(camera)) is not None:
             body = PreviewWish(mask=mask, found=True).body() if mask else ""
             try:
-                answer_s = 1.5
-                self._ask(Command(camera, "preview", body), answer_s)
+                self._ask(Command(camera, "preview", body), 1.5)
                 self._errors.pop(camera, None)
             except BusError as error:
                 self._errors[camera] = str(error)
@@ -186,10 +164,7 @@ class PreviewLeases:
             time.sleep(ask_every_s)
 
     def _mask(self, camera: str) -> tuple[str, ...] | None:
-        """Return all markers that somebody wants tinted.
-
-        None when nobody looks; the thread is then forgotten.
-        """
+        """Return all markers that somebody wants tinted; None when nobody looks: its thread then ends."""
         with self._lock:
             now = time.monotonic()
             wanted = {mask: until for mask, until in self._until.get(camera, {}).items() if until > now}
@@ -202,25 +177,16 @@ class PreviewLeases:
 
 
 class PictureSizes:
-    """Compares the sizes of previews with those of the camera files.
-
-    Holds the sizes [px] that the files stated last, and why the last preview of a camera was refused.
-    """
+    """Compares the sizes [px] of previews with those of the camera files."""
 
     def __init__(self, camera: Callable[[str], CameraCalibration]) -> None:
-        """Compare with the camera files that `camera` reads.
-
-        It gives the file of a camera, or raises a `CalibrationError` where there is none.
-        """
+        """Compare with the files that `camera` reads; it raises a `CalibrationError` where there is none."""
         self._camera = camera
         self._known: dict[str, tuple[float, Size | None]] = {}
         self._refused: dict[str, str] = {}
 
     def fits(self, preview: Preview) -> bool:
-        """Whether a preview is no larger than its camera's pictures.
-
-        Where no file states their size, any that a message may carry is.
-        """
+        """Whether a preview is no larger than the size in its camera's file, if known."""
         width, height = jpeg_size(preview.jpeg)
         most = self._size(preview.camera)
         if most is None or (width <= most[0] and height <= most[1]):

@@ -1,9 +1,8 @@
 """Local processes that the console starts by command line.
 
-They are cameras, a master and calibrations, and they end with the console.
-
-Each runs in a process group of its own; a thread reads its lines. A `supervisor` process holds the groups and
-ends them when the console is gone, so that a console that was killed leaves no camera busy.
+They are cameras, a master and calibrations. Each runs in a process group of its own; a thread reads its
+lines. A `process_supervisor` holds the groups and ends them when the console is gone, even killed, so that no
+camera stays busy.
 """
 
 import codecs
@@ -26,25 +25,16 @@ _CHUNK = 8192
 
 
 class LocalProcess:
-    """One running command, with its child process and its last output lines.
-
-    It also holds output that does not end the line: a question.
-    """
+    """One running command: its last lines, and a `prompt` that does not end its line."""
 
     def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        """Start it.
-
-        Args:
-            name: For messages.
-            command: Program and arguments.
-            environment: Added to this process's own.
+        """Start `command` with this process's environment and `environment`.
 
         Raises:
             PhalanxError: The program cannot be started.
         """
         self.name, self.command = name, tuple(command)
-        tail = 200
-        self.lines: deque[str] = deque(maxlen=tail)
+        self.lines: deque[str] = deque(maxlen=200)
         self.prompt = ""
         self._stopped = False
         try:
@@ -96,10 +86,7 @@ class LocalProcess:
         self._signal(signal.SIGINT)
 
     def stop(self, ends_s: float = ENDS_S) -> int:
-        """Stop the process, wait until it has ended, and return its exit code.
-
-        It is killed after `ends_s` [s].
-        """
+        """Stop it, after `ends_s` [s] by killing, and return its exit code."""
         self._stopped = True
         if self._child.poll() is None:
             self._signal(signal.SIGTERM)
@@ -134,17 +121,9 @@ class LocalProcess:
 
 
 class LocalProcesses:
-    """All processes that the console started, by name.
-
-    It holds the supervisor process, and allows one process of a name at a time.
-    """
+    """All processes that the console started, one of a name, and their supervisor."""
 
     def __init__(self) -> None:
-        """Start the supervisor process.
-
-        Raises:
-            PhalanxError: This interpreter cannot be started.
-        """
         self._lock = threading.Lock()
         self._all: dict[str, LocalProcess] = {}
         self._shared: dict[type, object] = {}
@@ -182,10 +161,7 @@ class LocalProcesses:
             return {name: one for name, one in self._all.items() if one.ended() is None}
 
     def shared(self, kind: type[T], make: Callable[[], T]) -> T:
-        """Return the one shared object of a type that manages these processes.
-
-        It is made when first asked for, so all pages see the same object.
-        """
+        """Return the one object of a type that all pages share, made when first asked."""
         with self._lock:
             found = self._shared.get(kind)
             if not isinstance(found, kind):
@@ -201,10 +177,7 @@ class LocalProcesses:
         self._send(f"-{process.pid}")
 
     def close(self) -> None:
-        """End all processes at once, then the supervisor.
-
-        Safe to call twice.
-        """
+        """End all processes at once, then the supervisor. Safe to call twice."""
         running = list(self.running().values())
         stoppers = [threading.Thread(target=one.stop, daemon=True) for one in running]
         for thread in stoppers:

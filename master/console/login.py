@@ -1,22 +1,10 @@
 """Login checks the password, keeps sessions and limits failed tries.
 
-Password of the console, made or read at the start.
-
-It is kept as its scrypt hash and compared in constant time.
-
-It is needed wherever the page can be reached from another machine (docs/security.md). scrypt is slow and takes memory
-on purpose: who steals the file of the hash tries a dozen passwords a second, not millions.
-
-Login sessions, and the limit on failed tries.
-
-Push machines: they receive the time as an argument, and both have bounded memory.
-
-Login page of the console.
-
-Nothing behind it is answered before somebody has logged in, and everything ends with the session.
-
-It stands before everything that the console serves: pages, NiceGUI's own socket and files, our sockets, downloads. Only
-the page of the login itself is open. A socket ends when its session does, also while nothing is sent on it.
+It is needed wherever the page can be reached from another machine (docs/security.md). The password is kept as
+its scrypt hash, slow and large on purpose (a thief of the file tries a dozen passwords a second, not
+millions), and compared in constant time. Sessions and failed tries have bounded memory, and receive the time
+as an argument. `LoginRequired` stands before everything that the console serves; only the page of the login
+is open.
 """
 
 import asyncio
@@ -45,7 +33,7 @@ from master.outputs.web.listening import read_private, write_private
 HASH_FILE = "console.password"
 MOST_BYTES = 1024
 _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 that are not taken for one another: 5 bits each
-_BYTES = 32  # 32 MiB and about 0.1 s
+_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +46,9 @@ class PasswordHash:
     salt: bytes
     digest: bytes
 
-    # 32 MiB and about 0.1 s
     @classmethod
     def of(cls, password: str, n: int = 2**15) -> "PasswordHash":
-        """Hash a password with a salt of its own; n is the cost, a power of two."""
+        """Hash a password with a new salt; by default n costs 32 MiB and about 0.1 s."""
         salt = secrets.token_bytes(16)
         r, p = 8, 1
         return cls(n, r, p, salt, _scrypt(password, salt, n, r, p))
@@ -76,13 +63,12 @@ class PasswordHash:
         try:
             kind, n, r, p, salt, digest = text.strip().split("$")
             found = cls(int(n), int(r), int(p), bytes.fromhex(salt), bytes.fromhex(digest))
+            if kind != "scrypt" or not 2 <= found.n <= 2**20 or len(found.digest) != _BYTES:
+                raise ValueError("another kind of hash")
         except ValueError as error:
             raise PhalanxError(
                 f"{where}: not the hash of a password; delete it, and a new one is made"
             ) from error
-        most_n = 2**20
-        if kind != "scrypt" or not 2 <= found.n <= most_n or len(found.digest) != _BYTES:
-            raise PhalanxError(f"{where}: not the hash of a password; delete it, and a new one is made")
         return found
 
     def text(self) -> str:
@@ -101,7 +87,7 @@ def new_password() -> str:
 
 
 def password_from(file: Path) -> PasswordHash:
-    """Of the password that stands in the first line of a file.
+    """Return the hash of the password in the first line of a file.
 
     Raises:
         PhalanxError: It cannot be read, others can read it, or the password is too short.
@@ -117,9 +103,7 @@ def password_from(file: Path) -> PasswordHash:
 
 
 def kept_password(folder: Path, notify: Callable[[str], None]) -> PasswordHash:
-    """Return the hash of the password kept in a folder.
-
-    At the first start the password is made, and printed this once.
+    """Return the hash of the password in a folder; at first made, and printed once.
 
     Raises:
         PhalanxError: The file is there and cannot be used, or it cannot be written.
@@ -161,21 +145,16 @@ class Session:
 
 
 class Sessions:
-    """Sessions stored by the hash of their token.
+    """Sessions by the hash of their token: a lookup reveals nothing about tokens."""
 
-    Thus a lookup reveals nothing about which token would have matched.
-    """
-
-    # a working day
     def __init__(self, life_s: float = 12 * 3600.0, most: int = 64) -> None:
-        """Nobody is logged in. With more than `most` the oldest is logged out."""
+        """Nobody is logged in; by default for a working day. With more than `most` the oldest is logged out."""
         self._life_s, self._most = life_s, most
         self._by_hash: OrderedDict[bytes, Session] = OrderedDict()
 
     def begin(self, now_s: float) -> str:
         """Log in; the token is for the browser alone."""
-        token_bytes = 32
-        token = secrets.token_urlsafe(token_bytes)
+        token = secrets.token_urlsafe(32)
         while len(self._by_hash) >= self._most:
             self._by_hash.popitem(last=False)[1].ended.set()
         self._by_hash[_hash(token)] = Session(now_s + self._life_s)
@@ -195,7 +174,6 @@ class Sessions:
             session.ended.set()
 
     def __len__(self) -> int:
-        """How many are kept."""
         return len(self._by_hash)
 
 
@@ -206,7 +184,6 @@ class Backoff:
     """
 
     def __init__(self, most: int = 1024) -> None:
-        """Nobody failed."""
         self._most = most
         self._failures: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
@@ -216,10 +193,7 @@ class Backoff:
         return max(0.0, until_s - now_s)
 
     def failed(self, address: str, now_s: float) -> None:
-        """Record a wrong password from an address.
-
-        After three, the wait doubles each time, to five minutes.
-        """
+        """Record a wrong password; after three, the wait doubles, to five minutes."""
         key = _network(address)
         count = self._failures.pop(key, (0, 0.0))[0] + 1
         free_tries = 3
@@ -234,7 +208,6 @@ class Backoff:
         self._failures.pop(_network(address), None)
 
     def __len__(self) -> int:
-        """How many addresses are kept."""
         return len(self._failures)
 
 
@@ -243,10 +216,7 @@ def _hash(token: str) -> bytes:
 
 
 def _network(address: str) -> str:
-    """Return the network whose failed tries are counted together.
-
-    It is an IPv4 address, or the 64 bits of IPv6 that one machine has for itself.
-    """
+    """Return the network whose tries count together: an IPv4 address, or 64 bits of IPv6."""
     try:
         found = ip_address(address.split("%", 1)[0])
     except ValueError:
@@ -268,10 +238,7 @@ _HEADERS = {
 
 
 class LoginRequired:
-    """ASGI middleware that admits only logged-in browsers.
-
-    It holds sessions and failed tries.
-    """
+    """ASGI middleware that admits only logged-in browsers."""
 
     def __init__(
         self,
@@ -284,13 +251,9 @@ class LoginRequired:
     ) -> None:
         """Stand before `app`.
 
-        Args:
-            app: What is behind the door.
-            password: Who knows it may come in.
-            cookie: Name of the session's cookie. Cookies know no port: two consoles of a machine need two names.
-            secure: Whether the page is served by TLS: the cookie then never leaves without it.
-            pages: Paths that one may be led to after the login; others lead to the first page.
-            clock: Seconds.
+        `cookie` names the session's cookie: cookies know no port, so two consoles of a machine need two
+        names. `secure`: the page is served by TLS; the cookie then never leaves without it. The login leads
+        only to one of `pages`, or the first page.
         """
         self._app, self._password, self._clock = app, password, clock
         self._cookie = f"__Host-{cookie}" if secure else cookie
@@ -299,7 +262,7 @@ class LoginRequired:
         self._checking, self._waiting = asyncio.Lock(), 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer the door, or pass on what belongs to a session."""
+        """Pass a request on, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -369,10 +332,7 @@ class LoginRequired:
         return answer
 
     async def _socket(self, session: Session, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a socket on until its session ends.
-
-        The handler then receives a disconnect, as if the browser had gone.
-        """
+        """Pass a socket on until its session ends: then the handler receives a disconnect."""
         ended = asyncio.ensure_future(_end(session, self._clock()))
 
         async def receive_or_end() -> Message:
@@ -394,7 +354,7 @@ class LoginRequired:
             ended.cancel()
 
     def _next(self, request: Request) -> str:
-        """Where to after the login: a page of ours by its path, nothing else."""
+        """Where to after the login: one of our pages, nothing else."""
         wanted = request.query_params.get("next", "/")
         return wanted if wanted in self._pages else "/"
 
@@ -406,14 +366,10 @@ async def _end(session: Session, now_s: float) -> None:
 
 
 async def _password(request: Request) -> str | None:
-    """Return the password from the form, or None.
-
-    None means that the form holds nothing, too much, something else, or arrives too slowly.
-    """
+    """Return the password from the form; None: nothing, too much, something else, or too slow."""
     body = b""
     try:
-        body_s = 10.0
-        async with asyncio.timeout(body_s):
+        async with asyncio.timeout(10.0):
             async for part in request.stream():
                 body += part
                 if len(body) > MOST_BYTES:

@@ -1,9 +1,8 @@
-"""Supervisor that ends the console's processes once the console is gone.
+"""Supervisor ends the console's processes once the console is gone.
 
-Run as `python -m master.console.process_supervisor`.
-
-It reads "+PID" and "-PID" lines from a pipe whose other end only the console holds. The end of the pipe is the end of
-the console: each process group that is still listed is asked to end, and killed if it does not.
+Run as `python -m master.console.process_supervisor`. It reads "+PID" and "-PID" lines from a pipe whose other
+end only the console holds. When that closes, each process group still listed is asked to end, and killed if
+it does not.
 """
 
 import os
@@ -32,15 +31,13 @@ def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
     left = {group for group in groups if _send(group, signal.SIGTERM)}
     deadline = time.monotonic() + ends_s
     while left and time.monotonic() < deadline:
-        poll_s = 0.05
-        time.sleep(poll_s)
+        time.sleep(0.05)
         left = {group for group in left if _send(group, 0)}
     for group in left:
         _send(group, signal.SIGKILL)
 
 
 def _send(group: int, number: int) -> bool:
-    """Send a signal to a process group and return whether the group existed."""
     try:
         os.killpg(group, number)
     except (ProcessLookupError, PermissionError):
@@ -51,9 +48,8 @@ def _send(group: int, number: int) -> bool:
 def main() -> None:
     """Outlive the console by as long as it takes to end its processes."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(
-            number, signal.SIG_IGN
-        )  # a terminal that closes reaches the console, which notifies by the pipe
+        # A terminal that closes reaches the console, which notifies by the pipe.
+        signal.signal(number, signal.SIG_IGN)
     end_groups(watch(sys.stdin))
 
 

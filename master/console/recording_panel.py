@@ -1,12 +1,7 @@
 """Panels start, stop and play recordings.
 
-Recording on the page: start, stop and progress.
-
-The recorder is a process of its own; files lie in one folder.
-
-Playback controls on the page.
-
-Begin a recording in place of a master; pause, seek and set the speed of whichever player runs.
+The recorder and the player are processes of their own; recordings lie in one folder beside the calibration
+tree. What is played takes the place of a master; pause, seek and speed go to whichever player runs.
 """
 
 import asyncio
@@ -25,7 +20,7 @@ from nicegui.events import GenericEventArguments
 from common.errors import PhalanxError
 from common.messages import Command, Health
 from common.messages.streams import MASTER
-from master.console.controls import CommandQueue
+from master.console.controls import CommandQueue, every
 from master.console.state import ConsoleState
 
 PROCESS = "record"
@@ -92,18 +87,9 @@ def recording_panel(state: ConsoleState) -> None:
         error = ui.label("").classes("problem").props('role="alert"')
 
     async def toggle() -> None:
-        error.set_text("")
-        button.disable()
-        try:
-            if PROCESS in state.local.running():
-                await asyncio.to_thread(state.local.stop, PROCESS)
-                name.set_value(_new_name())
-            else:
-                await asyncio.to_thread(start_recording, state, str(name.value or ""), bool(previews.value))
-        except PhalanxError as problem:
-            error.set_text(str(problem))
-        finally:
-            button.enable()
+        wanted, small = str(name.value or ""), bool(previews.value)
+        if await _toggle(state, PROCESS, lambda: start_recording(state, wanted, small), button, error):
+            name.set_value(_new_name())
 
     button.on_click(toggle)
 
@@ -118,9 +104,24 @@ def recording_panel(state: ConsoleState) -> None:
         else:
             status.set_text("\n".join(process.tail(3)) or ("starting …" if running else ""))
 
-    update()
-    update_s = 0.5
-    ui.timer(update_s, update)
+    every(0.5, update)
+
+
+async def _toggle(
+    state: ConsoleState, process: str, start: Callable[[], object], button: ui.button, error: ui.label
+) -> bool:
+    """Stop a process that runs, else start it; whether it was stopped. An error is shown."""
+    error.set_text("")
+    button.disable()
+    try:
+        runs = process in state.local.running()
+        await asyncio.to_thread((lambda: state.local.stop(process)) if runs else start)
+        return runs
+    except PhalanxError as problem:
+        error.set_text(str(problem))
+        return False
+    finally:
+        button.enable()
 
 
 def _new_name() -> str:
@@ -138,8 +139,7 @@ def recordings(state: ConsoleState) -> list[str]:
     if not folder.is_dir():
         return []
     files = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-    most_files = 200
-    return [path.stem for path in files[:most_files]]
+    return [path.stem for path in files[:200]]
 
 
 def start_playing(state: ConsoleState, name: str) -> None:
@@ -161,16 +161,10 @@ def start_playing(state: ConsoleState, name: str) -> None:
 
 
 class Controls:
-    """Pause, position and speed of whichever player is on the bus.
-
-    It holds what the page shows of the player.
-    """
+    """Pause, position and speed of whichever player is on the bus."""
 
     def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
-        """Build the controls in the present slot.
-
-        `notify` receives the reason why a command was refused, or nothing.
-        """
+        """Build the controls; `notify` receives why a command was refused, or nothing."""
         self._state, self._notify = state, notify
         self._answer: Health | None = None
         self._at, self._speed, self._paused = 0.0, 1.0, False
@@ -264,17 +258,8 @@ def play_panel(state: ConsoleState) -> None:
         log = ui.label("").classes("mono").props('role="log" aria-label="Messages of the player"')
 
     async def toggle() -> None:
-        error.set_text("")
-        play.disable()
-        try:
-            if PLAYBACK in state.local.running():
-                await asyncio.to_thread(state.local.stop, PLAYBACK)
-            else:
-                await asyncio.to_thread(start_playing, state, str(which.value or ""))
-        except PhalanxError as problem:
-            error.set_text(str(problem))
-        finally:
-            play.enable()
+        wanted = str(which.value or "")
+        await _toggle(state, PLAYBACK, lambda: start_playing(state, wanted), play, error)
 
     play.on_click(toggle)
 
@@ -289,6 +274,4 @@ def play_panel(state: ConsoleState) -> None:
         process = state.local.get(PLAYBACK)
         log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
 
-    update()
-    update_s = 0.5
-    ui.timer(update_s, update)
+    every(0.5, update)

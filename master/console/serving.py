@@ -1,25 +1,11 @@
 """Web server limits connections and refuses requests of other sites.
 
-Web server limits connections and refuses requests of other sites.
-
-Web server of the console: uvicorn with limits on connections.
-
-The limits apply to whoever connects and does not, or not yet, send requests like a browser.
-
-uvicorn by itself waits for ever for a request that never comes or never ends, keeps headers however many there are, and
-gives TLS a minute. An unknown sender would hold every place, or all memory, without a password.
-
-Filter for who may talk to the console.
-
-Only pages that it served itself, under the name it is reached by, may do so.
-
-A page of another site, open in the same browser, could otherwise open a web socket to this one (browsers send those
-across origins), show it in a frame and steal a click, or reach it under a name of its own that it lets point here (DNS
-rebinding). Where there is no login, another user of the same machine is refused as well: `same_user`.
-
-Local user at the other end of a connection that never left this machine.
-
-Linux reports it in /proc/net.
+uvicorn by itself waits for ever for a request that never comes or never ends, keeps headers however many
+there are, and gives TLS a minute: an unknown sender would hold every place, or all memory, without a
+password. A page of another site, open in the same browser, could open a web socket to this one (browsers send
+those across origins), show it in a frame and steal a click, or reach it under a name of its own that it lets
+point here (DNS rebinding). Where there is no login, another user of the same machine is refused as well:
+`same_user`, by /proc/net.
 """
 
 import asyncio
@@ -48,19 +34,13 @@ MOST_HEAD_BYTES = 64 * 1024  # of the address that is asked for, and all headers
 
 
 class BoundedHttp(HttpToolsProtocol):
-    """One connection, with a deadline and the size of the request head so far.
-
-    It holds these besides what uvicorn holds.
-    """
+    """One connection of uvicorn, with a deadline and a size limit for request heads."""
 
     _deadline: asyncio.TimerHandle | None = None
     _head_bytes = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """Start to wait for a request.
-
-        A connection is aborted if its address already has half of all places.
-        """
+        """Wait for a request; aborted if its address already has half of all places."""
         super().connection_made(transport)
         host = self._host(self)
         if sum(self._host(one) == host for one in self.connections) > MOST_OF_ONE:
@@ -204,12 +184,10 @@ class OwnPagesOnly:
     def __init__(
         self, app: ASGIApp, allowed: Collection[str], same_user: Callable[[Peer, Peer], bool] | None = None
     ) -> None:
-        """Guard `app`.
+        """Guard `app`, which is reached under the names `allowed`.
 
-        Args:
-            app: What is guarded.
-            allowed: Names under which it is reached.
-            same_user: Whether the two ends of a connection (client, server) belong to one user; None: not asked.
+        `same_user`: whether the two ends of a connection (client, server) belong to one user; None: not
+        asked.
         """
         self._app, self._allowed, self._same_user = app, frozenset(allowed), same_user
 
@@ -275,11 +253,8 @@ _WORD = 8  # hexadecimal digits of 32 bits, which the kernel writes in the machi
 def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool:
     """Return whether the client belongs to this process's user, or to root.
 
-    True where the system does not report it.
-
-    Args:
-        client, server: Address and port of both ends, as the server sees them.
-        net: Folder with the kernel's tables of sockets.
+    Both ends as the server sees them; `net` has the kernel's tables of sockets. True where the system has
+    none.
     """
     tables = [path for name in _TABLES if (path := net / name).exists()]
     if not tables:

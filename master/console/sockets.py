@@ -1,9 +1,7 @@
-"""Web sockets of the console.
+"""Web sockets of the console carry camera pictures, and hands for the 3D view.
 
-They carry pictures of a camera as the slave made them, and hands for the 3D view.
-
-Each message is sent when the page has shown the one before, so a slow page or network sees fewer, never old ones. An
-open socket is a look at the camera: when it closes, the camera stops showing itself within seconds.
+Each message is sent when the page has shown the one before, so a slow page or network sees fewer, never old
+ones. An open socket is a look at the camera: when it closes, the camera stops showing itself within seconds.
 """
 
 import asyncio
@@ -25,28 +23,21 @@ _TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
 
 
 class _Wish(msgspec.Struct):
-    """Request of a page for the picture it wants."""
-
     mask: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_MARKERS)]
 
 
 class Shown:
-    """Last message from the page at the other end.
-
-    It states whether the page has shown the last message, and which markers it wants tinted.
-    """
+    """Whether the page has shown the last message, and which markers it wants tinted."""
 
     def __init__(self) -> None:
-        """It wants the first message."""
         self.ready = True
         self.mask: tuple[str, ...] = ()
 
     def on_text(self, text: str) -> None:
         """Take one message of the page; what is none of ours is left alone."""
-        most_characters = 8192
         if text == "next":
             self.ready = True
-        elif len(text) <= most_characters:
+        elif len(text) <= 8192:
             self.mask = _mask(text, self.mask)
 
 
@@ -80,10 +71,7 @@ def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
 
 @asynccontextmanager
 async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
-    """Accept the page's socket and listen to it while the block runs.
-
-    The block ends when the page goes.
-    """
+    """Accept the page's socket and listen to it while the block runs, which ends when the page goes."""
     await socket.accept()
     shown = Shown()
     sending = asyncio.current_task()
@@ -111,8 +99,7 @@ async def _send_pictures(socket: WebSocket, state: ConsoleState, camera: str, sh
     asked = shown.mask
     while True:
         if loop.time() >= look_at or shown.mask != asked:
-            renew_s = 1.0
-            asked, look_at = shown.mask, loop.time() + renew_s
+            asked, look_at = shown.mask, loop.time() + 1.0
             state.look(camera, shown.mask)
         picture = state.preview(camera)
         if picture is None:

@@ -1,16 +1,8 @@
 """State of the console holds the newest messages and the last minute.
 
-History of the last minute in figures, for the plots.
-
-It covers latency, rates, loss, clocks and temperature. Bounded, pure.
-
-Received gestures of the hands, in the form a person follows them.
-
-It covers the gestures that last now, and the last things reported. Bounded.
-
-State of the console, read from the bus on threads of its own.
-
-The pages show it and hold no data.
+Threads read the bus: the newest message of each sender, the gestures that last and the last ones reported,
+and the figures of the last minute (latency, rates, loss, clocks, temperature). All is bounded. The pages show
+it and hold no data.
 """
 
 import math
@@ -27,16 +19,7 @@ import numpy as np
 from common.bus.bus import Bus
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
-from common.messages import (
-    Checklist,
-    Contact,
-    Gesture,
-    HandPose,
-    Health,
-    Message,
-    ObjectPose,
-    Preview,
-)
+from common.messages import Checklist, Contact, Gesture, HandPose, Health, Message, ObjectPose, Preview
 from common.messages.streams import MASTER
 from master.commands.options import HERE_BEACON, HERE_BIND, HERE_BUS
 from master.console.controls import Tuner
@@ -59,17 +42,14 @@ class History:
     """
 
     def __init__(self) -> None:
-        """Nothing has happened yet."""
         self._rows: deque[tuple[float, dict[str, float]]] = deque(maxlen=round(SPAN_S / STEP_S))
         self._counts: dict[str, tuple[int, int, float]] = {}
 
     def push(self, t_s: float, latencies_ms: Sequence[float], health: Mapping[str, Health]) -> None:
-        """Add the row of `t_s` [s].
+        """Add the row of `t_s` [s], of any clock that only rises.
 
-        Args:
-            t_s: When, any clock that only rises.
-            latencies_ms: Of the poses since the last row.
-            health: The newest report of each process that is alive.
+        `latencies_ms` are of the poses since the last row, `health` the newest report of each process that is
+        alive.
         """
         row: dict[str, float] = {}
         before = self._rows[-1][0] if self._rows else None
@@ -99,9 +79,7 @@ class History:
         return rows[-1][1].get(name) if rows else None
 
     def _counted(self, report: Health) -> dict[str, float]:
-        """Return frame and loss rates per second.
-
-        Frames are those that arrive from each camera; lost messages are counted for each sender.
+        """Return per second the frames of each camera and the lost messages of each sender.
 
         A count of the master that is absent is 0: what never happened it does not report.
         """
@@ -149,10 +127,7 @@ KEPT = 30
 
 @dataclass(frozen=True, slots=True)
 class ReceivedGesture:
-    """One received gesture, with its time of receipt [s, monotonic].
-
-    It holds the message that began or ended it.
-    """
+    """Message that began or ended a gesture, with its time of receipt [s, monotonic]."""
 
     received_s: float
     gesture: Gesture
@@ -162,7 +137,6 @@ class ReceivedGestures:
     """Newest message of each lasting gesture, and the last begins, ends and taps."""
 
     def __init__(self) -> None:
-        """Start without any gesture."""
         self._held: dict[tuple[str, str], ReceivedGesture] = {}
         self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
 
@@ -205,10 +179,11 @@ class ConsoleSettings:
 
     Attributes:
         calibration: The calib_json tree that it shows and edits.
-        rigs: Rigs of it that run; may be empty, and their files need not be there yet: then the page sets them up.
+        rigs: Rigs of it that run; may be empty, and their files need not be there yet: then the page sets
+            them up.
         bus: Endpoint of the master's bus.
-        beacon, bind: ADDRESS:PORT for slaves and data, of the processes that the page starts.
-        key: Rig key, for these processes; None: none was given.
+        beacon, bind, key: ADDRESS:PORT for slaves and data, and rig key, of the processes that the page
+            starts.
         port, host: Where the page is served; port 0: a free one.
         password_file: Asks for the password in it; None: elsewhere than on this machine one is made.
         open_links: The page may be plain where other machines reach it.
@@ -230,7 +205,6 @@ class Newest(Generic[MessageT]):
     """Newest message of each sender, at most 64, with its time of receipt."""
 
     def __init__(self) -> None:
-        """Start without any message."""
         self._received: dict[str, tuple[float, MessageT]] = {}
 
     def put(self, name: str, message: MessageT) -> None:
@@ -255,18 +229,10 @@ class Newest(Generic[MessageT]):
 
 
 class ConsoleState:
-    """Link to the bus, newest messages, recent figures and local processes.
-
-    The messages are the newest of all that came over the bus; the figures are those of the last minute.
-    """
+    """Link to the bus, newest messages, the last minute's figures, local processes."""
 
     def __init__(self, settings: ConsoleSettings, open_bus: Callable[[], Bus] | None = None) -> None:
-        """Begin to listen.
-
-        Args:
-            settings: How the console was started.
-            open_bus: Opens another bus than that of the settings.
-        """
+        """Begin to listen; `open_bus` opens another bus than that of the settings."""
         self.settings = settings
         self.history = History()
         self.received_gestures = ReceivedGestures()
@@ -274,11 +240,13 @@ class ConsoleState:
         self._poses, self._health = Newest[HandPose](), Newest[Health]()
         self._objects, self._contacts = Newest[ObjectPose](), Newest[Contact]()
         self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
-        latencies = 4096
-        self._latencies_ms: deque[float] = deque(maxlen=latencies)
+        self._latencies_ms: deque[float] = deque(maxlen=4096)
         self._closing = threading.Event()
         self._sizes = PictureSizes(self.camera)
-        self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))
+        streams = ("hand", "object", "contact", "gesture", "health", "checklist", "preview")
+        self.link = Link(
+            open_bus or (lambda: join_bus(settings.bus)), dict.fromkeys(streams, self.on_message)
+        )
         self._preview_leases = PreviewLeases(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
         self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)
@@ -311,10 +279,7 @@ class ConsoleState:
 
     @property
     def checklist(self) -> Checklist | None:
-        """Return the checklist: what is not as it should be.
-
-        None if no master reports it.
-        """
+        """What is not as it should be; None if no master reports it."""
         return self._checklists.get(MASTER)
 
     @property
@@ -327,24 +292,15 @@ class ConsoleState:
         return self._previews.get(camera)
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
-        """Request this camera's preview for a page for the next 3 s.
-
-        The pixels of these markers are tinted. Never waits.
-        """
+        """Request a camera's preview for 3 s, with these markers tinted. Never waits."""
         self._preview_leases.look(camera, mask)
 
     def preview_error(self, camera: str) -> str:
-        """Return why there is no picture of a camera that somebody looks at.
-
-        Empty while the camera answers.
-        """
+        """Return why a camera that is looked at shows no picture; empty while it does."""
         return self._sizes.error(camera) or self._preview_leases.error(camera)
 
     def tuner(self, camera: str) -> Tuner:
-        """Return the tuner of a camera, which is the same for every page.
-
-        Thus all pages revert to what it was before the first change.
-        """
+        """Return a camera's tuner, one for all pages: all revert to the same settings."""
         if camera not in self._tuners:
             self._tuners[camera] = Tuner(camera, self.link.ask)
         return self._tuners[camera]
@@ -363,10 +319,7 @@ class ConsoleState:
         return self.settings.calibration / "cameras" / f"{camera}.json"
 
     def rigs(self) -> dict[str, RigCalibration]:
-        """Return the rigs whose files are present and valid.
-
-        What is wrong with another rig is what the Set-up page is for.
-        """
+        """Return the rigs whose files are valid; the Set-up page shows the others."""
         found: dict[str, RigCalibration] = {}
         for name in self.rig_names:
             try:
@@ -376,10 +329,7 @@ class ConsoleState:
         return found
 
     def cameras(self) -> tuple[str, ...]:
-        """Return the cameras of the rigs.
-
-        Without rigs, return those that send something like a camera's report.
-        """
+        """Return the cameras of the rigs, or without rigs those that report as cameras."""
         named = tuple(dict.fromkeys(camera for rig in self.rigs().values() for camera in rig.cameras))
         return named or tuple(sorted(name for name, one in self.health.items() if "frames" in one.counts))
 
@@ -424,10 +374,3 @@ class ConsoleState:
         while not self._closing.wait(STEP_S):
             taken = [self._latencies_ms.popleft() for _ in range(len(self._latencies_ms))]
             self.history.push(time.monotonic(), taken, self.health)
-
-
-_STREAMS = ("hand", "object", "contact", "gesture", "health", "checklist", "preview")
-
-
-def _takers(state: ConsoleState) -> dict[str, Callable[[Message], None]]:
-    return dict.fromkeys(_STREAMS, state.on_message)

@@ -1,39 +1,33 @@
 """Covariance of each joint, to second order where joints move on arcs.
 
-Kernels of how sure each joint is: this epoch and the state before.
+The estimates of this epoch and of the state before share priors and the errors of markers that repeat, so
+they are not added up as a Kalman filter does (Julier, Uhlmann 1997, "A non-divergent estimation algorithm in
+the presence of unknown correlations"). In each direction the surer of the two counts: in the coordinates in
+which the covariance of this epoch is the unit matrix and that of the past diagonal, the smaller of each pair.
 
-The estimates of this epoch and of the state before are not independent: the same priors, and errors of markers
-that repeat, are in both. So they are never added up as the Kalman filter does (Julier, Uhlmann 1997, "A non-divergent
-estimation algorithm in the presence of unknown correlations", show what that leads to). In each direction the surer of
-the two is taken, and no more: in the coordinates in which the covariance of this epoch is the unit matrix and that of
-the past diagonal, the smaller of each pair. Where every finger is seen this epoch constrains more, and counts alone.
-
-Kernels of joints that move on arcs.
-
-Joints move on arcs, which linear covariances leave out: a palm that is turned by 30 degrees about the one marker on its
-back has its wrist 8 mm off the tangent. A bone b that is turned by w moves by w x b + w x (w x b) / 2 to second order.
-With w = sum_k c_k w_k, c_k independent of variance one,
+Linear covariances leave arcs out: a palm turned by 30 degrees about the one marker on its back has its wrist
+8 mm off the tangent. A bone b that is turned by w moves by w x b + w x (w x b) / 2 to second order. With w =
+sum_k c_k w_k, c_k independent of variance one, and h summed over the bones from the palm's origin to the
+joint (Isserlis 1918),
 
     h_kl = (w_k x (w_l x b) + w_l x (w_k x b)) / 2
     E[(sum_kl c_k c_l h_kl / 2)(sum_kl c_k c_l h_kl / 2)'] = (sum_k h_kk)(sum_k h_kk)' / 4 + sum_kl h_kl h_kl' / 2
 
-(Isserlis 1918), h summed over the bones from the palm's origin to the joint; w_k are columns of a pivoted Cholesky
-factor of the turns' covariance, as many as are not straight.
-
-A marker that is seen does not leave its place by any turn: its arc h^m is taken back by the answer of the fit to a
-marker that moved so far,
+w_k are columns of a pivoted Cholesky factor of the turns' covariance, as many as are not straight. No turn
+moves a marker that is seen: its arc h^m is taken back by the response of the fit to a marker that moved so
+far,
 
     h - J K h^m,   K = cov Jm' (Jm cov Jm' v R)^-1
 
-R is the covariance of the markers, and v takes the larger in each direction. So tips that are seen stay where they are,
-and the palm turns about the marker on its back.
+R is the covariance of the markers, and v takes the larger in each direction.
 """
 
 from math import acos, cos, sqrt
 
 from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS
-from common.kernels import constant, inlined, inner, record
+from common.kernels import constant, inlined, inner
+from common.records import record
 from master.estimator.kinematics import (
     DIRECTION,
     PLACE,
@@ -84,21 +78,16 @@ class CovarianceScratch:
         K, pairs = 3 * markers, MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
         scratch = record(
             cls,
-            A=(N, N),
-            L=(N, N),
-            V=(N, N),
-            work=(N, N),
+            **dict.fromkeys(("A", "L", "V", "work"), (N, N)),
+            **dict.fromkeys(("B", "BL", "BV"), (K, K)),
             values=N,
-            rotations=(MOST_ROTATIONS, N),
             left=N,
+            rotations=(MOST_ROTATIONS, N),
             w=(5, 4, MOST_ROTATIONS, 3),
             joint=(pairs, 26, 3),
             marker=(pairs, K),
             Jm=(K, N),
             gain=(N, K),
-            B=(K, K),
-            BL=(K, K),
-            BV=(K, K),
             B_values=K,
             row=K,
             white=(3, 3),
@@ -113,10 +102,7 @@ class CovarianceScratch:
 
 @inner
 def surer(now: Float, past: Float, scratch: CovarianceScratch, out: Float) -> None:
-    """Write the covariance (N, N) that is the smaller of two in each direction.
-
-    Both are positive definite.
-    """
+    """Write, in each direction, the smaller of two positive definite covariances."""
     N, L, A, V = now.shape[0], scratch.L, scratch.A, scratch.V
     if not cholesky(now, N, L):
         for i in range(N):
@@ -155,10 +141,7 @@ def surer(now: Float, past: Float, scratch: CovarianceScratch, out: Float) -> No
 
 @inner
 def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
-    """Reduce an epoch's information on hidden fingers to their limits.
-
-    The limits are seen from where the fingers are expected.
-    """
+    """Reduce an epoch's information on hidden fingers to their limits."""
     N = cov.shape[0]
     for f in range(5):
         if hidden.gone_s[f] <= 0.0:
@@ -172,10 +155,7 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 @inner
 def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: CovarianceScratch) -> int:
-    """Write the derivatives of a joint (10, 3) and their unknowns.
-
-    Return how many unknowns they belong to.
-    """
+    """Write a joint's derivatives (10, 3) and their unknowns; return how many."""
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
         work.point[i] = work.P[f, level, i] if f >= 0 else T[i, 3]
@@ -215,10 +195,7 @@ def _project(cov: Float, count: int, scratch: CovarianceScratch, out: Float) -> 
 def linear(
     hand: HandTables, T: Float, cov: Float, work: Scratch, scratch: CovarianceScratch, joint_cov: Float
 ) -> None:
-    """Write the covariances of the joints (26, 3, 3) [m^2], by derivatives.
-
-    `work` is as `chains` left it.
-    """
+    """Write the covariances of the joints (26, 3, 3) [m^2] by derivatives."""
     for joint in range(26):
         count = joint_jacobian(hand, joint, T, work, scratch)
         _project(cov, count, scratch, joint_cov[joint])
@@ -235,12 +212,7 @@ def tilts(
     tilt: Float,
     process_noise: Float,
 ) -> None:
-    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2].
-
-    Write also how fast they walk (5,).
-
-    `work` as `chains` left it; of the walk the trace [rad^2/s^2].
-    """
+    """Write the last phalanges' covariances (5, 3, 3) [rad^2] and walk [rad^2/s^2]."""
     for f in range(5):
         squared = 0.0
         for i in range(3):
@@ -265,10 +237,7 @@ def tilts(
 
 @inlined
 def _widest(C: Float) -> float:
-    """Return the largest eigenvalue of a symmetric matrix (3, 3).
-
-    It solves the characteristic polynomial.
-    """
+    """Return the largest eigenvalue of a symmetric matrix (3, 3)."""
     mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
     a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
     d, e, f = C[0, 1], C[0, 2], C[1, 2]
@@ -281,11 +250,9 @@ def _widest(C: Float) -> float:
 
 @inner
 def is_small(hand: HandTables, cov: Float, joint: int, most_m: float) -> bool:
-    """Return whether a joint's 95 % region stays within a distance.
+    """Return whether the 95 % region of a joint stays within a distance.
 
-    The covariances are (26, 3, 3).
-
-    And that of its finger's PIP: a tip may be known to millimetres, and not how the finger is bent.
+    That of its finger's PIP must, too: a tip may be known to millimetres, and not how the finger is bent.
     """
     quantile_95 = 7.815  # chi square of three numbers
     most_m2 = most_m * most_m / quantile_95
@@ -297,12 +264,7 @@ _NONE = constant(0)
 
 @inner
 def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch) -> int:
-    """Write the rotations that are not straight, and return how many.
-
-    They are columns of a pivoted Cholesky factor.
-
-    One that is less sure than `rotation_most_rad` leads nowhere farther.
-    """
+    """Write rotations above `rotation_most_rad` (pivoted Cholesky); return how many."""
     N, left = cov.shape[0], scratch.left
     for i in range(N):
         left[i] = 0.0 if 3 <= i < 6 else cov[i, i]
@@ -338,10 +300,7 @@ def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch
 def _bone_rotations(
     hand: HandTables, T: Float, count: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
-    """Write how each rotation rotates each bone (5, 4, K, 3).
-
-    It covers the palm, and the axes of the joints before the bone.
-    """
+    """Write how palm and joints before it rotate each bone (5, 4, K, 3)."""
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
         for k in range(count):
@@ -386,10 +345,7 @@ def _second_derivative(one: Float, other: Float, bx: float, by: float, bz: float
 def _second_derivatives(
     rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
-    """Write the second derivatives of joints and markers by rotations k and m.
-
-    They go to room.joint and room.marker (not yet whitened).
-    """
+    """Write second derivatives of joints and markers (not whitened) by k and m."""
     hand, mounts, w = rig.hand, rig.mounts, scratch.w
     for joint in range(26):
         if hand.finger[joint] >= 0:
@@ -445,10 +401,7 @@ def _second_derivatives(
 
 @inner
 def _whiten(information: Float, white: Float) -> None:
-    """Write W (3, 3) with W' W = information, which may be singular.
-
-    W is the transposed factor of Cholesky.
-    """
+    """Write W (3, 3), W' W = information, which may be singular (Cholesky)."""
     for j in range(3):
         total = information[j, j]
         for k in range(j):
@@ -474,10 +427,7 @@ def _gain(
     work: Scratch,
     scratch: CovarianceScratch,
 ) -> int:
-    """Write the response of the fit to moved markers (N, K); return K.
-
-    Also whiten the second derivatives of the markers.
-    """
+    """Write the response of the fit to moved markers (N, K); return K."""
     hand, mounts, N, K = rig.hand, rig.mounts, cov.shape[0], 0
     for m in range(mounts.finger.shape[0]):
         if not seen[m]:
@@ -525,10 +475,7 @@ def _gain(
 
 @inner
 def _at_most_one(N: int, K: int, scratch: CovarianceScratch) -> None:
-    """Divide the gain by whatever is wider than its markers.
-
-    It is wider because the residual or two hypotheses made it so.
-    """
+    """Divide the gain by what residual or hypotheses made wider than its markers."""
     for r in range(K):
         for q in range(K):
             scratch.BL[r, q] = (1.0 if r == q else 0.0) - scratch.B[r, q]
@@ -563,15 +510,10 @@ def add_second_order(
     scratch: CovarianceScratch,
     joint_cov: Float,
 ) -> None:
-    """Add to covariances of the joints what the linear ones leave out.
+    """Add to joints' covariances (26, 3, 3) [m^2] what the linear ones leave out.
 
-    Args:
-        rig, settings: The hand and its markers.
-        T: (4, 4) palm; chains and derivatives of its angles are in `work`.
-        cov: (N, N) of the unknowns.
-        seen: (M,) markers that are measured, and `information` (M, 3, 3) [1/m^2] of their places.
-        work, room: Scratch.
-        joint_cov: (26, 3, 3) [m^2], changed.
+    `work` has chains and derivatives of T; `seen` (M,) markers, `information` (M, 3, 3) [1/m^2] of their
+    places.
     """
     count, N = _rotation_columns(settings, cov, scratch), cov.shape[0]
     if count == 0:

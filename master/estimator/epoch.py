@@ -1,20 +1,10 @@
 """An epoch has inputs, compiled steps, and a hand as output.
 
-Result of the pipeline for one epoch: marker positions, and the hand.
+`CycleReader` makes rows of a wrist camera's strobe cycles, for the level asked for:
 
-Inputs and outputs of the estimator at an epoch.
-
-Compiled steps of an epoch.
-
-They work on the tables, the state and the scratch arrays of one hand.
-
-Conversion of a wrist camera's strobe cycle to estimator rows.
-
-The rows hold rays and points on the laser plane, for the level asked for.
-
-fk     laser points only, of fingers that bend naturally
-ik     only fingers of which laser point and tip are both seen; the others are not reported
-auto   what there is: a finger whose tip is not seen is solved from its laser point, as far as that goes
+    fk     laser points only, of fingers that bend naturally
+    ik     only fingers of which laser point and tip are both seen; the others are not reported
+    auto   a finger whose tip is not seen is solved from its laser point, as far as that goes
 """
 
 from collections import Counter
@@ -27,8 +17,9 @@ import numpy as np
 from common.arrays import Bool, Code, Float, Int
 from common.geometry.camera_model import CameraModel
 from common.hand.model import FINGERS, HandJoints, HandModel
-from common.kernels import bound, boxed, fields
+from common.kernels import bound
 from common.messages import Source, WristDetections
+from common.records import boxed, fields
 from master.estimator.kinematics import Scratch, pose
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import Model, Workspace, count_rows
@@ -45,76 +36,44 @@ from master.rig.wrist import WristSetup
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerPositions:
-    """Positions of the M markers of a rig at one epoch.
+    """Positions of the M markers of a rig at one epoch."""
 
-    Attributes:
-        points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it,
-            or what they see is not one thing.
-        cov_m2: (M, 3, 3) [m^2].
-        noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one epoch to the next.
-        apart: (M,) what two cameras see is not one thing.
-        rejected: (C, M) outliers of single cameras, without which the rays of three or more meet.
-    """
-
-    points_m: Float
-    cov_m2: Float
-    noise_m2: Float
-    outliers: Bool
-    rejected: Bool
+    points_m: Float  # centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it, or not one thing
+    cov_m2: Float  # (M, 3, 3) [m^2]
+    noise_m2: Float  # (M, 3, 3) [m^2] the part of it that may differ from one epoch to the next
+    outliers: Bool  # (M,) what two cameras see is not one thing
+    rejected: Bool  # (C, M) outliers of single cameras, without which the rays of three or more meet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedHand:
-    """A hand's pose and how well it is known.
+    """A hand's pose and how well it is known."""
 
-    Attributes:
-        T_rig_palm: (4, 4).
-        angles_rad: (5, 4), inside the limits.
-        joints: Forward kinematics of the two.
-        cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
-        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this epoch alone.
-        tilt_process_noise_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
-    """
-
-    T_rig_palm: Float
-    angles_rad: Float
+    T_rig_palm: Float  # (4, 4)
+    angles_rad: Float  # (5, 4), inside the limits
     joints: HandJoints
-    cov_m2: Float
-    tilt_cov_rad2: Float
-    tilt_process_noise_rad2_s2: Float
+    cov_m2: Float  # (26, 3, 3) [m^2] covariance of the joint positions
+    tilt_cov_rad2: Float  # (5, 3, 3) [rad^2] of the last phalanges' directions, by this epoch alone
+    tilt_process_noise_rad2_s2: Float  # (5,) [rad^2/s^2] growth of its trace, by time squared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEstimate:
-    """Hand estimate of the pipeline at one epoch.
-
-    Attributes:
-        t_ns: The epoch.
-        markers: Positions as triangulated.
-        smooth_m: (M, 3) [m] after the 1 € filter.
-        back_normal: (3,) unit vector from the hand to the cameras that see its back.
-        solution: The hand; None: none is known.
-        valid, tracked, source: (26,) as of `HandPose`.
-        seen: (5,) fingers whose marker was placed now.
-        residual_m: (5,) distance at which FABRIK left the marker on a finger's end from its target; NaN: not seen.
-        iterations: (5,) of FABRIK.
-        reached: (5,) FABRIK brought the marker onto its target.
-        solved: Whether the hand is solved from this epoch, not held from an earlier one.
-    """
+    """Hand estimate of the marker line at one epoch."""
 
     t_ns: int
     markers: MarkerPositions
-    smooth_m: Float
-    back_normal: Float
-    solution: SolvedHand | None
-    valid: Bool
+    smooth_m: Float  # (M, 3) [m] after the 1 € filter
+    back_normal: Float  # (3,) unit vector from the hand to the cameras that see its back
+    solution: SolvedHand | None  # None: none is known
+    valid: Bool  # (26,), as `tracked` and `source`: as of `HandPose`
     tracked: Bool
     source: Code
-    seen: Bool
-    residual_m: Float
-    iterations: Int
-    reached: Bool
-    solved: bool = False
+    seen: Bool  # (5,) fingers whose marker was placed now
+    residual_m: Float  # (5,) where FABRIK left the marker on a finger's end from its target; NaN: not seen
+    iterations: Int  # (5,) of FABRIK
+    reached: Bool  # (5,) FABRIK brought the marker onto its target
+    solved: bool = False  # whether the hand is solved from this epoch, not held from an earlier one
 
     @classmethod
     def unseen(
@@ -139,132 +98,80 @@ class HandEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:
-    """What is measured at one time.
-
-    Attributes:
-        t_ns: When.
-        points_m: (A, 3) where rays place the markers; NaN: they do not.
-        cov_m2: (A, 3, 3) covariances of these, where they are what is measured; None: the centroids are.
-        uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
-        variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
-        own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
-        back_normal: (3,) unit vector from the hand to the cameras that see its back.
-        orientation: Rotation of the palm by other sensors; None: not measured.
-        wrist: What a wrist device sees of the fingers; None: nothing.
-        place: (3,) [m] where the palm is, of a wrist device alone; None: not known.
-        start: Another hand of this epoch; None: there is none.
-        second_order: Whether the joints' covariance is wanted to second order, as a hand that is published has it.
-    """
+    """What is measured at one time."""
 
     t_ns: int
-    points_m: Float
-    back_normal: Float
-    cov_m2: Float | None = None
-    uv: Float | None = None
-    variance_px2: Float | None = None
-    own_m2: Float | None = None
-    orientation: "OrientationMeasurement | None" = None
-    wrist: "WristRows | None" = None
-    place: Float | None = None
-    start: SolvedHand | None = None
-    second_order: bool = True
+    points_m: Float  # (A, 3) [m] where rays place the markers; NaN: they do not
+    back_normal: Float  # (3,) unit vector from the hand to the cameras that see its back
+    cov_m2: Float | None = None  # (A, 3, 3) where points are measured; None: the centroids are
+    uv: Float | None = None  # (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out
+    variance_px2: Float | None = None  # (C, A) of each camera's own errors; NaN: not to be used
+    own_m2: Float | None = None  # (A, 3, 3) [m^2] of what is wrong with each marker itself, beside bones
+    orientation: "OrientationMeasurement | None" = None  # of the palm by other sensors; None: not measured
+    wrist: "WristRows | None" = None  # what a wrist device sees of the fingers; None: nothing
+    place: Float | None = None  # (3,) [m] where the palm is, of a wrist device alone; None: not known
+    start: SolvedHand | None = None  # another hand of this epoch; None: there is none
+    second_order: bool = True  # whether the joints' covariance is wanted to second order
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrientationMeasurement:
-    """How other sensors have the palm turned.
+    """How other sensors have the palm turned."""
 
-    Attributes:
-        rotation: (3, 3) palm -> rig frame; where `axes` is given that of a straight wrist.
-        information: (3, 3) [1/rad^2] about its turn, rig axes.
-        sure: Whether it is known about every axis how the palm lies.
-        axes: (3, 3) as rows, rig axes: about which tilt 2 and heading turn the forearm; None: the IMU is on the palm.
-        process_noise_rad2: Variance of what the heading has drifted since the epoch before.
-    """
-
-    rotation: Float
-    information: Float
-    sure: bool
-    axes: Float | None = None
-    process_noise_rad2: float = 0.0
+    rotation: Float  # (3, 3) palm -> rig frame; where `axes` is given that of a straight wrist
+    information: Float  # (3, 3) [1/rad^2] about its turn, rig axes
+    sure: bool  # whether it is known about every axis how the palm lies
+    axes: Float | None = None  # (3, 3) rows, rig axes: of tilt 2 and heading; None: IMU on the palm
+    process_noise_rad2: float = 0.0  # variance of what the heading has drifted since the epoch before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristRows:
-    """Measurements of five fingers from one strobe cycle of a wrist device.
+    """Measurements of five fingers from one strobe cycle; rays are (x, y, 1)."""
 
-    x, y are those of undistorted rays (x, y, 1).
-
-    Attributes:
-        laser, tip: (5, 2) laser points and fingertips x, y; NaN: not seen.
-        laser_sigma_px, tip_sigma_px: (5,) their standard deviations per axis.
-        laser_px: (5,) lengths of the lines.
-        tip_depth: (5,) distances of the tips by light, in a unit of its own.
-        laser_s, tip_s: How much later than the epoch laser points and fingertips were seen.
-        law: (5,) PIPs [rad] by another law of the laser point; NaN: none.
-    """
-
-    laser: Float
-    laser_sigma_px: Float
-    laser_px: Float
+    laser: Float  # (5, 2) x, y, as `tip`; NaN: not seen
+    laser_sigma_px: Float  # (5,) standard deviation per axis, as `tip_sigma_px`
+    laser_px: Float  # (5,) lengths of the lines
     tip: Float
     tip_sigma_px: Float
-    tip_depth: Float
-    laser_s: float
+    tip_depth: Float  # (5,) distances of the tips by light, in a unit of its own
+    laser_s: float  # how much later than the epoch the laser points were seen, as `tip_s` the fingertips
     tip_s: float
-    law: Float
+    law: Float  # (5,) PIPs [rad] by another law of the laser point; NaN: none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedHand(SolvedHand):
-    """A hand fitted by the estimator.
+    """A hand fitted by the estimator."""
 
-    Attributes:
-        alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
-            epoch alone.
-        x: (n,) free angles.
-        scale: By how much the residual of the epoch has scaled `measurement_cov`.
-        natural_weight: Probability that the hand follows the posture prior.
-        marker_chi2: (M,) chi square of each marker.
-        steps: Of the search.
-        twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone.
-    """
-
-    measurement_cov: Float
-    x: Float
-    scale: float
-    natural_weight: float
-    marker_chi2: Float
-    steps: int
-    twist: Float = field(default_factory=lambda: np.zeros(5))
+    measurement_cov: Float  # (6 + n, 6 + n) turn [rad], shift [m], free angles [rad], by this epoch alone
+    x: Float  # (n,) free angles
+    scale: float  # by how much the residual of the epoch has scaled `measurement_cov`
+    natural_weight: float  # probability that the hand follows the posture prior
+    marker_chi2: Float  # (M,)
+    steps: int  # of the search
+    twist: Float = field(default_factory=lambda: np.zeros(5))  # (5,) [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
     """Result of the estimator at an epoch.
 
-    Attributes:
-        solution: The hand; None: nothing is known of it.
-        valid, tracked, source: (26,) as of `HandPose`.
-        rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
-            a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
-            the palm one of the former and which markers are seen.
-        anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        solver_mode: (5,) `SolverMode` codes of what the fingers are solved from by a wrist device, now.
-        ambiguous: (5,) whether another pose of the finger explains that as well.
-        rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was rejected.
-        refused, off: (5,) fingertips and laser points that no pose explains.
+    `sources` (6,): what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal
+    grounds: for a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by
+    its level; for the palm one of the former and which markers are seen. `ambiguous` (5,): another pose
+    explains the finger as well.
     """
 
-    solution: FittedHand | None
-    valid: Bool
+    solution: FittedHand | None  # None: nothing is known of the hand
+    valid: Bool  # (26,), as `tracked` and `source`: as of `HandPose`
     tracked: Bool
     source: Code
     sources: Int
-    reinitialised: bool = False
+    reinitialised: bool = False  # the hand of a moment ago was wrong: nothing of it is in this one
     solver_mode: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
-    ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
-    rotation_rejected: bool = False
+    ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))  # (5,)
+    rotation_rejected: bool = False  # whether the palm by markers contradicts the measured orientation
     refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
 
@@ -274,15 +181,10 @@ _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 
 
 class EpochSteps:
-    """Holds the state of one hand, and what is worked on at an epoch.
+    """Holds the state of one hand (`now`), and what is worked on at an epoch (`at`).
 
-    Attributes:
-        state: All that is remembered of the hand; `now`: its fields.
-        at: Task, epoch prior, what is found, and scratch: fields of `Workspace`.
-        observed: Rows of the markers.
-        placed: (M,) of which of the hand's markers the places are known at the epoch.
-        on_hand: (M,) the hand's markers among those of the rig.
-        finger: (M,) the finger that carries each; -1: the palm.
+    `triangulated` (M,): of which of the hand's markers the places are known at the epoch; `on_hand` (M,): the
+    hand's markers among those of the rig; `finger` (M,): the finger that carries each; -1: the palm.
     """
 
     def __init__(
@@ -296,10 +198,7 @@ class EpochSteps:
         settings: Settings,
         wrist: WristModel | None,
     ) -> None:
-        """Lay out the tables, and compile.
-
-        Arguments as of `Estimator`; `posture_prior`: any of those used.
-        """
+        """Lay out the tables, and compile; arguments as of `Estimator`."""
         self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self.finger = mounts.finger
@@ -314,10 +213,8 @@ class EpochSteps:
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._lines_of_sight = (
-            self._space["ground"],
-            self._space["epoch_prior"]["lines_of_sight"],
-        )
+        self._ground = self._space["ground"]
+        self._lines_of_sight = self._space["epoch_prior"]["lines_of_sight"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share
@@ -325,10 +222,8 @@ class EpochSteps:
         if wrist is not None:
             self._lay_out(wrist)
         nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
-        scratch, none = (
-            (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))),
-            np.full((5, 2), np.nan),
-        )
+        scratch = np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))
+        none = np.full((5, 2), np.nan)
         each = none[:, 0].copy()
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
         self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
@@ -363,19 +258,12 @@ class EpochSteps:
             lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
-            self._cycle(
-                self._model.device,
-                at.wrist.laser,
-                at.wrist.laser_sigma_px,
-                at.wrist.laser_px,
-                at.wrist.tip,
-                at.wrist.tip_sigma_px,
-                at.wrist.tip_depth,
-                self._settings.light_rad,
-                at.wrist.laser_s,
-                at.wrist.tip_s,
-                self._lines_of_sight,
-            )
+            seen = at.wrist
+            laser = seen.laser, seen.laser_sigma_px, seen.laser_px
+            tip = seen.tip, seen.tip_sigma_px, seen.tip_depth
+            times = seen.laser_s, seen.tip_s
+            light_rad = self._settings.light_rad
+            self._cycle(self._model.device, *laser, *tip, light_rad, *times, self._lines_of_sight)
         if at.uv is None and at.cov_m2 is None:
             self.observed.seen[:] = False
         elif at.cov_m2 is not None:
@@ -396,17 +284,11 @@ class EpochSteps:
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
-        """Predict the extra unknowns and search the finger minima.
-
-        The search is along the angles of the fingers that a wrist device sees.
-        """
+        """Predict the extras; search the minima of fingers that a wrist device sees."""
         self._prepare(self._model, self._state, self._space)
 
     def set_priors(self, at: Epoch, *, known: bool) -> None:
-        """Write the priors other than the past and the posture prior.
-
-        `known`: whether the past is still informative.
-        """
+        """Write the priors but past and posture; `known`: the past is informative."""
         epoch_prior, ground, orientation = self.at.epoch_prior, self.at.ground, at.orientation
         epoch_prior.back_normal[:] = at.back_normal
         epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
@@ -418,10 +300,8 @@ class EpochSteps:
             epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
         epoch_prior.oriented[0] = orientation is not None
         if orientation is not None:
-            epoch_prior.forearm[:3, :3], epoch_prior.orientation_info[:] = (
-                orientation.rotation,
-                orientation.information,
-            )
+            epoch_prior.forearm[:3, :3] = orientation.rotation
+            epoch_prior.orientation_info[:] = orientation.information
             epoch_prior.on_forearm[0] = orientation.axes is not None
             epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         epoch_prior.place_w2[0] = 0.0
@@ -439,10 +319,7 @@ class EpochSteps:
         return self._fit(self._model, posture_prior, self.observed, self._blank, self._space)
 
     def take_over(self, *, goes_on: bool) -> Estimate:
-        """Write the solution into the state and return the estimate.
-
-        `goes_on`: the hand is that of the epoch before.
-        """
+        """Write the solution into the state; `goes_on`: it is the hand before."""
         out = Estimate.empty()
         self._take_over(self._model, self._state, goes_on, self.observed, self._space, out)
         return out
@@ -458,10 +335,9 @@ class EpochSteps:
     def determines_hand(self, at: Epoch) -> bool:
         """Return whether the markers determine a hand.
 
-        They must not lie in one line, unless that line runs across `back_normal`.
-
-        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
-        orientation that is known any one marker is enough.
+        They must not lie in one line, unless it runs across `back_normal`: what faces the cameras turns the
+        hand about a line of markers, but not about one that points at them. With an orientation that is known
+        any marker is enough.
         """
         if at.place is not None:
             return True
@@ -491,10 +367,7 @@ class EpochSteps:
         return bool((marker_chi2 > self._settings.marker_gate).any())
 
     def _lay_out(self, wrist: WristModel) -> None:
-        """Write the finger priors before a wrist device, and those of the extras.
-
-        The extras are what the device leaves open.
-        """
+        """Write finger priors before a wrist device, and those of its extras."""
         prior, state, s = self.at.prior, self.now, self._settings
         prior.base_rad[:], prior.per_pip[:], prior.frame[:] = wrist.base_rad, wrist.per_pip, wrist.frame
         prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
@@ -517,19 +390,13 @@ _NO_LAW = np.full(5, nan)
 
 
 class CycleReader:
-    """Reader that converts the strobe cycles of one device to rows.
-
-    It counts what it rejects: `outside`, `no_plane`, by finger.
-    """
+    """Converts cycles to rows; counts by finger `outside`, `tip_outside`, `no_plane`."""
 
     def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:
         self._setup, self._cubic, self._counts = setup, cubic, counts
 
     def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
-        """Return the rows of a strobe cycle for an epoch, and its laser points.
-
-        The laser points are (5, 3) [m], camera frame; NaN: not seen.
-        """
+        """Return a strobe cycle's rows, laser points (5, 3) [m], camera frame; NaN: none."""
         setup, solver_mode = self._setup, self._setup.solver_mode
         uv = np.concatenate([message.laser_uv, message.tip_uv])
         self._reject("outside", uv[:5], message.laser_sigma_px)
@@ -550,24 +417,12 @@ class CycleReader:
             laser[alone], tip[alone] = nan, nan
         law = _NO_LAW if self._cubic is None else np.where(np.isnan(tip[:, 0]), self._cubic(points_m), nan)
         late_s = 1e-9 * (message.t_ns + setup.late_ns - t_ns)
-        rows = WristRows(
-            laser,
-            message.laser_sigma_px,
-            message.laser_px,
-            tip,
-            message.tip_sigma_px,
-            message.tip_depth,
-            late_s,
-            late_s + setup.frame_s,
-            law,
-        )
-        return rows, points_m
+        tips = tip, message.tip_sigma_px, message.tip_depth
+        times = late_s, late_s + setup.frame_s
+        return WristRows(laser, message.laser_sigma_px, message.laser_px, *tips, *times, law), points_m
 
     def _reject(self, event: str, uv: Float, sigma_px: Float) -> None:
-        """Write NaN to points (5, 2) that are unusable, and count them.
-
-        These are points outside the picture, and those that may be anywhere in it.
-        """
+        """Write NaN to points (5, 2) outside the picture or anywhere in it; count."""
         optics = self._setup.optics
         right, low = optics.width_px - 0.5, optics.height_px - 0.5
         most_px = max(optics.width_px, optics.height_px)

@@ -1,15 +1,8 @@
 """The estimator predicts a hand, fits it, and starts again when lost.
 
-Solution for a hand from one epoch alone.
-
-A search begins there when it has no state to go on from.
-
-From another hand of the epoch, if there is one that explains the markers; else from several, open to closed, each laid
-on the markers as a rigid body, of which the best goes on.
-
-Predict a hand from the epoch before, and fit it to what is measured.
-
-From an estimate to the message of a hand.
+`Reinitialiser` fits one epoch alone, from another hand of the epoch if there is one that explains the
+markers; else from several, open to closed, each laid on the markers as a rigid body, of which the best goes
+on.
 """
 
 from collections.abc import Sequence
@@ -41,10 +34,7 @@ NONE = frozenset[int]()
 
 
 class PosturePriorTables:
-    """Posture priors of one hand while some fingers are flexed unlike the others.
-
-    Each is computed once.
-    """
+    """Posture priors of one hand by fingers flexed unlike the others, cached."""
 
     def __init__(
         self, model: HandModel, parameters: HandParameters, settings: Settings, *, natural: bool
@@ -71,12 +61,8 @@ class Reinitialiser:
         posture_prior: PosturePriorTables,
         settings: Settings,
     ) -> None:
-        self._steps, self._parameters, self._posture_prior, self._settings = (
-            steps,
-            parameters,
-            posture_prior,
-            settings,
-        )
+        self._steps, self._parameters = steps, parameters
+        self._posture_prior, self._settings = posture_prior, settings
         postures = np.zeros((len(_BENDS_RAD), 5, 4))
         mcp_per_pip = 0.6
         postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (mcp_per_pip, 1.0))[:, None]
@@ -89,8 +75,8 @@ class Reinitialiser:
     def begin(self, at: Epoch) -> float:
         """Fit without the state; return chi square of the markers.
 
-        From the other hand, or from several starts. A finger between two that show is rather bent as they are: no hand
-        curls it alone. But straight it would show.
+        From the other hand, or several starts. A finger between two that show is rather bent as they are: no
+        hand curls it alone, but straight it would show.
         """
         shown = frozenset(np.flatnonzero(self._steps.at.ground.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
@@ -103,12 +89,8 @@ class Reinitialiser:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
         steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
         task, epoch_prior, scratch = steps.at.task, steps.at.epoch_prior, steps.at.scratch
-        epoch_prior.past_w2[:], epoch_prior.past[:], epoch_prior.palm_w2[:], epoch_prior.depth_w2[:] = (
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        )
+        epoch_prior.past_w2[:] = epoch_prior.past[:] = 0.0
+        epoch_prior.palm_w2[:] = epoch_prior.depth_w2[:] = 0.0
         fingers = np.isin(np.arange(5), list(outliers))
         epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
         even = 0.5  # probability
@@ -136,10 +118,7 @@ class Reinitialiser:
             epoch_prior.own_w2[:] = 0.0
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
-        """Return three hands, open to closed, as starts of the search.
-
-        Each is laid on the markers as a rigid body; only one where the palm is known.
-        """
+        """Return three hands laid on the markers as rigid bodies, or a known palm's."""
         steps, measured = self._steps, self._measured_rotation(epoch)
         if epoch.place is not None and measured is not None:
             T = np.eye(4)
@@ -172,19 +151,13 @@ class Reinitialiser:
         return starts
 
     def _measured_rotation(self, at: Epoch) -> Float | None:
-        """Return the palm rotation measured by other sensors (3, 3).
-
-        It includes the estimated wrist flexion; None: they do not report it.
-        """
+        """Return the palm (3, 3) by other sensors and wrist flexion; None: neither."""
         if at.orientation is None or at.orientation.axes is None:
             return None if at.orientation is None else at.orientation.rotation
         return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
 
     def _with_scanned(self, x: Float) -> Float:
-        """Return free angles (n,) with those of the scanned fingers filled in.
-
-        These are fingers whose minimum was searched.
-        """
+        """Return free angles (n,) with those of scanned fingers filled in."""
         known = self._steps.at.scan.known > 0.0
         if not known.any():
             return x
@@ -210,17 +183,13 @@ class Estimator:
         settings: Settings = DEFAULT,
         wrist: WristModel | None = None,
     ) -> None:
-        """Prepare.
+        """Prepare; cameras in the rig's order, markers in that of every marker array.
 
         Args:
-            cameras: In the rig's order.
-            model: The hand.
-            markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
             continuous: False: every epoch is an unrelated pose, nothing is remembered.
-            natural: Whether the hand follows the posture prior, and begins anew where markers are unexplained: the fit
-                of the card's line, which has no other hand to begin from.
-            settings: Every number that tunes it.
+            natural: Whether the hand follows the posture prior, and begins anew where markers are unexplained: the
+                fit of the card's line, which has no other hand to begin from.
             wrist: A wrist device on the forearm of this hand; None: there is none.
 
         Raises:
@@ -278,10 +247,7 @@ class Estimator:
         self._now.measured_rotation_known[0] = False
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
-        """Place joints and markers (M, 3) [m], rig frame.
-
-        Of a palm (4, 4) and angles (5, 4) [rad]. The angles are cut at their limits, in place.
-        """
+        """Place joints, markers (M, 3) [m], rig frame; clip the angles (5, 4), in place."""
         return self._steps.pose(T, angles_rad)
 
     def push(self, at: Epoch) -> Fitted:
@@ -318,11 +284,7 @@ class Estimator:
         )
 
     def _solve(self, at: Epoch, *, known: bool) -> tuple[Estimate | None, bool]:
-        """Fit an epoch and take it over.
-
-        Returns:
-            The hand; None: there is none. And whether the one before was wrong.
-        """
+        """Fit an epoch and take it over; return the hand, and if it began anew."""
         if known:
             wrong, consistent = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
@@ -338,11 +300,9 @@ class Estimator:
         return self._steps.take_over(goes_on=goes_on), reinitialised
 
     def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
-        """Fit from the state.
+        """Fit from the state; return chi square of the markers, and if the fit stands.
 
-        Returns:
-            Chi square of the markers, infinite where no motion explains them but another hand does; and whether no hand
-            that may take its place is better.
+        Infinite: no motion explains the markers, but another hand does.
         """
         start, task = at.start, self._at.task
         task.may_leave[0] = may_leave and start is not None and self._steps.determines_hand(at)
@@ -363,16 +323,12 @@ class Estimator:
         return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * somewhere_m**2
 
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
-        """What thumb ... little and the palm rest on now (6,), as of `Fitted`.
-
-        Of what a wrist device measures the level counts, that of now or of the strobe cycle before.
-        """
+        """What each finger and the palm rest on (6,), as of `Fitted`; devices by level."""
         ground = self._at.ground
         sources: list[int] = ground.sources.tolist()
         if self.wrist:
-            by_device = zip(
-                self._now.solver_mode.tolist(), self._now.measured_ns.tolist(), strict=False
-            )  # of fingers alone
+            # of fingers alone
+            by_device = zip(self._now.solver_mode.tolist(), self._now.measured_ns.tolist(), strict=False)
             for f, (solver_mode, measured_ns) in enumerate(by_device):
                 if (at.t_ns - measured_ns) * 1e-9 <= self.settings.tracked_cycle_s:
                     sources[f] += ON_OTHERS * solver_mode
@@ -419,7 +375,6 @@ class Estimator:
 
 
 def _unknown(sources: Int) -> Fitted:
-    """No hand."""
     none = np.zeros(26, np.bool_)
     return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), sources, False)
 
@@ -432,16 +387,7 @@ def pose_of(
     markers: MarkerPositions,
     volume: Volume | None = None,
 ) -> HandPose:
-    """The message of one hand; all NaN and not valid where nothing is known of it.
-
-    Args:
-        hand: Of either solver.
-        model: The hand.
-        t_ns: The epoch.
-        smooth_m: (M, 3) [m] markers after the 1 € filter, and `markers` before it.
-        markers: As triangulated.
-        volume: What the rig states; joints report whether they lie in it.
-    """
+    """The message of one hand, markers smoothed and not; all NaN, not valid: unknown."""
     solution = hand.solution
     if solution is None:
         nothing = np.full((26, 3, 3), np.nan)

@@ -1,36 +1,27 @@
 """A search along each bend of a finger gives its probability density.
 
-Kernels of the search along a finger's minimum.
-
-For every PIP they find the best of the other angles, and how likely it is.
-
-Laser point and fingertip hold a finger's angles in some directions well and in others hardly: near the turn of a
-fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip only the prior
-constrains it. A finger's posterior may be long, bent, and in two parts, and no descent from one start finds it. For
-each PIP of a grid the other unknowns (abduction, flexion, DIP and twist of its hinges) get their least chi square;
-what is left of the residuals is interpolated between the nodes; and the density over the PIP is, with the others
-integrated out (Laplace; MacKay, "Information Theory, Inference, and Learning Algorithms", 27),
+Laser point and fingertip hold a finger's angles in some directions well and in others hardly: near the turn
+of a fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip
+only the prior constrains it. A finger's posterior may be long, bent, and in two parts, and no descent from
+one start finds it. For each PIP of a grid the other unknowns (abduction, flexion, DIP and twist of its
+hinges) get their least chi square; what is left of the residuals is interpolated between the nodes; and the
+density over the PIP is, with the others integrated out (Laplace; MacKay, "Information Theory, Inference, and
+Learning Algorithms", 27),
 
     exp(-chi2 / 2) |S|^1/2 p(flexion, PIP)         S: covariance of the others at that PIP
 
-p is a mixture of three hands: a *natural* one, whose flexion follows the PIP, a *straight* one, whose fingers are
-stretched while they bend in their knuckles ("intrinsic plus" in hand surgery), and a *free* one, whose joints know
-nothing of each other. All fingers decide which of them it is.
-
-Kernels of the probability density of a finger along its minimum over PIP.
-
-They give densities by hand, and the pose that is taken.
-
-Three hands are weighed (`master.estimator.finger_scan`): natural, straight and free ones. Fingers whose tips are seen
-decide which of them it is. A density may have several parts; the heaviest, by where the finger was, is taken,
-and the covariance holds all of them.
+p is a mixture of three hands: a *natural* one, whose flexion follows the PIP, a *straight* one, whose fingers
+are stretched while they bend in their knuckles ("intrinsic plus" in hand surgery), and a *free* one, whose
+joints know nothing of each other. Fingers whose tips are seen decide which of them it is. Of a density in
+several parts the heaviest, by where the finger was, is taken, and the covariance holds all of them.
 """
 
 from math import exp, inf, isfinite, log, pi, sqrt
 from typing import Any
 
 from common.arrays import Float, Int
-from common.kernels import inlined, inner, record
+from common.kernels import inlined, inner
+from common.records import record
 from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_hit, laser_centroid, look
 from master.estimator.kinematics import twist_hand
 from master.estimator.parameters import HandTables
@@ -45,115 +36,80 @@ _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
 
 
 class Prior:
-    """Prior of the fingers before a strobe cycle is seen.
+    """Prior of the fingers before a strobe cycle is seen."""
 
-    Attributes:
-        palm: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) as of `flexed_palm`.
-        twist, twist2: (5,) mean and variance of the twist of the hinges [rad].
-        light, light2: (1,) mean and variance of the logarithm of the light's unit.
-        natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
-        abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
-        coupled_share, coupled_spread: (1,) by how much of the PIP more this hand bends in its MCP, and within how much
-            of it (`master.estimator.wrist_update`).
-        last: (5,) PIPs expected, `process_noise` (5,) how far from there they may be, `had_previous` (5,)
-            whether they are expected anywhere.
-        near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
-        natural_only: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
-        law: (5,) PIPs by another law; NaN: none.
-        frame: (4,) least and most x and y of a fingertip that is clearly in the image.
-    """
-
-    palm: Float
-    wrist_axes: Float
-    twist: Float
+    palm: Float  # (4, 4) camera frame
+    wrist_axes: Float  # (2, 3) as of `flexed_palm`
+    twist: Float  # (5,) mean of the twist of the hinges [rad], and `twist2` its variance
     twist2: Float
-    light: Float
+    light: Float  # (1,) mean of the logarithm of the light's unit, and `light2` its variance
     light2: Float
-    base_rad: Float
+    base_rad: Float  # (5, 4) natural angles by the PIP: base_rad + per_pip PIP
     per_pip: Float
-    abduction: Float
+    abduction: Float  # (5,) standard deviations [rad] of abduction, and `flexion` of flexion, about them
     flexion: Float
-    coupled_share: Float
-    coupled_spread: Float
-    last: Float
-    process_noise: Float
-    had_previous: Float
-    near_rad: Float
-    natural_only: Float
-    law: Float
-    frame: Float
+    coupled_share: Float  # (1,) by how much of the PIP more this hand bends in its MCP (`wrist_update`),
+    coupled_spread: Float  # (1,) and within how much of it
+    last: Float  # (5,) PIPs expected [rad],
+    process_noise: Float  # (5,) how far from there they may be,
+    had_previous: Float  # (5,) and whether they are expected anywhere
+    near_rad: Float  # (5,) how far from there a finger that is well known is searched; 0: everywhere
+    natural_only: Float  # (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk")
+    law: Float  # (5,) PIPs by another law [rad]; NaN: none
+    frame: Float  # (4,) least and most x and y of a fingertip that is clearly in the image
 
     @classmethod
     def empty(cls) -> "Prior":
         """Allocate it."""
         return record(
             cls,
+            **dict.fromkeys(
+                (
+                    "twist",
+                    "twist2",
+                    "abduction",
+                    "flexion",
+                    "last",
+                    "process_noise",
+                    "had_previous",
+                    "near_rad",
+                    "law",
+                ),
+                5,
+            ),
+            **dict.fromkeys(("light", "light2", "coupled_share", "coupled_spread", "natural_only"), 1),
             palm=(4, 4),
             wrist_axes=(2, 3),
-            twist=5,
-            twist2=5,
-            light=1,
-            light2=1,
             base_rad=(5, 4),
             per_pip=(5, 4),
-            abduction=5,
-            flexion=5,
-            coupled_share=1,
-            coupled_spread=1,
-            last=5,
-            process_noise=5,
-            had_previous=5,
-            near_rad=5,
-            natural_only=1,
-            law=5,
             frame=4,
         )
 
 
 class Scan:
-    """Estimates of five fingers along their minima, for every PIP.
+    """Estimates of five fingers along their minima, for every PIP."""
 
-    Attributes:
-        x: (5, NODES, 5) angles and twist [rad] at each PIP.
-        rows: (5, NODES, 8) residuals in their standard deviations.
-        volume: (5, NODES) logarithm of |S|^1/2, and `flexion2` (5, NODES) variance of the flexion.
-        length_px: (5, NODES) of the laser's line.
-        lack: (5, NODES, 2) of the ridge to the cut.
-        hand: (5, 3) logarithm of the evidence of each hand.
-        share: (3,) probabilities of the hands.
-        log_p: (5, 3, 61) logarithm of the density of each finger, fine, by hand.
-        p: (61,) density of one finger, and `near` (61,) that by which its place is chosen.
-        out: (5, 5) angles and twist chosen, and `mode` (5, 5) of the most likely pose of that part.
-        way: (5, 5) derivative of these by the PIP there.
-        pip2: (5,) variance of the PIP.
-        chi2: (5,) chi square of the best node; of none: infinite.
-        parts: (5,) how many parts a density has that count.
-        known: (5,) whether the finger was scanned.
-        first, last: (5,) nodes between which the minimum was searched.
-        showing: (5, NODES) 1 where the fingertip would be in sight.
-    """
-
-    x: Float
-    rows: Float
-    volume: Float
-    flexion2: Float
-    length_px: Float
-    lack: Float
-    hand: Float
-    share: Float
-    p: Float
-    near: Float
-    log_p: Float
-    out: Float
-    mode: Float
-    way: Float
-    pip2: Float
-    chi2: Float
-    parts: Float
-    known: Float
-    first: Int
+    x: Float  # (5, NODES, 5) angles and twist [rad] at each PIP
+    rows: Float  # (5, NODES, 8) residuals in their standard deviations
+    volume: Float  # (5, NODES) logarithm of |S|^1/2
+    flexion2: Float  # (5, NODES) variance of the flexion
+    length_px: Float  # (5, NODES) of the laser's line
+    lack: Float  # (5, NODES, 2) of the ridge to the cut
+    hand: Float  # (5, 3) logarithm of the evidence of each hand
+    share: Float  # (3,) probabilities of the hands
+    p: Float  # (61,) density of one finger
+    near: Float  # (61,) that by which its place is chosen
+    log_p: Float  # (5, 3, 61) logarithm of the density of each finger, fine, by hand
+    out: Float  # (5, 5) angles and twist chosen
+    mode: Float  # (5, 5) of the most likely pose of that part
+    way: Float  # (5, 5) derivative of these by the PIP there
+    pip2: Float  # (5,) variance of the PIP
+    chi2: Float  # (5,) of the best node; of none: infinite
+    parts: Float  # (5,) how many parts a density has that count
+    known: Float  # (5,) whether the finger was scanned
+    first: Int  # (5,) node where the search of the minimum began, and `last` where it ended
     last: Int
-    showing: Float
+    showing: Float  # (5, NODES) 1 where the fingertip would be in sight
     angles: Float  # (20,)
     H: Float  # (4, 4)
     L: Float  # (4, 4)
@@ -170,35 +126,24 @@ class Scan:
         fine = FINE * (NODES - 1) + 1
         return record(
             cls,
+            **dict.fromkeys(("volume", "flexion2", "length_px", "showing"), (5, NODES)),
+            **dict.fromkeys(("out", "mode", "way"), (5, 5)),
+            **dict.fromkeys(("pip2", "chi2", "parts", "known", "twist"), 5),
+            **dict.fromkeys(("H", "L", "S"), (4, 4)),
             x=(5, NODES, 5),
             rows=(5, NODES, ROWS),
-            volume=(5, NODES),
-            flexion2=(5, NODES),
-            length_px=(5, NODES),
             lack=(5, NODES, 2),
             hand=(5, HANDS),
             share=HANDS,
             p=fine,
             near=fine,
             log_p=(5, HANDS, fine),
-            out=(5, 5),
-            mode=(5, 5),
-            way=(5, 5),
-            pip2=5,
-            chi2=5,
-            parts=5,
-            known=5,
             first=("i8", 5),
             last=("i8", 5),
-            showing=(5, NODES),
             angles=20,
-            H=(4, 4),
-            L=(4, 4),
             g=4,
-            S=(4, 4),
             J=(8, 4),
             r=8,
-            twist=5,
             surface=Surface.empty(),
         )
 
@@ -221,10 +166,7 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 def _rows(
     settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, tip: bool, scan: Scan
 ) -> float:
-    """Write residuals (8,) and derivatives (8, 4); return half chi-square.
-
-    They are those of what `look` left in `scan.surface`.
-    """
+    """Write residuals (8,), derivatives (8, 4) by `look`; return half chi square."""
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
         r[i] = 0.0
@@ -477,12 +419,7 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
 def weigh_hands(
     hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, scan: Scan
 ) -> None:
-    """Write the evidence of each hand by each finger.
-
-    Write also the probabilities of the hands.
-
-    A finger measured by the laser alone does not count: it is explained by any.
-    """
+    """Write each hand's evidence by fingers whose tips are seen, and probabilities."""
     others = 0
     for f in range(1, 5):
         others += 1 if lines_of_sight.shown[f] > 0.0 else 0
@@ -515,10 +452,7 @@ def weigh_hands(
 
 @inlined
 def _at(scan: Scan, f: int, place: float, out: Float) -> None:
-    """Write the pose (5,) of finger f at a place along its minimum.
-
-    The place is counted in fine steps.
-    """
+    """Write the pose (5,) of finger f at a place of its minimum, in fine steps."""
     node = min(int(place / FINE), NODES - 2)
     share = place / FINE - node
     for k in range(5):
@@ -529,14 +463,11 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
 def choose(
     hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, scan: Scan
 ) -> None:
-    """Write the estimate of finger f from its density.
+    """Write the estimate of finger f from the densities that `weigh_hands` left.
 
-    It is the median of the part that weighs most, its likeliest pose, and the spread.
-
-    By the densities that `weigh_hands` left.
-
-    Two tops are of one part where the density does not fall clearly between them. Where frames follow each other, a
-    part near to where the finger was is preferred.
+    It is the median of the part that weighs most, its likeliest pose, and the spread. Two tops are of one
+    part where the density does not fall clearly between them. Where frames follow each other, a part near to
+    where the finger was is preferred.
     """
     count, p = FINE * (NODES - 1) + 1, scan.p
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]

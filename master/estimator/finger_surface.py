@@ -1,17 +1,15 @@
 """Kernels of a finger before a wrist device.
 
-They model its skin, where the laser meets it, and its tip.
+The skin of a finger is a chain of capsules (`common.hand.skin`), cut by the plane of the laser. What the
+camera makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points
+of the spheres that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half
+circle that faces the light lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points
+crosses the plane nearest to the laser is the laser point: within 0.2 mm (median) from a PIP of 45 degrees on,
+0.4 mm over all, at most about 1 mm. The ridge has derivatives in closed form; the exact cut
+(`laser_centroid`) gives what it lacks.
 
-The skin of a finger is a chain of capsules (`common.hand.skin`), cut by the plane of the laser.
-What the camera
-makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
-that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
-lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
-laser is the laser point: within 0.2 mm (median) from a PIP of 45 degrees on, 0.4 mm over all, at most about 1 mm. The
-ridge has derivatives in closed form; the exact cut (`laser_centroid`) gives what it lacks.
-
-A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of direction s,
-at q + v - s (n . v) / (n . s), with n the normal of the plane.
+A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of
+direction s, at q + v - s (n . v) / (n . s), with n the normal of the plane.
 """
 
 from math import atan2, cos, inf, log, sin, sqrt
@@ -20,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import constant, inlined, inner, record
+from common.kernels import constant, inlined, inner
+from common.records import record
 from master.estimator.kinematics import abduction_axis, finger_chain
 from master.estimator.parameters import HandTables
 
@@ -59,23 +58,19 @@ class Surface:
         """Allocate it."""
         return record(
             cls,
+            **dict.fromkeys(("q", "way", "ray", "laser_centroid", "tip"), 3),
             S=(8, 3),
-            Q=(9, 3),
             along=(8, 3),
+            Q=(9, 3),
             bone=(7, 3),
-            q=3,
-            way=3,
+            axis=(7, 3),
             laser=(7, 12),
             camera=(7, 12),
-            ray=3,
             lit=(RAYS, 5),
             reached=7,
             begins=7,
-            laser_centroid=3,
             R=(4, 3, 3),
             P=(4, 3),
-            axis=(7, 3),
-            tip=3,
             seen=5,
             J=(5, MOVES),
         )
@@ -83,10 +78,7 @@ class Surface:
 
 @inner
 def spheres(device: Any, f: int, work: Surface) -> None:
-    """Write the spheres of finger f and the direction of the chain.
-
-    The joints are `work.R`, `work.P`.
-    """
+    """Write the spheres of finger f by `work.R`, `work.P`, and their direction."""
     S, along, bone, R, P = work.S, work.along, work.bone, work.R, work.P
     for k in range(8):
         b = _BONE[k]
@@ -120,9 +112,7 @@ def spheres(device: Any, f: int, work: Surface) -> None:
 
 @inner
 def crossing(device: Any, f: int, work: Surface) -> int:
-    """Write where the ridge of finger f crosses the plane, and its direction there.
-
-    The ridge is that of `work.S`.
+    """Write where the ridge of finger f crosses the plane, and its direction.
 
     Returns:
         The stretch on which it does, plus 16 where the chain does not reach the plane and was prolonged.
@@ -182,10 +172,7 @@ def crossing(device: Any, f: int, work: Surface) -> int:
 
 @inlined
 def _terms(S: Float, k: int, r1: float, r2: float, ox: float, oy: float, oz: float, out: Float) -> None:
-    """Write the terms that `first_hit` needs of one cone, seen from a point.
-
-    The cone lies between spheres k and k + 1.
-    """
+    """Write `first_hit` terms (12,) of the cone from sphere k on, from a point."""
     ax, ay, az = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
     wx, wy, wz = ox - S[k, 0], oy - S[k, 1], oz - S[k, 2]
     bx, by, bz = ox - S[k + 1, 0], oy - S[k + 1, 1], oz - S[k + 1, 2]
@@ -211,10 +198,7 @@ def _away(S: Float, k: int) -> float:
 
 @inlined
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
-    """Return the distance along a unit ray to the cone of terms (12,).
-
-    inf: the cone is missed (`common.geometry.tapered_capsules`).
-    """
+    """Return the distance along a unit ray to a cone's terms (12,); inf: missed."""
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
     best, d2 = inf, t[6]
     k2, k1 = d2 - m2 * m2, d2 * m3 + m2 * t[8]
@@ -236,12 +220,9 @@ def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
 
 @inner
 def laser_centroid(device: Any, f: int, work: Surface) -> float:
-    """Write the centroid of the lit and visible laser line on finger f.
+    """Write the centroid (3,) [m] of finger f's seen laser line; return its length.
 
-    It is of `work.S` and goes to `work.laser_centroid` (3,) [m].
-
-    Returns:
-        Length of that line in the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
+    In the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
     """
     S, laser, lit = work.S, device.laser_m, work.lit
     a0, a1, a2 = device.plane[0, 0], device.plane[0, 1], device.plane[0, 2]
@@ -357,18 +338,11 @@ def look(
     moves: int,
     work: Surface,
 ) -> int:
-    """Write what is seen of finger f by ridge and tip, and derivatives.
+    """Write what is seen of finger f by ridge and tip to `seen`, derivatives to `J`.
 
-    Args:
-        hand, device: What is looked at, and by what.
-        T: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) about which the wrist bends (`flexed_palm`).
-        angles: (20,) [rad].
-        f: Finger.
-        moves: By how many of `MOVES` derivatives are wanted.
-        work: Written: `seen`, `J`, and what leads to them.
-
-    Returns:
-        The stretch of the ridge that is lit, as of `crossing`.
+    `T` (4, 4) palm, camera frame, `wrist_axes` (2, 3) as of `flexed_palm`, `angles` (20,) [rad]; `moves`: by
+    how many of `MOVES` derivatives are wanted. Returns the stretch of the ridge that is lit, as of
+    `crossing`.
     """
     R, P, A, J, seen = work.R, work.P, work.axis, work.J, work.seen
     finger_chain(hand, T, angles, f, R, P)

@@ -1,22 +1,16 @@
 """Kinematics of a hand: places of its points, and their derivatives.
 
-Kernels of a hand: joints and points in the rig frame, and their derivatives.
+Unknowns are the palm's turn (3, a rotation vector in front of its rotation, rig axes) and shift (3) [m], then
+the free angles [rad]. A point on a finger moves with the palm and the axes of its own finger's joints before
+it alone (level 0: abduction and flexion, 1: PIP, 2: DIP), so kernels keep derivatives as ten rows at most:
+six of the palm, then those of the finger (`HandTables.first`). What turns about axis a through o moves by a x
+(point - o).
 
-Unknowns are the palm's turn (3, a rotation vector in front of its rotation, rig axes) and shift (3) [m], then the free
-angles [rad]. A point on a finger moves with the palm and the angles of its own finger alone, so derivatives are kept
-as ten rows at most: six of the palm, then those of the finger (`HandTables.first`). What turns about axis a through o
-moves by a x (point - o).
-
-Points fixed to a hand, and how they move with its angles.
-
-The model is rigid bodies rotating about known axes.
-
-A point on a finger is turned by the axes of the joints before it: abduction and flexion at the root (level 0), PIP
-(1) and DIP (2). Turning about axis a through o moves it by a x (point - o). All in the palm frame.
+`BodyPoints` does the same for many poses at once, in the palm frame.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin, sqrt
 from typing import Any
 
@@ -25,7 +19,8 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry.transforms import skew
 from common.hand.model import CHAINS, Chains, HandJoints, HandModel
-from common.kernels import constant, inlined, inner, kernel, record
+from common.kernels import constant, inlined, inner, kernel
+from common.records import record
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.fabrik.linear_algebra import copy
 
@@ -33,10 +28,7 @@ PLACE, DIRECTION = constant(0), constant(1)
 
 
 class Scratch:
-    """Scratch for the intermediate results of kernels.
-
-    It holds nothing from one call to the next.
-    """
+    """Scratch of kernels; it holds nothing from one call to the next."""
 
     uv: Float  # (2,)
     J: Float  # (2, 3)
@@ -62,33 +54,23 @@ class Scratch:
         """Allocate it."""
         return record(
             cls,
+            **dict.fromkeys(("K", "left", "gained", "H"), (3, 3)),
+            **dict.fromkeys(("gain", "g", "point", "arm", "ahead"), 3),
             uv=2,
             J=(2, 3),
-            K=(3, 3),
-            gain=3,
-            left=(3, 3),
-            gained=(3, 3),
-            H=(3, 3),
-            g=3,
             by_place=(10, 3),
             rows=(10, 3),
             angles=20,
             by=(20, 4),
             R=(5, 4, 3, 3),
             P=(5, 4, 3),
-            point=3,
-            arm=3,
-            ahead=3,
             palm=(4, 4),
         )
 
 
 @inner
 def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
-    """Write all angles (20,) [rad] of the free ones (n,), and derivatives.
-
-    `by`: (20, 4), by the free angles of the same finger. As `HandParameters.angles`.
-    """
+    """Write all angles (20,) [rad] of the free (n,); by (20, 4): their derivatives."""
     for f in range(5):
         start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
         for a in range(4 * f, 4 * f + 4):
@@ -107,10 +89,7 @@ def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
 
 @inner
 def free_of(tables: HandTables, angles: Float, x: Float) -> None:
-    """Write the free angles (n,) of all angles (20,) [rad], inside the limits.
-
-    As `HandParameters.of_angles`.
-    """
+    """Write free angles (n,) of all (20,) [rad]: `HandParameters.of_angles`."""
     for f in range(5):
         start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
         for k in range(count):
@@ -139,31 +118,14 @@ def clamp(tables: HandTables, angles: Float) -> None:
 
 @inner
 def chains(tables: HandTables, T: Float, angles: Float, R: Float, P: Float) -> None:
-    """Write joint rotations and places, rig frame, of a palm and all angles.
-
-    Args:
-        tables: The hand.
-        T: (4, 4) palm.
-        angles: (20,) [rad].
-        R, P: Written: (5, 4, 3, 3) and (5, 4, 3) [m].
-    """
+    """Write joint rotations R (5, 4, 3, 3) and places P (5, 4, 3) [m], rig frame."""
     for f in range(5):
         finger_chain(tables, T, angles, f, R[f], P[f])
 
 
 @inner
 def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, P: Float) -> None:
-    """Write joint rotations and places of finger f alone.
-
-    They are in the frame of the palm's pose.
-
-    Args:
-        tables: The hand.
-        T: (4, 4) palm.
-        angles: (20,) [rad].
-        f: Finger.
-        R, P: Written: (4, 3, 3) and (4, 3) [m].
-    """
+    """Write rotations R (4, 3, 3) and places P (4, 3) [m] of one finger's joints."""
     local = R[3]  # until it is the tip's
     for i in range(3):
         P[0, i] = T[i, 3]
@@ -195,10 +157,7 @@ def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, 
 
 @inlined
 def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
-    """Write the axis (3,) about which finger f abducts.
-
-    It is in the frame of the palm's pose.
-    """
+    """Write the axis (3,), in the frame of T, about which finger f abducts."""
     for i in range(3):
         out[i] = 0.0
         for j in range(3):
@@ -207,11 +166,9 @@ def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
 
 @inner
 def twist_hand(tables: HandTables, twist: Float) -> None:
-    """Roll the hinges of each finger about its first bone by (5,) [rad].
+    """Roll the hinges of each finger about its first bone (5,) [rad], in `swing`.
 
-    This changes `HandTables.swing` of the abduction.
-
-    The axes of a hand file are those of a drawing, and a person's lie askew to them by a few degrees. Rodrigues.
+    Those of a person lie askew to the drawing's in a hand file by a few degrees. Rodrigues.
     """
     for f in range(5):
         if tables.twist[f] == twist[f]:
@@ -266,12 +223,7 @@ def markers_of(tables: HandTables, mounts: Mounts, T: Float, x: Float, work: Scr
 
 @inner
 def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, rotation: Float) -> None:
-    """Write the 26 joints, rig frame, of chains (`chains`).
-
-    Args:
-        tables, T, R, P: The hand.
-        position, rotation: Written: (26, 3) [m], (26, 3, 3).
-    """
+    """Write the 26 joints (26, 3) [m], (26, 3, 3), rig frame, of `chains`."""
     for joint in range(26):
         f, k = tables.finger[joint], tables.level[joint]
         for i in range(3):
@@ -289,10 +241,7 @@ def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, ro
 
 @inlined
 def palm_jacobian(arm: Float, J: Float) -> None:
-    """Write derivatives by the palm of a point `arm` (3,) from its origin.
-
-    `J`: (10, 3), the first six rows.
-    """
+    """Write J[:6] (6, 3): how a point `arm` (3,) from its origin moves by the palm."""
     for i in range(3):
         for j in range(3):
             J[i, j] = 0.0
@@ -315,14 +264,10 @@ def finger_jacobian(
     what: int,
     J: Float,
 ) -> None:
-    """Write derivatives by the free angles of finger f.
+    """Write J[6:] of (10, 3): derivatives by the free angles of finger f.
 
-    Args:
-        tables, by, T, R, P: The hand (`angles_of`, `chains`).
-        f, level: Finger, and joint of its chain that carries what moves.
-        point: (3,) [m] of the finger, rig frame; of what is only turned, the direction (3,).
-        what: PLACE or DIRECTION.
-        J: (10, 3), written from row 6 on, as many as the finger has free angles.
+    Of a point (3,) [m], rig frame, on joint `level` of its chain, or of a direction (3,): `what` is PLACE or
+    DIRECTION. `by` is as of `angles_of`.
     """
     count = tables.first[f + 1] - tables.first[f]
     for c in range(count):
@@ -352,10 +297,7 @@ def finger_jacobian(
 
 @inlined
 def rotate_by(step: Float, T: Float, out: Float) -> None:
-    """Write T (4, 4) turned in front by step[:3] [rad], shifted by step[3:6] [m].
-
-    Rodrigues' formula.
-    """
+    """Write T (4, 4) turned in front by step[:3] [rad], shifted by step[3:6] [m]."""
     x, y, z = step[0], step[1], step[2]
     angle = sqrt(x * x + y * y + z * z)
     a = sin(angle) / angle if angle > 1e-9 else 1.0
@@ -376,10 +318,7 @@ def rotate_by(step: Float, T: Float, out: Float) -> None:
 
 @inlined
 def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
-    """Write the rotation vector (3,) of A B' of two rotations.
-
-    The rotations are (>= 3, >= 3); `c`: (3, 3) scratch.
-    """
+    """Write the rotation vector (3,) of A B'; `c`: (3, 3) scratch."""
     for i in range(3):
         for j in range(3):
             c[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
@@ -404,10 +343,7 @@ def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
 
 @kernel
 def quaternions(rotation: Float, out: Float) -> None:
-    """Write unit quaternions (N, 4) wxyz with w >= 0 of rotation matrices (N, 3, 3).
-
-    By the largest of the four classic forms (Shepperd, 1978), as `common.geometry.transforms.matrix_to_quaternion`.
-    """
+    """Write unit quaternions (N, 4) wxyz, w >= 0, of matrices (Shepperd, 1978)."""
     for n in range(rotation.shape[0]):
         R, q = rotation[n], out[n]
         trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -438,17 +374,7 @@ def pose(
     rotation: Float,
     out: Float,
 ) -> None:
-    """Write joints and markers of a palm (4, 4) and all angles (20,) [rad].
-
-    They are in the rig frame.
-
-    Args:
-        boxed_hand, mounts: The hand (`common.kernels.boxed`) and its markers.
-        T: Its palm.
-        angles: Cut at their limits, in place.
-        boxed_work: Scratch.
-        position, rotation, out: Written: (26, 3) [m], (26, 3, 3), markers (M, 3) [m].
-    """
+    """Write joints, markers (M, 3) [m], rig frame; clip the angles (20,), in place."""
     hand, work = boxed_hand[0], boxed_work[0]
     copy(T, work.palm)
     clamp(hand, angles)
@@ -471,23 +397,14 @@ _AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abducti
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyPoints:
-    """P points, each fixed to a joint of a finger's chain or to the palm.
+    """P points, each fixed to a joint of a finger's chain or to the palm."""
 
-    Attributes:
-        finger, level: (P,) chain and joint of the chain (0 root ... 3 tip); zeros for the palm.
-        on_finger: (P, 1) whether it is fixed to a chain.
-        offset_m: (P, 3) place in that joint's frame; palm: in the palm frame.
-        moves: (P, 4, n) how much the free angles turn each of the four axes, 0 where that leaves the point alone.
-        abduction_axis: (5, 1, 3) palm frame; the only axis that no angle turns.
-        parameters: The free angles.
-    """
-
-    finger: Int
-    level: Int
-    on_finger: Bool
-    offset_m: Float
-    moves: Float
-    abduction_axis: Float
+    finger: Int  # (P,) chain; 0 for the palm
+    level: Int  # (P,) joint of the chain (0 root ... 3 tip); 0 for the palm
+    on_finger: Bool  # (P, 1) whether it is fixed to a chain
+    offset_m: Float  # (P, 3) place in that joint's frame; palm: in the palm frame
+    moves: Float  # (P, 4, n) how much the free angles turn each of the four axes, 0: leaves the point alone
+    abduction_axis: Float  # (5, 1, 3) palm frame; the only axis that no angle turns
     parameters: HandParameters
 
     @classmethod
@@ -497,68 +414,42 @@ class BodyPoints:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        mounts = [model.mount(name) for name in names]
-        places: list[tuple[int | None, Float]] = []
-        for mount in mounts:
-            if mount.joint is None or mount.finger is not None:
-                places.append((mount.joint, mount.offset_m))
-            else:  # wrist and metacarpals do not move against the palm
-                R, p = model.rest_rotation[mount.joint], model.rest_position_m[mount.joint]
-                places.append((None, p + R @ mount.offset_m))
-        return cls._of(model, parameters, places)
+        mounts = Mounts.of(model, names)
+        return cls._of(model, parameters, mounts.finger, mounts.level, mounts.offset_m)
 
     @classmethod
     def joints(cls, model: HandModel, parameters: HandParameters) -> "BodyPoints":
         """The 26 joints themselves."""
-        on_chain = np.isin(np.arange(26), CHAINS)
-        places = [
-            (joint, np.zeros(3)) if on_chain[joint] else (None, model.rest_position_m[joint])
-            for joint in range(26)
-        ]
-        return cls._of(model, parameters, places)
+        finger, level = np.full(26, -1), np.zeros(26, int)
+        for f, chain in enumerate(CHAINS):
+            finger[chain], level[chain] = f, np.arange(4)
+        offset_m = np.where((finger < 0)[:, None], model.rest_position_m, 0.0)
+        return cls._of(model, parameters, finger, level, offset_m)
 
     @classmethod
     def _of(
-        cls, model: HandModel, parameters: HandParameters, places: Sequence[tuple[int | None, Float]]
+        cls, model: HandModel, parameters: HandParameters, finger: Int, level: Int, offset_m: Float
     ) -> "BodyPoints":
-        """Build points from their places on the hand.
-
-        A place is (joint of a chain, offset in its frame), or (None, place in the palm frame).
-        """
-        count = len(places)
-        finger, level, on_finger = np.zeros(count, int), np.zeros(count, int), np.zeros((count, 1), bool)
-        moves = np.zeros((count, 4, len(parameters.free)))
-        for p, (joint, _) in enumerate(places):
-            if joint is not None:
-                finger[p], level[p] = np.argwhere(joint == CHAINS)[0]
-                on_finger[p] = True
-                used = min(int(level[p]), 2) + 2
-                moves[p, :used] = parameters.complete[4 * finger[p] : 4 * finger[p] + used]
+        """Build points of chains (P,), -1: the palm, levels (P,), places there (P, 3)."""
+        moves = np.zeros((len(finger), 4, len(parameters.free)))
+        for p in np.flatnonzero(finger >= 0):
+            used = min(int(level[p]), 2) + 2
+            moves[p, :used] = parameters.complete[4 * finger[p] : 4 * finger[p] + used]
         axis = np.zeros((5, 1, 3))
         axis[:, 0, 1] = model.side_sign
         axis[0, 0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
-        offset = np.array([offset for _, offset in places]).reshape(count, 3)
-        return cls(finger, level, on_finger, offset, moves, axis, parameters)
+        on_finger = (finger >= 0)[:, None]
+        return cls(np.maximum(finger, 0), level, on_finger, offset_m, moves, axis, parameters)
 
     def only(self, use: Bool) -> "BodyPoints":
         """The points where `use` (P,) is true."""
         if use.all():
             return self
-        return BodyPoints(
-            self.finger[use],
-            self.level[use],
-            self.on_finger[use],
-            self.offset_m[use],
-            self.moves[use],
-            self.abduction_axis,
-            self.parameters,
-        )
+        by_point = "finger", "level", "on_finger", "offset_m", "moves"
+        return replace(self, **{name: getattr(self, name)[use] for name in by_point})
 
     def place(self, chains: Chains) -> Float:
-        """Return the positions of the points (..., P, 3) [m], palm frame.
-
-        The leading axes are those of the chains.
-        """
+        """Return the points (..., P, 3) [m], palm frame, of poses (...)."""
         R = chains.rotation[..., self.finger, self.level, :, :]
         p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
@@ -571,10 +462,7 @@ class BodyPoints:
         return p + (R @ self.offset_m[..., None])[..., 0]
 
     def jacobian(self, chains: Chains, points_m: Float, x: Float) -> Float:
-        """Return the derivatives of the points by the parameters.
-
-        The result is (..., P, 3, n) [m/rad] for points (..., P, 3), palm frame, at x (..., n).
-        """
+        """Return derivatives (..., P, 3, n) [m/rad] of points at x (..., n)."""
         axes = np.empty((*chains.position_m.shape[:-3], 5, 4, 3))
         axes[..., :1, :] = self.abduction_axis
         np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])

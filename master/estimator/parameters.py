@@ -1,29 +1,22 @@
 """The parameters of a hand, their limits, and the mean within them.
 
-Free parameters of the whole-hand fit.
-
-They are the angles that no coupling fixes, and the bounds of each.
-
 A parameter vector is the palm's rotation (3, rotation vector about the wrist, rig frame) and translation (3),
-then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it does not follow exactly) of each
-finger. Where flexion narrows the abduction (`common.hand.profiles`), the parameter is the abduction before that:
+then the n angles that no coupling fixes: four of the thumb; abduction, flexion, PIP (and DIP where it does
+not follow exactly) of each finger. Where flexion narrows the abduction (`common.hand.profiles`), the
+parameter is the abduction before that,
 
     abduction = share(flexion) parameter
 
-so that a box of parameters is all the legal poses, and the prior of spreading fades in a fist as the range does. Where
-limits have a tolerance, what is beyond them costs, and the box ends three standard deviations farther out.
+so that a box of parameters is all the legal poses, and the prior of spreading fades in a fist as the range
+does. Where limits have a tolerance, what is beyond them costs, and the box ends three standard deviations
+farther out.
 
-A hand profile and its markers as flat arrays, for kernels.
-
-The mean of a hand within its limits, where the likeliest one leans on them.
-
-A fit ends at the likeliest pose, and of a finger that is poorly known this is often the limit itself: everything
-beyond is forbidden, so what lies before it is piled up there. The mean of what is possible lies inside. Near its
-solution the posterior is a normal distribution cut by a box, whose moments are found by expectation propagation (Minka
-2001; for boxes: Cunningham, Hennig, Lacoste-Julien 2011, "Gaussian probabilities and expectation propagation"): each
-limit is stood for by a normal factor that leaves its own angle the mean and variance of the cut distribution.
-
-For hands that are free of the posture prior only: natural ones rest at their limits, as flat ones do.
+Of a finger that is poorly known the likeliest pose is often the limit itself: everything beyond is forbidden,
+so what lies before it is piled up there. `truncated_mean` is the mean of the normal posterior cut by the box,
+by expectation propagation (Minka 2001; for boxes: Cunningham, Hennig, Lacoste-Julien 2011, "Gaussian
+probabilities and expectation propagation"): a normal factor for each limit leaves its angle the mean and
+variance of the cut distribution. It is for hands that are free of the posture prior only: natural ones rest
+at their limits, as flat ones do.
 """
 
 from collections.abc import Sequence
@@ -36,7 +29,8 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS, FINGER_JOINTS, HandModel
 from common.hand.profiles import ABDUCTION, FLEXION, spread_left
-from common.kernels import filled, inlined, inner, record
+from common.kernels import inlined, inner
+from common.records import filled, record
 from master.fabrik.linear_algebra import cholesky, inverse
 
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
@@ -45,43 +39,25 @@ REACH = 3.0  # standard deviations beyond a limit, where there is no hand
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandParameters:
-    """Free angles of one hand model.
+    """Free angles of one hand model."""
 
-    Attributes:
-        free: (n,) their indices in the flat (20,) table of angles.
-        complete: (20, n) all angles = complete @ free ones, couplings included; abductions before they narrow.
-        low, high: (n,) [rad] bounds that keep coupled angles inside their limits, too.
-        legal_low, legal_high: (n,) [rad] the limits themselves.
-        beyond_w2: (n,) [1/rad^2] inverse variance by which they are exceeded; 0: not at all.
-        rests: (n,) whether it often stands at its low bound: that of a straight finger.
-        abduction, flexion: Columns of the free angles of the K fingers whose abduction narrows; slices where they are
-            evenly spaced, as they mostly are: those are views.
-        most: (K,) [rad] their highest flexion.
-        left: (K,) share of the abduction left there.
-        anywhere: (6 + n,) inverse variances of the palm's turn and shift and of the angles, of a hand of which nothing
-            is known but its limits.
-    """
-
-    free: Int
-    complete: Float
-    low: Float
+    free: Int  # (n,) their indices in the flat (20,) table of angles
+    complete: Float  # (20, n) all angles = complete @ free ones, couplings included, abductions not narrowed
+    low: Float  # (n,) [rad] low and `high` bounds that keep coupled angles inside their limits, too
     high: Float
-    legal_low: Float
+    legal_low: Float  # (n,) [rad] the limits themselves, low and `legal_high`
     legal_high: Float
-    beyond_w2: Float
-    at_low_limit: Bool
-    abduction: Int | slice
-    flexion: Int | slice
-    most: Float
-    left: Float
-    anywhere: Float
+    beyond_w2: Float  # (n,) [1/rad^2] inverse variance by which they are exceeded; 0: not at all
+    at_low_limit: Bool  # (n,) whether it often stands at its low bound: that of a straight finger
+    abduction: Int | slice  # columns of the K fingers whose abduction narrows: a slice (view) if even,
+    flexion: Int | slice  # as this
+    most: Float  # (K,) [rad] their highest flexion
+    left: Float  # (K,) share of the abduction left there
+    anywhere: Float  # (6 + n,) inverse variances of turn, shift, angles of a hand known by its limits only
 
     @classmethod
     def of(cls, model: HandModel) -> "HandParameters":
-        """Return the free angles of a hand: 20, or 16 where the DIPs follow exactly.
-
-        There are 16 only if no posture prior has the spread of the DIPs.
-        """
+        """Return the free angles of a hand: 20, or 16 where the DIPs follow exactly."""
         follows = model.dip_spread_rad == 0.0 and model.posture is None
         ratio = model.dip_per_pip if follows else None
         free = np.array([a for a in range(20) if not (ratio is not None and a >= 4 and a % 4 == 3)])
@@ -128,10 +104,7 @@ class HandParameters:
         return self.by_parameters(self.complete[:, None].copy(), x)[:, 0]
 
     def by_parameters(self, J: Float, x: Float) -> Float:
-        """Convert derivatives (..., P, 3, n) by free angles to those by parameters.
-
-        The former are by the free angles as they are, the latter by the parameters at x (..., n); in place.
-        """
+        """Convert derivatives by free angles to those by parameters x (..., n), in place."""
         if len(self.most):
             flexed = self._flexed(x)
             spread_derivative = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]
@@ -169,61 +142,35 @@ def _evenly(columns: Int) -> Int | slice:
 
 
 class HandTables:
-    """A hand profile with n free angles.
+    """A hand profile with n free angles, as flat arrays for kernels."""
 
-    Attributes:
-        swing: (3, 5, 4, 3, 3) as `HandModel.swing`.
-        tip_rotation: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
-        root_m: (5, 3) first joint of each chain, palm frame [m].
-        bone_m: (5, 3, 3) bones in the frames of their joints [m].
-        abduction_axis: (5, 3) palm frame.
-        first: (6,) column of the first free angle of each finger; those of finger f are first[f] ... first[f + 1] - 1.
-        complete: (20, 4) all angles by the free ones of their finger, abductions before they narrow.
-        narrows: (5,) whether flexion narrows the finger's abduction.
-        most: (5,) [rad] highest flexion.
-        left: (5,) share of the abduction left there.
-        low, high: (n,) [rad] limits of the free angles.
-        legal_low, legal_high, beyond_w2: (n,) as of `HandParameters`.
-        rests: (n,) whether it often stands at its low limit, as that of a straight finger.
-        anywhere: (6 + n,) inverse variances of a hand of which nothing is known but its limits.
-        limits: (5, 4, 2) [rad] low and high of all angles, abductions before they narrow.
-        finger: (26,) chain of each joint, -1: fixed to the palm.
-        level: (26,) its place in the chain.
-        middle: (26,) the PIP of its finger, a metacarpal's too; those of thumb, palm and wrist: themselves.
-        rest_m, rest_R: (26, 3) [m], (26, 3, 3) place and rotation of those fixed to the palm, palm frame.
-        twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone, in `swing` (`twist_hand`).
-        twist_axis: (5, 3) that bone, in the frame of the abduction.
-        untwisted: (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them.
-        product: (3, 3) room.
-    """
-
-    swing: Float
-    tip_rotation: Float
-    root_m: Float
-    bone_m: Float
-    abduction_axis: Float
-    first: Int
-    complete: Float
-    narrows: Bool
-    most: Float
-    left: Float
-    low: Float
+    swing: Float  # (3, 5, 4, 3, 3) as `HandModel.swing`
+    tip_rotation: Float  # (5, 3, 3) rest rotation of the tip in the frame of the joint before it
+    root_m: Float  # (5, 3) first joint of each chain, palm frame [m]
+    bone_m: Float  # (5, 3, 3) bones in the frames of their joints [m]
+    abduction_axis: Float  # (5, 3) palm frame
+    first: Int  # (6,) columns of the free angles of finger f are first[f] ... first[f + 1] - 1
+    complete: Float  # (20, 4) all angles by the free ones of their finger, abductions not narrowed
+    narrows: Bool  # (5,) whether flexion narrows the finger's abduction
+    most: Float  # (5,) [rad] highest flexion
+    left: Float  # (5,) share of the abduction left there
+    low: Float  # (n,) from here to `anywhere` as of `HandParameters`
     high: Float
     legal_low: Float
     legal_high: Float
     beyond_w2: Float
     at_low_limit: Bool
     anywhere: Float
-    limits: Float
-    finger: Int
-    level: Int
-    middle: Int
-    rest_m: Float
+    limits: Float  # (5, 4, 2) [rad] low and high of all angles, abductions not narrowed
+    finger: Int  # (26,) chain of each joint, -1: fixed to the palm
+    level: Int  # (26,) its place in the chain
+    middle: Int  # (26,) PIP of its finger, a metacarpal's too; thumb, palm, wrist: the joint itself
+    rest_m: Float  # (26, 3) [m] place, palm frame, and `rest_R` rotation of those fixed to the palm
     rest_R: Float
-    twist: Float
-    twist_axis: Float
-    untwisted: Float
-    product: Float
+    twist: Float  # (5,) [rad] roll of each finger's hinges about its first bone, in `swing` (`twist_hand`)
+    twist_axis: Float  # (5, 3) that bone, in the frame of the abduction
+    untwisted: Float  # (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them
+    product: Float  # (3, 3) scratch
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
@@ -279,19 +226,12 @@ class HandTables:
 
 
 class Mounts(NamedTuple):
-    """Where M markers sit on a hand.
+    """Where M markers sit on a hand."""
 
-    Attributes:
-        finger: (M,) chain; -1: the palm.
-        level: (M,) joint of the chain.
-        offset_m: (M, 3) [m] place in that joint's frame.
-        on_back: (M,) whether it is on the palm itself.
-    """
-
-    finger: Int
-    level: Int
-    offset_m: Float
-    on_back: Bool
+    finger: Int  # (M,) chain; -1: the palm
+    level: Int  # (M,) joint of the chain
+    offset_m: Float  # (M, 3) [m] place in that joint's frame
+    on_back: Bool  # (M,) whether it is on the palm itself
 
     @classmethod
     def of(cls, model: HandModel, names: Sequence[str]) -> "Mounts":
@@ -358,15 +298,9 @@ def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float
 def truncated_mean(hand: HandTables, normal: Float, gradient: Float, x: Float, cut: Cut, mean: Float) -> None:
     """Write the step (N,) from the most likely hand to the mean within the limits.
 
-    Straight fingers are no chance: they do rest at their limit, so nothing is piled up there.
-
-    Args:
-        hand: Its limits.
-        normal: (N, N) normal matrix of the cost at the likeliest hand.
-        gradient: (N,) there; counts where the angles stand at a limit, elsewhere it is 0.
-        x: (n,) its angles.
-        cut: Scratch.
-        mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
+    Straight fingers do rest at their limit, so nothing is piled up there. `normal` (N, N) and `gradient` (N,)
+    of the cost at the likeliest hand x (n,); the gradient counts at limits, elsewhere it is 0. The angles
+    stay within the limits.
     """
     n, N = x.shape[0], cut.pull.shape[0]
     for i in range(N):

@@ -1,27 +1,15 @@
 """The pipeline of the marker rig turns frames and IMU samples into poses.
 
-Orientation of one IMU between its samples.
+`MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same
+messages and get the same poses. It is built from calibration by `master.rig.setup`.
 
-It handles the shorter arc, gaps, values that are no rotation, and clocks set back.
-
-Orientation of the palm measured by an IMU on it.
-
-The IMU is mounted and placed in the rig; the orientation has its covariance.
-
-An IMU measures its axes in a world of its own, whose z axis is vertical:
+An IMU on the palm measures its axes in a world of its own, whose z axis is vertical:
 
     R_rig_palm = R_rig_world R_world_imu R_palm_imu^T
 
-Two of the three numbers are held by gravity: the tilt against the vertical. The third, the heading about it, is only
-summed up from angular rates and drifts, unless a magnetometer holds it. So the covariance is narrow across the vertical
-and wide about it. A heading of which nothing is known is taken from the hand as it was solved, and left to it.
-
-Pipeline of the marker rig.
-
-It takes centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
-
-`MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
-and get the same poses. It is built from calibration by `master.rig.setup`.
+Gravity holds the tilt against the vertical. The heading about it is only summed up from angular rates and
+drifts, unless a magnetometer holds it. So the covariance is narrow across the vertical and wide about it. A
+heading of which nothing is known is taken from the hand as it was solved, and left to it.
 """
 
 from collections import Counter, deque
@@ -29,7 +17,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from math import acos, atan2, hypot, isnan, nan, sin, sqrt
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -54,11 +42,9 @@ from master.estimator.epoch import (
     MarkerPositions,
     OrientationMeasurement,
     SolvedHand,
-    WristRows,
 )
 from master.estimator.estimator import Estimator, pose_of
 from master.estimator.kinematics import quaternions
-from master.estimator.parameters import Mounts
 from master.estimator.sensors import CameraArrays
 from master.estimator.settings import DEFAULT
 from master.estimator.smoothing import HandOneEuro
@@ -67,6 +53,9 @@ from master.fabrik.intersection import Prior, among, associate, triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
+
+if TYPE_CHECKING:  # it imports this file
+    from master.estimator.wrist_pipeline import WristSide
 
 REACH_NS = 50_000_000  # farther from an epoch a sample does not constrain it
 
@@ -80,50 +69,34 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Between:
-    """Orientation of an IMU at a time.
-
-    Attributes:
-        q_wxyz: Unit quaternion.
-        away_s: How far from samples that is [s].
-        drift_rad: How far its heading has drifted since the first sample, standard deviation [rad].
-    """
+    """Orientation of an IMU at a time."""
 
     q_wxyz: Wxyz
-    away_s: float
-    drift_rad: float
+    away_s: float  # how far from samples that is [s]
+    drift_rad: float  # how far its heading has drifted since the first sample, standard deviation [rad]
 
 
 class OrientationSamples:
     """Push machine. Holds the newest samples, and when the first came.
 
-    Attributes:
-        counts: Samples rejected: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
+    It counts what it rejects: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
     """
 
     def __init__(self, counts: Counter[str], drift_rad_s: float, late_us: float = 0.0) -> None:
-        """Begin without any, counting into `counts`.
-
-        Args:
-            counts: What is rejected, by reason.
-            drift_rad_s: How fast headings drift where samples do not state how far.
-            late_us: How much later samples were taken than their time stamps; added to these.
-        """
+        """Begin empty; `drift_rad_s`: of unstated headings, `late_us`: added to stamps."""
         self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
         kept = 512  # half a second of the fastest sensors; epochs lie at most two camera periods behind
         self._samples: deque[_Sample] = deque(maxlen=kept)
         self._first_ns: int | None = None
 
     def __len__(self) -> int:
-        """How many it holds."""
         return len(self._samples)
 
     def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample of the IMU and how far its heading has drifted.
+        """Take one sample (4,), IMU axes -> its world, and how far its heading drifted.
 
-        The quaternion (4,) is IMU axes -> its world, q as good as -q.
-
-        What is no rotation is rejected. A sample long before the newest means that a clock was set back, or that the
-        newest came from a time that is not yet: the others are forgotten.
+        What is no rotation is rejected. A sample long before the newest means that a clock was set back, or
+        that the newest came from a time that is not yet: the others are forgotten.
         """
         t_ns += self._late_ns
         w, x, y, z = orientation_wxyz.tolist()
@@ -146,9 +119,7 @@ class OrientationSamples:
             self._samples.append(_Sample(t_ns, unit, drift_rad))
 
     def between(self, t_ns: int) -> Between | None:
-        """Return the orientation at a time.
-
-        None: too far from any sample.
+        """Return the orientation at a time; None: too far from any sample.
 
         The times to both sides count as resistors in parallel do: with one side alone it is the time to that.
         """
@@ -172,10 +143,7 @@ class OrientationSamples:
 
 
 def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
-    """Return the unit quaternion at `share` 0...1 between two.
-
-    It lies on the shorter arc (Shoemake, 1985).
-    """
+    """Return the unit quaternion at `share` 0...1 of the shorter arc (Shoemake 1985)."""
     (a, b, c, d), (w, x, y, z) = first, second
     cosine = a * w + b * x + c * y + d * z
     angle = acos(min(abs(cosine), 1.0))
@@ -195,9 +163,8 @@ _EYE = np.eye(3)
 class OrientationTrack:
     """Push machine. Holds the samples of one IMU.
 
-    Attributes:
-        counts: `orientation.used`, epochs that had one, `orientation.absent`, those that had none; samples rejected:
-            `orientation.missing`, `orientation.not_unit`, `orientation.late`.
+    It counts `orientation.used`, epochs that had one, `orientation.absent`, those that had none, and what
+    `OrientationSamples` rejects.
     """
 
     def __init__(self, imu: ImuCalibration, counts: Counter[str] | None = None) -> None:
@@ -214,21 +181,11 @@ class OrientationTrack:
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
 
     def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world.
-
-        See `OrientationSamples.push`.
-        """
+        """Take one sample, as of `OrientationSamples.push`."""
         self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def at(self, t_ns: int, near: SolvedHand | None) -> OrientationMeasurement | None:
-        """Return the palm's orientation at a time.
-
-        None where no sample is near enough.
-
-        Args:
-            t_ns: The epoch.
-            near: The hand as it was solved, which gives the heading where the IMU has none; None: not known.
-        """
+        """Return the palm's orientation at a time, or None; `near` may give the heading."""
         found = self._samples.between(t_ns)
         heading_rad = None if found is None else self._heading_rad(found.drift_rad)
         if found is None or (heading_rad is None and near is None):
@@ -255,10 +212,7 @@ class OrientationTrack:
 
 
 def _twist_about(axis: Float, rotation: Float) -> Float:
-    """Return the rotation (3, 3) about a unit axis (3,) nearest to a given one.
-
-    For a rotation (3, 3) this is its twist.
-    """
+    """Return the rotation (3, 3) about a unit axis (3,) nearest to one: its twist."""
     w, *v = matrix_to_quaternion(rotation)
     return rotation_vector_to_matrix(2.0 * atan2(float(np.array(v) @ axis), float(w)) * axis)
 
@@ -280,35 +234,6 @@ Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
 
 
-class WristSideOf(Protocol):
-    """Measurements by a wrist device and its IMU of the hand the cameras watch.
-
-    See `master.estimator.wrist_pipeline`.
-    """
-
-    def rows_at(self, t_ns: int) -> WristRows | None:
-        """Return the rows of a strobe cycle that no epoch had.
-
-        None: there is none.
-        """
-        ...
-
-    def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
-        """Return the palm orientation measured by the IMU.
-
-        None: the IMU does not report it.
-        """
-        ...
-
-    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
-        """Learn from an epoch that was solved."""
-        ...
-
-    def completed(self, pose: HandPose, estimator: Estimator) -> HandPose:
-        """The pose with what else is known of the hand."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class SolvedPose:
     """A pose, and when the last contributing frame was handed to its slave [ns]."""
@@ -318,10 +243,7 @@ class SolvedPose:
 
 
 class MarkerPipeline:
-    """Push machine that holds sync, line, estimator and filter.
-
-    Each has its own state; it also holds where markers were last.
-    """
+    """Push machine that holds sync, line, estimator, filter, and last marker places."""
 
     def __init__(
         self,
@@ -337,29 +259,25 @@ class MarkerPipeline:
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
-        side: "WristSideOf | None" = None,
+        side: "WristSide | None" = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
         dropped_epochs: Callable[[], bool] | None = None,
     ) -> None:
-        """Join the parts.
+        """Join the parts; cameras in the rig's order, markers in that of every array.
 
         Args:
-            cameras: In the rig's order.
-            model: The hand.
-            markers: Names in the order of every marker array.
             line: Brings the cameras to one epoch, and solves it first.
             rays: Places markers by the rays of all cameras; None: there is one camera.
             rays_px: Standard deviation per axis that the calibration leaves.
             estimator: Fits the hand to the pixels, from the line's hand; None: the line's hand is published.
             smooth: Filters the fitted hand; None: frames are unrelated, nothing is filtered.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
-            volume: What the rig states, or None; joints report whether they lie in it.
-            imu: On the palm; its orientation is used where the rig states how it is mounted and how its world lies.
+            volume: Joints report whether they lie in it; None: none is stated.
+            imu: On the palm; used where the rig states how it is mounted and how its world lies.
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
-            counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether to drop it for newer ones; None: none is.
+            dropped_epochs: Asked for each epoch whether to drop it for newer ones; None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
@@ -371,7 +289,6 @@ class MarkerPipeline:
         self._on_hand, self._hand_markers = line.on_hand, tuple(markers[int(m)] for m in line.on_hand)
         joints = [model.mount(name).joint for name in self._hand_markers]
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
-        self._finger_of = Mounts.of(model, self._hand_markers).finger
         self._stage, self._volume, self._dropped_epochs, self._side = stage, volume, dropped_epochs, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._last_ns = -(2**63)
@@ -392,10 +309,7 @@ class MarkerPipeline:
         return self._solved(sets)
 
     def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
-        """Return the pose at an epoch at which no camera saw anything.
-
-        It comes from what else watches the hand; None: the epoch is past.
-        """
+        """Return the pose of an epoch no camera saw, by other sensors; None: it is past."""
         shape = (len(self._names), len(self.markers))
         unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
         missing = np.ones(len(self._names), np.bool_)
@@ -403,10 +317,7 @@ class MarkerPipeline:
         return poses[0] if poses else None
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take the orientation (4,) that the IMU reports of itself.
-
-        It serves the epochs about `t_ns`.
-        """
+        """Take the orientation (4,) of the IMU, for the epochs about `t_ns`."""
         if self._orientation is None:
             self.counts["orientation.unplaced"] += 1
         else:
@@ -417,10 +328,7 @@ class MarkerPipeline:
         return self._solved(self._line.sync.flush())
 
     def _solved(self, sets: list[FrameSet]) -> list[SolvedPose]:
-        """Return the poses of epochs later than the last one.
-
-        Others are counted: cameras came back with old frames.
-        """
+        """Return the poses of epochs after the last; others (old frames) are counted."""
         poses: list[SolvedPose] = []
         for frames in sets:
             if frames.t_ns <= self._last_ns:
@@ -524,9 +432,8 @@ class MarkerPipeline:
         assert frames.alt_uv is not None
         assert frames.alt_sigma_px is not None
         ambiguous = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
-        if (
-            not ambiguous.any()
-        ):  # an alternative was named in a frame nearby, and is not carried to this epoch
+        # an alternative was named in a frame nearby, and is not carried to this epoch
+        if not ambiguous.any():
             return replace(frames, alt_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
         clear = np.where((ambiguous | first.outliers)[:, None], np.nan, first.points_m)
@@ -542,15 +449,10 @@ class MarkerPipeline:
         self._count("alternative", associated.taken)
         self._count("unclear", associated.dropped)
         return replace(
-            frames,
-            uv=associated.uv,
-            sigma_px=associated.sigma_px,
-            area=associated.area_px2,
-            alt_uv=None,
+            frames, uv=associated.uv, sigma_px=associated.sigma_px, area=associated.area_px2, alt_uv=None
         )
 
     def _expected(self, hand: SolvedHand) -> Prior:
-        """Where a hand has the markers."""
         points = np.full((len(self.markers), 3), np.nan)
         cov = np.full((len(self.markers), 3, 3), np.nan)
         points[self._on_hand] = self.model.marker_points(hand.joints, self._hand_markers)
@@ -558,7 +460,6 @@ class MarkerPipeline:
         return Prior(points, cov)
 
     def _count(self, event: str, markers: Bool) -> None:
-        """Count an event of each of the markers (M,) by name."""
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 

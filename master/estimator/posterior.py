@@ -1,42 +1,32 @@
 """The posterior of an epoch mixes the hands of all hypotheses.
 
-Kernels of the posterior of an epoch.
-
-They compute both hypotheses, their evidence, mean and covariance.
-
-The evidence of a hypothesis is the density of the markers under it, by Laplace's approximation
+The evidence of a hypothesis is the density of the markers under it at its solution, by Laplace's
+approximation (MacKay 1992, "Bayesian interpolation", section 4),
 
     log p = -cost + log density of the posture prior - log det(normal) / 2
 
-at its solution (MacKay 1992, "Bayesian interpolation", section 4). Whether a hand is natural does not change from
-frame to frame, while the evidence of one is noise in part: its logarithm is smoothed in time. Mean and covariance are
-those of the mixture: the spread between solutions is uncertainty as well. Of a free hand the mean within its limits is
-taken, of a natural one the likeliest pose (`master.estimator.parameters`).
+Whether a hand is natural does not change from frame to frame, so this is smoothed in time. Mean and
+covariance are those of the mixture: the spread between solutions is uncertainty as well. Of a free hand the
+mean within its limits is taken, of a natural one the likeliest pose (`master.estimator.parameters`).
 
-The covariance is that of this epoch alone. To the fit the state before is a prior, as wide as a hand moves meanwhile.
-That holds it steady, but it is not independent: the same prior led to it from the same markers, so a wrong direction
-of a finger is as wrong in every frame of a held pose. What is left are rows and posture prior. It holds better of some
-postures than of others: a pointing hand defies it. By how much, the residual of the epoch itself shows, which scales
-the covariance (Birge 1932), with the claimed widths as one observation more (a prior of unit information: Kass,
-Wasserman 1995):
+The covariance is that of this epoch alone. The state before is a prior to the fit, but not independent: the
+same prior led to it from the same markers, so a wrong direction of a finger is as wrong in every frame of a
+held pose. The posture prior holds better of some postures than of others. By how much, the residual of the
+epoch itself shows, which scales the covariance (Birge 1932), with the claimed widths as one observation more
+(a prior of unit information: Kass, Wasserman 1995):
 
     covariance = s^2 normal^-1,   s^2 = max(1, (1 + chi^2) / (1 + f)),   f = numbers that are measured - 6
 
-A good fit makes nothing surer than it was claimed. Priors that contradict each other, whatever the markers, are no
-evidence of the epoch: their least cost is no part of chi^2.
-
-What an epoch rests on: the rows of its markers, counted.
-
-Workspace of the kernels of an epoch.
-
-It has what is the same at every epoch, the task, and scratch room.
+Priors that contradict each other, whatever the markers, are no evidence: their least cost is no part of
+chi^2.
 """
 
 from math import exp, log
 from typing import Any, NamedTuple
 
 from common.arrays import Bool, Code, Float, Int
-from common.kernels import constant, inlined, inner, kernel, record
+from common.kernels import constant, inlined, inner, kernel
+from common.records import record
 from master.estimator.covariance import CovarianceScratch
 from master.estimator.finger_scan import Prior, Scan
 from master.estimator.kinematics import markers_of, rotate_by, rotation_between
@@ -125,12 +115,7 @@ def _solve_each(
 def _weigh(
     posture_prior: PosturePrior, settings: Settings, natural_weight: float, counts: float, scratch: Scratch
 ) -> None:
-    """Write the probability of each hypothesis.
-
-    It follows from the hypothesis's evidence and from what it was before.
-
-    `natural_weight` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
-    """
+    """Write each hypothesis's probability, by evidence and what it was before."""
     N, share, other = scratch.middle.shape[0], scratch.each[0].share, scratch.each[1].share
     share[0], other[0] = 1.0, 0.0
     if posture_prior.constant.shape[0] < 2:
@@ -149,10 +134,7 @@ def _weigh(
 
 @inner
 def _least(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, scratch: Scratch) -> float:
-    """Return the least cost of the posture prior and the single-angle priors.
-
-    The latter are those of this epoch. The least cost is by how much they contradict each other.
-    """
+    """Return the least cost of posture and own priors: how they contradict."""
     n = epoch_prior.own.shape[0]
     x = scratch.cut.weight
     for i in range(n):
@@ -176,10 +158,7 @@ def _covariance(
     numbers: float,
     scratch: Scratch,
 ) -> float:
-    """Write the covariance (N, N) of one hypothesis; return its scale.
-
-    The covariance is by this epoch alone.
-    """
+    """Write a hypothesis's covariance (N, N) by this epoch; return its scale."""
     N, A, one = scratch.middle.shape[0], scratch.A, scratch.each[h]
     for i in range(N):
         for j in range(i + 1):
@@ -225,10 +204,7 @@ def _mix(
     scratch: Scratch,
     out: Posterior,
 ) -> int:
-    """Write mean step and covariance of the hypotheses together.
-
-    Return the likelier one.
-    """
+    """Write mean step and covariance of all hypotheses; return the likelier one."""
     n, N = out.x.shape[0], scratch.middle.shape[0]
     best = likelier(scratch)
     if scratch.each[best].share[0] > 1.0 - settings.negligible:
@@ -273,10 +249,7 @@ def _mix(
 
 @inlined
 def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
-    """Write where the step of a hypothesis brings the markers.
-
-    They go to room.here (M, 3), as if on straight lines.
-    """
+    """Write where a hypothesis's step brings the markers (M, 3), going straight."""
     markers_of(rig.hand, rig.mounts, one.palm, one.x, scratch.search.rows, scratch.here)
     moves = False
     difference_step = 1e-4  # of a step: what a difference is taken over
@@ -308,8 +281,8 @@ def _onto(
 ) -> None:
     """Move the likelier hand by the mean step, then to the mean of the markers.
 
-    What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
-    step, the shortest by the normal matrix, to where the mean of their markers is.
+    A pose between two hands that explain the markers does so a little worse, since fingers move on arcs. So
+    it is one step, the shortest by the normal matrix, to where the mean of their markers is.
     """
     n, N, between, likely = out.x.shape[0], scratch.middle.shape[0], blank.between, scratch.each[best]
     for m in range(rig.mounts.finger.shape[0]):
@@ -377,15 +350,10 @@ def posterior(
     scratch: Scratch,
     out: Posterior,
 ) -> None:
-    """Fit one epoch from a start.
+    """Fit one epoch from a palm T, x, z.
 
-    Args:
-        rig, settings, posture_prior, epoch_prior, observed: What is known.
-        palm, x, z: (4, 4), (n,), (K,) where both searches begin.
-        natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
-        numbers: How many numbers are measured.
-        blank, room: Scratch.
-        out: Written.
+    `natural_weight`: probability of a natural hand a moment ago, `counts`: what that counts, 0 ... 1;
+    `numbers` measured.
     """
     out.steps[0] = _solve_each(rig, settings, posture_prior, epoch_prior, observed, T, x, z, scratch)
     _weigh(posture_prior, settings, natural_weight, counts, scratch)
@@ -411,25 +379,15 @@ ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 
 
 class Ground:
-    """Counts of one epoch.
+    """What an epoch rests on: the rows of its markers, counted."""
 
-    Attributes:
-        shown: (5,) fingers that are measured.
-        rests: (6,) as of `Fitted`, by markers alone; of the palm where `by_markers`.
-        seen: (1,) markers that have a row.
-        most: (1,) the most rays of any; a marker that is placed as a point counts as two.
-        numbers: (1,) numbers that are measured.
-        back: (1,) whether a marker on the palm's back is seen.
-        by_markers: (1,) whether they determine where the palm is.
-    """
-
-    shown: Bool
-    sources: Int
-    seen: Int
-    most: Int
-    numbers: Float
-    back: Bool
-    by_markers: Bool
+    shown: Bool  # (5,) fingers that are measured
+    sources: Int  # (6,) as of `Fitted`, by markers alone; of the palm where `by_markers`
+    seen: Int  # (1,) markers that have a row
+    most: Int  # (1,) the most rays of any; a marker that is placed as a point counts as two
+    numbers: Float  # (1,) numbers that are measured
+    back: Bool  # (1,) whether a marker on the palm's back is seen
+    by_markers: Bool  # (1,) whether they determine where the palm is
 
     @classmethod
     def empty(cls) -> "Ground":
@@ -448,13 +406,7 @@ class Ground:
 
 @kernel
 def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
-    """Count the rows of an epoch.
-
-    Args:
-        mounts: The hand's markers.
-        observed: Their rows.
-        boxed_out: (1,) `Ground`, written.
-    """
+    """Count the rows of an epoch into `boxed_out`, (1,) `Ground`."""
     out = boxed_out[0]
     out.seen[0], out.most[0], out.numbers[0], out.back[0] = 0, 0, 0.0, False
     for p in range(6):
@@ -482,65 +434,39 @@ def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
 
 
 class Task:
-    """What is to be done at an epoch.
+    """What is to be done at an epoch."""
 
-    Attributes:
-        t_ns: (1,) the epoch.
-        palm_shown: (1,) whether something measures where the palm is.
-        palm, angles: (4, 4), (20,) another hand of the epoch [rad].
-        x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
-        may_leave: (1,) whether there is another, and it may take the place of the state.
-        rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
-        natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
-        second_order: (1,) whether covariance is wanted to second order.
-        process_noise_rad2: (1,) variance of what the heading has drifted since the last epoch.
-        continuous: (1,) whether epochs follow each other.
-        scanned: (20,) angles of fingers whose cost map was searched, where it is likeliest.
-        refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
-        solver_mode: (5,) `SolverMode` codes of what fingers are solved from.
-        ambiguous: (5,) whether another pose explains as much.
-    """
-
-    t_ns: Int
-    palm_shown: Bool
-    palm: Float
+    t_ns: Int  # (1,)
+    palm_shown: Bool  # (1,) whether something measures where the palm is
+    palm: Float  # (4, 4) of another hand of the epoch, and `angles` (20,) [rad]
     angles: Float
-    x: Float
-    may_leave: Bool
-    coarse: Bool
-    natural_weight: Float
-    counts: Float
-    second_order: Bool
-    process_noise_rad2: Float
-    continuous: Bool
-    scanned: Float
-    refused: Bool
+    x: Float  # (n,) its free angles, inside the limits; or, with the palm, where a search begins
+    may_leave: Bool  # (1,) whether there is another, and it may take the place of the state
+    coarse: Bool  # (1,) whether a search ends early, in place, under the widest hypothesis alone
+    natural_weight: Float  # (1,) probability of a natural hand a moment ago
+    counts: Float  # (1,) what that counts, 0 ... 1
+    second_order: Bool  # (1,) whether covariance is wanted to second order
+    process_noise_rad2: Float  # (1,) variance of what the heading has drifted since the last epoch
+    continuous: Bool  # (1,) whether epochs follow each other
+    scanned: Float  # (20,) angles of fingers whose cost map was searched, where it is likeliest
+    refused: Bool  # (5,) fingertips, and `off` (5,) laser points, that no pose explains
     off: Bool
-    solver_mode: Code
-    ambiguous: Bool
+    solver_mode: Code  # (5,) `SolverMode` codes of what fingers are solved from
+    ambiguous: Bool  # (5,) whether another pose explains as much
 
     @classmethod
     def empty(cls, n: int) -> "Task":
         """Scratch for one."""
         return record(
             cls,
+            **dict.fromkeys(("palm_shown", "may_leave", "coarse", "second_order", "continuous"), ("u1", 1)),
+            **dict.fromkeys(("natural_weight", "counts", "process_noise_rad2"), 1),
+            **dict.fromkeys(("refused", "off", "solver_mode", "ambiguous"), ("u1", 5)),
             t_ns=("i8", 1),
-            palm_shown=("u1", 1),
             palm=(4, 4),
             angles=20,
-            x=n,
-            may_leave=("u1", 1),
-            coarse=("u1", 1),
-            natural_weight=1,
-            counts=1,
-            second_order=("u1", 1),
-            process_noise_rad2=1,
-            continuous=("u1", 1),
             scanned=20,
-            refused=("u1", 5),
-            off=("u1", 5),
-            solver_mode=("u1", 5),
-            ambiguous=("u1", 5),
+            x=n,
         )
 
 
@@ -577,10 +503,7 @@ class Workspace:
 
 
 class Model(NamedTuple):
-    """Everything that is the same at every epoch.
-
-    Hand, settings and device are in their arrays (`common.kernels.boxed`).
-    """
+    """Everything that is the same at every epoch, in boxes (`common.kernels.boxed`)."""
 
     hand: Any
     settings: Any

@@ -1,45 +1,23 @@
 """Priors say how a hand is held before it is measured.
 
-Prior of a hand before a marker is seen.
+Every prior is a row of a least-squares problem that is linear in the free angles, divided by its standard
+deviation. Hands mostly follow joint couplings, and now and then defy them altogether: a gun, horns, a
+pianist. So there are two hypotheses of every hand, *natural* and *free*, and the evidence of the markers
+decides how much each counts (MacKay 1992, "Bayesian interpolation": the width of the prior is what a free
+hand gains in fit and pays in volume).
 
-It covers the posture priors of natural and of free hands, and curled fingers.
+Three come from Kim et al. 2012 ("Digits"). *Flexion synergy*: the MCP of a finger is 0.54 of its PIP and the
+DIP 0.84 (Kamper et al. 2003), or as the hand file states; a thumb closes in proportion, from one end of its
+limits to the other. *Finger line*: a finger that bends moves its laser point along a nearly straight line on
+the laser plane, which a guided curl measures; the model of a hand is not stretched to that range: where the
+point of a straight finger lies shows how straight it was held, 3 mm for each degree. *Cubic*: the printed law
+of the distance d along that line from where it comes nearest to the device,
 
-Every prior is a row of a least-squares problem that is linear in the free angles, divided by its standard deviation.
+    PIP [deg] = -0.0003 d^3 + 0.059 d^2 - 4.07 d + 119.75        d in mm, 0 ... 102.06
 
-Hands mostly follow joint couplings, and now and then defy them altogether: a gun, horns, a pianist. One width would
-be too wide for the former or too narrow for the latter. So there are two hypotheses of every hand, *natural* and
-*free*, and the evidence of the markers decides how much each counts (MacKay 1992, "Bayesian interpolation": the
-width of the prior is what a free hand gains in fit and pays in volume).
-
-Principal axis of the motion of a finger's laser point (Kim et al. 2012).
-
-The laser draws its points on a plane, and a finger that bends moves its point along a nearly straight line in it,
-towards the device; the thumb's runs diagonally. A guided curl measures this line and how far the points go. Along it a
-new point is normalised, and what deviates from it is abduction: the printed law (`master.estimator.priors`) needs both.
-
-The model of a hand does not: it knows the line by its bones. It is not stretched to the measured range either, because
-where the point of a straight finger lies shows how straight it was held, 3 mm for each degree. On simulated hands with
-skin wrong by 10 % and a palm by 1 degree and 1 mm, stretching turned a PIP good to 4 degrees (median of eight hands)
-into one good to 13 where curls ended anywhere, and to 5 where all were full.
-
-Flexion synergy: the joints of a finger bend together (Kim et al. 2012).
-
-The MCP of a finger is 0.54 of its PIP and the DIP 0.84 (Kamper et al. 2003); a hand file that states couplings has its
-own. A thumb closes in proportion, from one end of its limits to the other.
-
-The printed cubic: PIP by the distance of the laser point (Kim et al. 2012).
-
-    PIP [deg] = -0.0003 d^3 + 0.059 d^2 - 4.07 d + 119.75        d in mm
-
-It needs no bones: d is how far the laser point is from where that finger's point comes nearest to the device (the
-paper takes that for the knuckle), along the finger's principal axis of motion. So it runs from 119.75 degrees at d = 0
-to none at d = 102.06 mm, and outside it stays there. The axis is what a guided curl measured (`finger_lines` of the
-rig), or else that of the simulated curl. A thumb has no PIP, and is left to the natural curve.
-
-As a law of any particular hand it is wrong by 12 to 20 degrees, and one digit more in 0.0003 would move its root
-between 71 and 152 mm: it is here to compare with (`forward` of the rig: "cubic").
-
-Prior model of a wrist device and its hand, before the first strobe cycle.
+As a law of any particular hand it is wrong by 12 to 20 degrees, and one digit more in 0.0003 would move its
+root between 71 and 152 mm: it is here to compare with (`forward` of the rig: "cubic"). A thumb is left to the
+natural curve.
 """
 
 from dataclasses import dataclass, replace
@@ -53,38 +31,28 @@ from common.calibration.rig import FingerLine
 from common.errors import CalibrationError, FitError
 from common.hand.model import FINGERS, HandModel
 from common.hand.profiles import ABDUCTION, FLEXION, preset_couplings
-from common.kernels import boxed, kernel
+from common.kernels import kernel
+from common.records import boxed
 from master.estimator.finger_surface import OWN_MOVES, Surface, laser_centroid, look
 from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.sensors import Device, flexed_palm
 from master.estimator.settings import DEFAULT, Settings
+from master.fabrik.linear_algebra import as_vector
 from master.rig.wrist import WristSetup
 
 Row = tuple[dict[int, float], float, float]
 
 
 class PosturePrior(NamedTuple):
-    """Prior on the free angles x of H hypotheses.
+    """Prior on free angles x, cost x normal x / 2 - pull x + constant, H hypotheses."""
 
-    The cost is x normal x / 2 - pull x + constant, half a sum of squares.
-
-    Attributes:
-        normal: (H, n, n).
-        pull: (H, n).
-        constant: (H,) so that the cost is that of the squares.
-        log_density: (H,) logarithm of the density at cost 0, but for what the hypotheses have in common.
-    """
-
-    normal: Float
-    pull: Float
-    constant: Float
-    log_density: Float
+    normal: Float  # (H, n, n)
+    pull: Float  # (H, n)
+    constant: Float  # (H,) so that the cost is that of the squares
+    log_density: Float  # (H,) at cost 0, but for what the hypotheses have in common
 
     def without(self, columns: Int, mean: float, sigma: float) -> "PosturePrior":
-        """Return the prior without single-angle rows in the first hypothesis.
-
-        The rows removed are those on each of these angles by itself.
-        """
+        """Return the prior less these rows on single angles in the first hypothesis."""
         normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
         normal[0, columns, columns] -= 1.0 / sigma**2
         pull[0, columns] -= mean / sigma**2
@@ -102,13 +70,7 @@ def posture_prior_of(
     settings: Settings = DEFAULT,
     unlike: frozenset[int] = frozenset(),
 ) -> PosturePrior:
-    """Return the posture priors of a natural hand and of a free one.
-
-    Args:
-        model, parameters: The hand.
-        settings: Widths and means.
-        unlike: Fingers of which it is known that they are not bent as the others: those are no neighbours.
-    """
+    """Return priors of a natural and a free hand; `unlike` fingers are no neighbours."""
     tables = [
         _table(parameters, _natural_rows(model, settings, unlike)),
         _table(parameters, _free_rows(model, settings)),
@@ -129,10 +91,7 @@ def posture_prior_of(
 
 
 def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tuple[Float, Float]:
-    """Return the inverse variances and means (n,) of curled fingers' angles.
-
-    The fingers (5,) are curled out of sight.
-    """
+    """Return inverse variances and means (n,) of fingers (5,) curled out of sight."""
     angles, sigma = np.zeros((5, 4)), np.full((5, 4), np.inf)
     s = settings
     angles[0] = (
@@ -149,19 +108,10 @@ def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tup
 
 
 def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list[Row]:
-    """Return the prior rows of a natural hand.
-
-    They are natural flexion, small abduction, neighbours alike, a loose thumb; angles by their place in the flat
-    table.
-    """
+    """Return the rows of a natural hand, by places in the flat table of angles."""
     if model.posture is not None:
         return _posture_rows(*model.posture, 1.0)
-    thumb = (
-        s.thumb_abduction_mean_rad,
-        s.thumb_flexion_mean_rad,
-        s.thumb_mcp_mean_rad,
-        s.thumb_ip_mean_rad,
-    )
+    thumb = (s.thumb_abduction_mean_rad, s.thumb_flexion_mean_rad, s.thumb_mcp_mean_rad, s.thumb_ip_mean_rad)
     rows: list[Row] = [({k: 1.0}, mean, s.thumb_rad) for k, mean in enumerate(thumb)]
     rows.append(({2: -1.0, 3: 1.0}, 0.0, s.thumb_rad))
     for f in range(1, 5):
@@ -207,10 +157,7 @@ def _free_rows(model: HandModel, s: Settings) -> list[Row]:
 
 
 def _loose_dip(model: HandModel, a: int, s: Settings) -> list[Row]:
-    """Return the row that couples a DIP to its PIP.
-
-    The finger's angles begin at `a`. There is a row only if the DIP follows loosely.
-    """
+    """Return the row, if it follows loosely, of the DIP of the finger at angle a."""
     if model.dip_per_pip is None:
         return [({a + 3: 1.0, a + 2: -s.loose_dip_per_pip}, 0.0, s.loose_dip_rad)]
     if model.dip_spread_rad > 0.0:
@@ -230,15 +177,10 @@ def _table(parameters: HandParameters, rows: list[Row]) -> tuple[Float, Float]:
 
 
 def principal_line(points_m: Float) -> FingerLine:
-    """Fit the line through the laser points of one finger.
+    """Fit the line through the laser points (N, 3) [m] of one finger, in any order.
 
-    It follows the principal component of their scatter.
-
-    Args:
-        points_m: (N, 3) [m], camera frame, in any order; NaN rows are rejected.
-
-    Returns:
-        The line, its origin at the point of the straightest finger, range (0, length).
+    The principal component; its origin is the point of the straightest finger, its range (0, length). NaN:
+    rejected.
 
     Raises:
         FitError: Fewer than five points, less than 5 mm of motion, or points on no line.
@@ -273,7 +215,10 @@ def principal_line(points_m: Float) -> FingerLine:
         )
     origin = mean + low * direction
     return FingerLine(
-        origin_m=_vector(origin), direction=_vector(direction), range_m=(0.0, high - low), residual_m=residual
+        origin_m=as_vector(origin),
+        direction=as_vector(direction),
+        range_m=(0.0, high - low),
+        residual_m=residual,
     )
 
 
@@ -289,34 +234,21 @@ def on_line(points_m: Float, line: FingerLine) -> tuple[Float, Float]:
     return (along - low) / (high - low), offset - along[..., None] * direction
 
 
-def _vector(value: Float) -> tuple[float, float, float]:
-    x, y, z = (float(number) for number in value)
-    return x, y, z
-
-
 PIP, DIP = 2, 3
 FULL_CURL_RAD = radians(120.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlexionSynergy:
-    """Angles by closing: base + closing * slope.
+    """Angles by closing: base_rad + closing * per_pip."""
 
-    Attributes:
-        base_rad, slope: (5, 4); the slope of the PIP (thumb MCP) is 1.
-        range_rad: (5, 2) of the closing.
-    """
-
-    base_rad: Float
-    per_pip: Float
-    range_rad: Float
+    base_rad: Float  # (5, 4)
+    per_pip: Float  # (5, 4); that of the PIP (thumb MCP) is 1
+    range_rad: Float  # (5, 2) of the closing
 
     @classmethod
     def of(cls, model: HandModel) -> "FlexionSynergy":
-        """Return the flexion synergy of a hand.
-
-        It uses the hand's own couplings where its file states them, else those of Digits.
-        """
+        """Return the synergy of a hand: its file's own couplings, or those of Digits."""
         stated = model.profile.couplings is not None
         digits = preset_couplings("D")
         mcp, dip = (model.mcp_per_pip, model.dip_per_pip) if stated else (None, None)
@@ -344,10 +276,7 @@ _POLYNOMIAL = (-0.0003, 0.059, -4.07, 119.75)
 
 
 def cubic_pip(distance_m: Float) -> Float:
-    """Return the PIP angle [rad] by the printed law.
-
-    It is clamped outside 0 ... 102.06 mm; NaN where the distance is NaN.
-    """
+    """Return the PIP angle [rad] by the printed law, clamped outside its range."""
     d = np.clip(1e3 * distance_m, 0.0, ROOT_MM)
     return np.radians(np.clip(np.polyval(_POLYNOMIAL, d), 0.0, _POLYNOMIAL[-1]))
 
@@ -356,10 +285,7 @@ def cubic_pip(distance_m: Float) -> Float:
 def _laser_points(
     boxed_hand: Float, boxed_device: Float, angles: Float, boxed_work: Float, out: Float
 ) -> None:
-    """Write laser points (C, 5, 3) [m] of hands of angles (C, 20).
-
-    NaN where the laser misses a finger.
-    """
+    """Write laser points (C, 5, 3) [m] of angles (C, 20); NaN: the finger is missed."""
     palm, axes = np.zeros((4, 4)), np.zeros((2, 3))
     hand, device, work = boxed_hand[0], boxed_device[0], boxed_work[0]
     flexed_palm(device.palm, 0.0, 0.0, palm, axes)
@@ -377,19 +303,13 @@ def lit(setup: WristSetup, synergy: FlexionSynergy) -> bool:
 
 
 def simulated_lines(setup: WristSetup) -> tuple[FingerLine, ...]:
-    """Return the lines (5) of a whole curl of the simulated hand.
-
-    The fingers are neither spread nor crossed.
-    """
+    """Return the lines (5) of a whole curl of a simulated, unspread hand."""
     points = _curl(setup, FlexionSynergy.of(setup.model))
     return tuple(principal_line(points[np.isfinite(points[:, f, 0]), f]) for f in range(5))
 
 
 def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
-    """Return laser points (C, 5, 3) [m] of a hand that closes.
-
-    NaN where the laser misses a finger.
-    """
+    """Return laser points (C, 5, 3) [m] of a hand that closes; NaN: missed."""
     model = setup.model
     curls = 31
     branch = 0.75  # of a curl: after that the last phalanx folds into the light, and the line jumps to it
@@ -403,20 +323,14 @@ def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
 
 
 class CubicLaw:
-    """Printed law that maps laser points of one device to angles.
-
-    What it holds was prepared by the constructor.
-    """
+    """Printed law that maps laser points of one device to angles."""
 
     def __init__(self, setup: WristSetup) -> None:
         simulated = simulated_lines(setup)
         self.lines = tuple(setup.lines.get(name, line) for name, line in zip(FINGERS, simulated, strict=True))
 
     def __call__(self, points_m: Float) -> Float:
-        """Return the PIPs (5,) [rad] of laser points (5, 3) [m].
-
-        The points are on the laser plane, in the camera frame. NaN: not seen, and for the thumb.
-        """
+        """Return PIPs (5,) [rad] of laser points (5, 3) [m]; NaN: not seen, the thumb."""
         pip = np.full(5, np.nan)
         for f, line in enumerate(self.lines[1:], start=1):
             along, _ = on_line(points_m[f], line)
@@ -432,30 +346,18 @@ _DIP_SPREAD_RAD = radians(7.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristModel:
-    """A wrist device, and how the fingers that it sees bend.
-
-    Attributes:
-        device: As arrays.
-        natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
-        frame: (4,) least and most x and y of the ray of a fingertip that is clearly in the image.
-        frame_s: From the laser's frame to that of the LEDs.
-        loose: Whether the wrist may bend before the device.
-        tilt_rad: By which the IMU may have the vertical off.
-        heading_rad: By which its heading may be off in the beginning; None: it may be any.
-        natural_only: Whether fingers are taken to bend naturally, whatever is seen.
-        cubic: The paper's law; None: the hand's own bones count.
-    """
+    """A wrist device, and how the fingers that it sees bend."""
 
     device: Device
-    base_rad: Float
+    base_rad: Float  # (5, 4) natural angles by the PIP: base_rad + per_pip PIP
     per_pip: Float
-    frame: Float
-    frame_s: float
-    loose: bool
-    tilt_rad: float
-    heading_rad: float | None
-    natural_only: bool
-    cubic: CubicLaw | None
+    frame: Float  # (4,) least and most x and y of the ray of a fingertip that is clearly in the image
+    frame_s: float  # from the laser's frame to that of the LEDs
+    loose: bool  # whether the wrist may bend before the device
+    tilt_rad: float  # by which the IMU may have the vertical off
+    heading_rad: float | None  # by which its heading may be off in the beginning; None: it may be any
+    natural_only: bool  # whether fingers are taken to bend naturally, whatever is seen
+    cubic: CubicLaw | None  # the paper's law; None: the hand's own bones count
 
     @classmethod
     def of(cls, setup: WristSetup, *, loose: bool) -> "WristModel":
@@ -497,10 +399,7 @@ class WristModel:
 
 
 def loosened(model: HandModel) -> HandModel:
-    """Return the hand model with the loose couplings that a wrist device needs.
-
-    The DIPs follow the PIP loosely, and the limits have room.
-    """
+    """Return the hand with loosely following DIPs and room beyond its limits."""
     limits = model.limits_rad.copy()
     limits[1:, ABDUCTION] = -_ASIDE_RAD, _ASIDE_RAD
     limits[1:, [FLEXION, PIP, DIP], 0] -= _BEYOND_RAD

@@ -1,35 +1,25 @@
 """The problem of a fit: a rig, a prior, and residuals of what is measured.
 
-Inputs of the search for a hand.
-
-They are the rig, the prior of the hand, and scratch arrays.
-
-Kernels of what is measured: predicted values, residuals and their derivatives.
-
-A RAY row is where a camera would see a marker, minus where it did [px], without what the side of a painted cap that it
-sees shifts its centroid by (`master.fabrik.rays`). A POINT row is a measured place [m].
-
-What is wrong with the marker itself, such as its colour, bones and the side of a cap that is not known, is seen by all
-cameras. It is a shift d of the marker with a covariance S, and is integrated out: with H, g the information and
-gradient of the rays,
-
-    H - H (H + S^-1)^-1 H,   g - H (H + S^-1)^-1 g,   cost - g' (H + S^-1)^-1 g / 2
-
-so a marker that one camera sees gives two numbers and one that sixteen see is no surer than its colour.
-
-Kernels of the measurement rows of a wrist device.
-
-The rows are LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
-
+    RAY        where a camera would see a marker, minus where it did [px]; without what the visible side of a painted
+               cap shifts its centroid by (`master.fabrik.rays`)
+    POINT      a place, minus the measured one [m]
     LASER      where the laser meets the finger's skin [x, y of the ray], minus where it was seen
     TIP        the fingertip, minus where it was seen
     TIP_DEPTH  logarithm of its distance in the unit of the light, minus that by its brightness
     TURN       rotation vector from where the sensors have the palm to where it is
 
-What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
-A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
-the wrist, and not with where the hand is in the room. The bend they constrain little (`wrist_share`), for that all
-fingers seem bent by as much is mostly an error that they share; what its uncertainty makes of them is in their noise.
+What is wrong with a marker itself (colour, bones, the side of a cap that is not known) is seen by all
+cameras. It is a shift d with a covariance S, and is integrated out: with H, g the information and gradient of
+the rays,
+
+    H - H (H + S^-1)^-1 H,   g - H (H + S^-1)^-1 g,   cost - g' (H + S^-1)^-1 g / 2
+
+so a marker that one camera sees gives two numbers and one that sixteen see is no surer than its colour.
+
+What a wrist device saw before or after the epoch is brought to it by the rates of the angles
+(`master.estimator.update`). Its rows move with the finger's angles, the twist of its hinges and the bend of
+the wrist. The bend they constrain little (`wrist_share`): that all fingers seem bent by as much is mostly an
+error that they share; what its uncertainty makes of them is in their noise.
 """
 
 from math import sqrt, tan
@@ -38,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.kernels import inlined, inner, kernel, record
+from common.kernels import inlined, inner, kernel
+from common.records import record
 from master.estimator.finger_surface import MOVES, Surface, look
 from master.estimator.kinematics import Scratch, rotation_between
 from master.estimator.parameters import HandTables, Mounts
@@ -56,10 +47,7 @@ from master.fabrik.linear_algebra import inverse_3
 
 
 class Rig(NamedTuple):
-    """Everything that is the same at every epoch.
-
-    It is the hand, its markers, the cameras, and a wrist device.
-    """
+    """Everything that is the same at every epoch."""
 
     hand: HandTables
     mounts: Mounts
@@ -68,83 +56,50 @@ class Rig(NamedTuple):
 
 
 class EpochPrior:
-    """Prior at one epoch beside the posture prior.
+    """Prior at one epoch beside the posture prior, filled in place."""
 
-    It is filled in place.
-
-    Attributes:
-        own_w2, own: (n,) inverse variances and means of single angles, by this epoch.
-        past_w2, past: (n,) the same, by the state before.
-        palm: (4, 4) the palm by the state before.
-        palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: no prior.
-        sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
-        back_normal: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
-        z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.sensors`).
-        orientation_info: (3, 3) [1/rad^2] information of the measured orientation, rig axes; `oriented` (1,) whether
-            there is any.
-        forearm: (4, 4) the palm by these in its first rows and columns; where `on_forearm` (1,) that of a straight
-            wrist, and `axes` (3, 3) about which tilt and heading turn it, as rows, rig axes.
-        place: (3,) [m] where the palm is, and `place_w2` (1,) how firmly; 0: not known.
-        sights: What a wrist device sees of the fingers.
-    """
-
-    own_w2: Float
+    own_w2: Float  # (n,) inverse variances, and `own` means, of single angles, by this epoch
     own: Float
-    past_w2: Float
+    past_w2: Float  # (n,) the same, by the state before
     past: Float
-    palm: Float
-    palm_w2: Float
-    line_of_sight: Float
-    depth_w2: Float
-    back_normal: Float
+    palm: Float  # (4, 4) the palm by the state before
+    palm_w2: Float  # (6,) inverse variances of turn [rad] and shift [m] from there; 0: no prior
+    line_of_sight: Float  # (3,) unit vector along which depth is held
+    depth_w2: Float  # (1,) how firmly [1/m^2]
+    back_normal: Float  # (3,) unit vector along which the back looks
     back_normal_w2: Float
-    z: Float
-    z_info: Float
-    orientation_info: Float
-    oriented: Float
-    forearm: Float
+    z: Float  # (K,) mean of the extras (`master.estimator.sensors`)
+    z_info: Float  # (K, K) their information
+    orientation_info: Float  # (3, 3) [1/rad^2] information of the measured orientation, rig axes
+    oriented: Float  # (1,) whether there is any
+    forearm: Float  # (4, 4) the palm by these in its first rows and columns; `on_forearm`: a straight wrist's
     on_forearm: Float
-    axes: Float
-    place: Float
-    place_w2: Float
+    axes: Float  # (3, 3) rows, rig axes, about which tilt and heading turn a forearm
+    place: Float  # (3,) [m] where the palm is
+    place_w2: Float  # (1,) how firmly; 0: not known
     lines_of_sight: LinesOfSight
 
     @classmethod
     def none(cls, n: int, extras: int) -> "EpochPrior":
-        """Return an empty prior of a hand with n free angles.
-
-        It has the given number of extra unknowns.
-        """
+        """Return an empty prior of a hand with n free angles and so many extras."""
         return record(
             cls,
-            own_w2=n,
-            own=n,
-            past_w2=n,
-            past=n,
+            **dict.fromkeys(("own_w2", "own", "past_w2", "past"), n),
+            **dict.fromkeys(("line_of_sight", "back_normal", "place"), 3),
+            **dict.fromkeys(("depth_w2", "back_normal_w2", "oriented", "on_forearm", "place_w2"), 1),
             palm=(4, 4),
+            forearm=(4, 4),
             palm_w2=6,
-            line_of_sight=3,
-            depth_w2=1,
-            back_normal=3,
-            back_normal_w2=1,
             z=extras,
             z_info=(extras, extras),
             orientation_info=(3, 3),
-            oriented=1,
-            forearm=(4, 4),
-            on_forearm=1,
             axes=(3, 3),
-            place=3,
-            place_w2=1,
             lines_of_sight=LinesOfSight.empty(),
         )
 
 
 class Search:
-    """Scratch for a search, of N = 6 + n + K unknowns.
-
-    They are the palm, n free angles and K extras.
-    """
+    """Scratch for a search of N = 6 + n + K unknowns: palm, free angles, extras."""
 
     gradient: Float  # (N,)
     normal: Float  # (N, N)
@@ -183,35 +138,26 @@ class Search:
         N = 6 + n + extras
         scratch = record(
             cls,
-            gradient=N,
-            normal=(N, N),
-            damped=(N, N),
-            L=(N, N),
-            step=N,
-            down=N,
-            palm=(4, 4),
-            next_palm=(4, 4),
+            **dict.fromkeys(("gradient", "step", "down"), N),
+            **dict.fromkeys(("normal", "damped", "L"), (N, N)),
+            **dict.fromkeys(("palm", "next_palm", "palm_straight", "palm_camera"), (4, 4)),
+            **dict.fromkeys(("q", "local_r", "local_w"), 3),
             x=n,
             off=6,
             z=extras,
-            q=3,
             J=(3, 3),
-            palm_straight=(4, 4),
             extras_jacobian=(5, 3),
             by_rotation=(8, 3),
-            palm_camera=(4, 4),
             wrist_axes=(2, 3),
             twist=5,
             wrist_share=1,
+            outliers=1,
             local_J=(3, 8),
-            local_r=3,
-            local_w=3,
             at=("i8", 8),
             surface=Surface.empty(),
             held=("u1", N),
             marker_chi2=markers,
             information=(markers, 3, 3),
-            outliers=1,
             rows=Scratch.empty(),
         )
         scratch.wrist_share[0] = 1.0
@@ -219,27 +165,16 @@ class Search:
 
 
 class Observations(NamedTuple):
-    """What is measured of M markers of a hand at one epoch.
+    """What is measured of M markers of a hand at one epoch."""
 
-    Attributes:
-        uv: (C, M, 2) [px] centroids in the distorted images.
-        weight: (C, M) [1/px^2] inverse variance per axis, of each camera's own errors; 0: no row.
-        own: (M, 3, 3) [1/m^2] inverse covariance of what is wrong with the marker itself.
-        point: (M, 3) [m] measured places, rig frame.
-        information: (M, 3, 3) [1/m^2] their inverse covariances.
-        placed: (M,) whether there is a POINT row.
-        seen: (M,) whether there is any row.
-        rays: (M,) how many rays; of a POINT row two.
-    """
-
-    uv: Float
-    weight: Float
-    own: Float
-    point: Float
-    information: Float
-    triangulated: Bool
-    seen: Bool
-    rays: Int
+    uv: Float  # (C, M, 2) [px] centroids in the distorted images
+    weight: Float  # (C, M) [1/px^2] inverse variance per axis, of each camera's own errors; 0: no row
+    own: Float  # (M, 3, 3) [1/m^2] inverse covariance of what is wrong with the marker itself
+    point: Float  # (M, 3) [m] measured places, rig frame
+    information: Float  # (M, 3, 3) [1/m^2] their inverse covariances
+    triangulated: Bool  # (M,) whether there is a POINT row
+    seen: Bool  # (M,) whether there is any row
+    rays: Int  # (M,) how many rays; of a POINT row two
 
     @classmethod
     def empty(cls, cameras: int, markers: int) -> "Observations":
@@ -274,17 +209,10 @@ def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: F
 def marker_rows(
     cameras: CameraArrays, observed: Observations, m: int, point: Float, work: Scratch
 ) -> tuple[float, float]:
-    """Write information and gradient of one marker by its place.
+    """Write information `work.H` (3, 3) and gradient `work.g` (3,) of marker m.
 
-    They go to work.H (3, 3) and work.g (3,).
-
-    Args:
-        cameras, observed, m: What is seen of which marker.
-        point: (3,) [m] where the hand has the marker, rig frame.
-        work: Written.
-
-    Returns:
-        Half chi square, and chi square of the place alone: without what rays that do not meet have between them.
+    `point` (3,): where the hand has it. Returns half chi square, and chi square of the place alone: without
+    what rays that do not meet have between them.
     """
     H, g, K, gain, left = work.H, work.g, work.K, work.gain, work.left
     cost = 0.0
@@ -330,14 +258,10 @@ def marker_rows(
 
 @kernel
 def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed: Observations) -> None:
-    """Write the RAY rows of a hand's markers.
+    """Write the RAY rows of a hand's markers (M,) among A of the rig.
 
-    Args:
-        uv: (C, A, 2) [px] of all markers of the rig; NaN: not seen.
-        variance: (C, A) [px^2] of each camera's own errors.
-        own: (A, 3, 3) [m^2] covariance of what is wrong with each marker itself.
-        markers: (M,) which of them are the hand's.
-        observed: Written.
+    `uv` (C, A, 2) [px]; NaN: not seen. `variance` (C, A) [px^2] of each camera's own errors, `own` (A, 3, 3)
+    [m^2] of what is wrong with each marker itself.
     """
     zero = np.zeros((3, 3))
     for k in range(markers.shape[0]):
@@ -354,12 +278,9 @@ def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed:
 
 @kernel
 def observe_points(point: Float, cov: Float, own_m2: float, observed: Observations) -> None:
-    """Write POINT rows.
+    """Write POINT rows of points (M, 3) [m] and cov (M, 3, 3) [m^2]; NaN: not seen.
 
-    Args:
-        point, cov: (M, 3) [m], (M, 3, 3) [m^2]; NaN: not seen.
-        own_m2: Variance of what is wrong with the markers themselves.
-        observed: Written.
+    `own_m2`: variance of what is wrong with the markers themselves.
     """
     own = np.zeros((3, 3))
     for i in range(3):
@@ -381,9 +302,7 @@ def observe_points(point: Float, cov: Float, own_m2: float, observed: Observatio
 
 @inlined
 def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
-    """Write the derivative (3, 3) of a rotation vector by a small rotation.
-
-    The rotation vector is (3,); the small rotation is applied in front of it (from the left).
+    """Write a rotation vector's derivative (3, 3) by a small rotation in front.
 
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
@@ -402,12 +321,11 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
 
 @inner
 def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
-    """Write the palm's rotation as other sensors measure it.
+    """Write the palm's rotation by other sensors, and its derivative by the extras.
 
-    The rotation goes to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
-
-    By an IMU on the forearm it is  exp(axes . (tilt, heading less its prior)) forearm R_y(deviation) R_x(flexion),
-    and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
+    To `search.palm` (3, 3) and `extras_jacobian` (5, 3). By an IMU on the forearm it is exp(axes . (tilt,
+    heading less its prior)) forearm R_y(deviation) R_x(flexion), and extras are tilt 2, heading, flexion,
+    deviation; by one on the palm itself it is `forearm`, which none turns.
     """
     R, extras_jacobian, F = search.palm_straight, search.extras_jacobian, epoch_prior.forearm
     if epoch_prior.on_forearm[0] == 0.0:
@@ -429,9 +347,9 @@ def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
 
 @inner
 def contrary(epoch_prior: EpochPrior, T: Float, z: Float, search: Search) -> float:
-    """Return the chi-square of a palm against its rotation by other sensors.
+    """Return chi square of a palm against its rotation by other sensors.
 
-    The chi-square of the extras' deviation from their prior, by which they accommodated the palm, is included.
+    That of the extras' deviation from their prior, by which they accommodated the palm, is included.
     """
     sensed_palm(epoch_prior, z, search)
     rotation_between(T, search.palm, search.J, search.q)
@@ -493,10 +411,7 @@ def _column(n: int, a: int) -> int:
 
 @inlined
 def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
-    """Write R (3, 3) rotated by a small rotation vector (3,).
-
-    The rotation is applied in front (from the left), to second order.
-    """
+    """Write R (3, 3) turned in front by a small vector (3,), to second order."""
     x, y, z = rotation[0], rotation[1], rotation[2]
     for j in range(3):
         a, b, c = R[0, j], R[1, j], R[2, j]
@@ -517,10 +432,7 @@ def finger_rows(
     normal: Float,
     search: Search,
 ) -> float:
-    """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
-
-    `search.palm_camera` and `search.wrist_axes` are those of the bend.
-    """
+    """Add the rows of finger f at `search.rows.angles`; return their cost."""
     hand, lines_of_sight, work, surface = rig.hand, epoch_prior.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
     count, base = hand.first[f + 1] - start, 6 + n

@@ -1,24 +1,13 @@
 """Cameras and a wrist device measure a hand; here they are flat arrays.
 
-Cameras of a rig as flat arrays, with kernels to project and undistort.
+A pixel is the ray r = (x, y, 1) through its undistorted point; it meets the laser plane n . X = c at X = c r
+/ (n . r) (Digits, UIST 2012: triangulation by one camera and a plane of light). The plane is seen at a flat
+angle, so one pixel is many times longer along it than across; the covariance carries that.
 
-Project also gives derivatives.
-
-Intersections of rays with the laser plane, with their uncertainty.
-
-It also gives coordinates in that plane.
-
-A pixel is the ray r = (x, y, 1) through its undistorted point; it meets the plane n . X = c at X = c r / (n . r)
-(Digits, UIST 2012: triangulation by one camera and a plane of light). The plane is seen at a flat angle, so one pixel
-is many times longer along it than across; the covariance carries that.
-
-A wrist device and its hand as flat arrays for kernels.
-
-Also what the device saw of the five fingers.
-
-To the noise of what is seen comes what the model of the hand does not know: skin whose thickness is not that of this
-person, what calibration leaves of plane and palm, and the part of the line that is not seen. The centroid of a line
-shorter than expected is off across by up to half of what is missing, and by a third of that along, as skin curves away.
+To the noise of what a wrist device sees comes what the model of the hand does not know: the thickness of this
+person's skin, what calibration leaves of plane and palm, and the part of the line that is not seen. The
+centroid of a line shorter than expected is off across by up to half of what is missing, and by a third of
+that along, as skin curves away.
 """
 
 from collections.abc import Sequence
@@ -33,30 +22,21 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import intersect_plane
 from common.hand.model import Fingertips
 from common.hand.skin import PLACES, SPREAD, PalmarSurface
-from common.kernels import filled, inlined, inner, kernel, record
+from common.kernels import inlined, inner, kernel
+from common.records import filled, record
 from master.rig.wrist import WristSetup
 
 
 class CameraArrays(NamedTuple):
-    """C cameras of the pinhole model with five distortion coefficients.
+    """C cameras of the pinhole model with five distortion coefficients."""
 
-    Attributes:
-        R: (C, 3, 3) rotations rig -> camera.
-        t: (C, 3) [m], so that a point of the camera's frame is R X + t.
-        centre: (C, 3) [m] optical centres, rig frame.
-        focal: (C, 2) [px] fx, fy.
-        principal: (C, 2) [px] cx, cy.
-        distortion: (C, 5) k1, k2, p1, p2, k3.
-        scale: (C,) [px] of a step of one in the normalised image, the mean of both axes.
-    """
-
-    R: Float
-    t: Float
-    centre: Float
-    focal: Float
-    principal: Float
-    distortion: Float
-    scale: Float
+    R: Float  # (C, 3, 3) rotations rig -> camera
+    t: Float  # (C, 3) [m], so that a point of the camera's frame is R X + t
+    centre: Float  # (C, 3) [m] optical centres, rig frame
+    focal: Float  # (C, 2) [px] fx, fy
+    principal: Float  # (C, 2) [px] cx, cy
+    distortion: Float  # (C, 5) k1, k2, p1, p2, k3
+    scale: Float  # (C,) [px] of a step of one in the normalised image, the mean of both axes
 
     @classmethod
     def of(cls, cameras: Sequence[CameraModel]) -> "CameraArrays":
@@ -76,16 +56,9 @@ class CameraArrays(NamedTuple):
 
 @inlined
 def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
-    """Write where camera c sees a point, and how that moves with it.
+    """Write where camera c sees a point (3,) [m], rig frame, and J (2, 3) [px/m].
 
-    Args:
-        cameras, c: The camera.
-        point: (3,) [m], rig frame.
-        uv: Written: (2,) [px], distorted image.
-        J: Written: (2, 3) [px/m], by the point.
-
-    Returns:
-        Whether the point is in front of the camera; else nothing is written.
+    `uv` (2,) [px], distorted image. False: the point is behind the camera, nothing is written.
     """
     x = cameras.t[c, 0]
     y = cameras.t[c, 1]
@@ -124,16 +97,7 @@ def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) ->
 
 @inlined
 def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> bool:
-    """Write the normalised image point (x/z, y/z) of a pixel, by Newton's method.
-
-    Args:
-        cameras, c: The camera.
-        u, v: [px], distorted image.
-        out: Written: (2,).
-
-    Returns:
-        Whether it is found; beyond where the lens folds the image over there is none.
-    """
+    """Write a pixel's normalised point (2,), by Newton; False: the lens folds there."""
     k1, k2, p1, p2, k3 = (
         cameras.distortion[c, 0],
         cameras.distortion[c, 1],
@@ -174,31 +138,20 @@ _AROUND_PX = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserPoints:
-    """Points on the plane.
+    """Points on the plane."""
 
-    Attributes:
-        point_m: (N, 3) [m], camera frame; NaN: not seen, or the ray does not meet the plane in front of the camera.
-        cov_m2: (N, 3, 3) [m^2], of rank two.
-    """
-
-    point_m: Float
-    cov_m2: Float
+    point_m: Float  # (N, 3) [m], camera frame; NaN: not seen, or the ray meets no plane before the camera
+    cov_m2: Float  # (N, 3, 3) [m^2], of rank two
 
 
 def in_image(setup: WristSetup, uv: Float, sigma_px: Float) -> Bool:
-    """Return which pixels (N, 2) can have been seen (N,).
-
-    They must be in the image, and their standard deviations (N,) not beyond it.
-    """
+    """Return which pixels (N, 2) lie in the image, their sigmas (N,) not beyond it."""
     size = np.array([setup.optics.width_px, setup.optics.height_px])
     return ((uv >= -0.5) & (uv <= size - 0.5)).all(axis=1) & (sigma_px <= size.max())
 
 
 def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:
-    """Return the points on the laser plane behind pixels (N, 2).
-
-    The pixels are of the distorted image, of standard deviations (N,) [px].
-    """
+    """Return the points on the laser plane behind pixels (N, 2), distorted image."""
     rays = setup.optics.ray(uv[:, None] + _AROUND_PX)
     found = intersect_plane(np.zeros(3), rays, setup.normal, setup.offset_m)
     by_pixel = (found[:, 1::2] - found[:, 2::2]) * (sigma_px / (2.0 * _STEP_PX))[:, None, None]
@@ -209,17 +162,10 @@ def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneAxes:
-    """Two axes in the laser plane, from where its light comes.
+    """Axes in the laser plane: across (image right), along (away from the camera)."""
 
-    They are across (image right) and along (away from the camera).
-
-    Attributes:
-        origin_m: (3,) [m], camera frame.
-        axes: (2, 3) unit vectors.
-    """
-
-    origin_m: Float
-    axes: Float
+    origin_m: Float  # (3,) [m] where the light comes from, camera frame
+    axes: Float  # (2, 3) unit vectors
 
     @classmethod
     def of(cls, setup: WristSetup) -> "PlaneAxes":
@@ -248,39 +194,21 @@ _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0
 
 
 class Device:
-    """Geometry of a wrist device mounted before its hand.
+    """Geometry of a wrist device mounted before its hand [m], camera frame."""
 
-    Lengths are in metres, in the camera frame unless stated otherwise.
-
-    Attributes:
-        palm: (4, 4) that of a straight wrist.
-        laser_m: (3,) where the laser's light comes from, in its plane.
-        plane: (3, 3) unit vectors across and along the plane, and its normal.
-        offset: (1,) the plane is normal . X = offset.
-        focal: (1,) [px].
-        before: (1,) on which side of the plane the wrist lies, 1 or -1.
-        radius: (5, 8) of the spheres of the skin, finger by sphere.
-        deep: (5, 8) how far behind the bone their centres lie, dorsally.
-        local: (5, 8, 3) their centres in the frames of their bones' joints.
-        back: (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint.
-        tip: (5, 3) fingertip in the frame of the last joint but the tip.
-        surface2: (5,) [m^2] variance of the skin's distance from the bone.
-        tip2: (5,) [m^2] variance of where the skin ends.
-    """
-
-    palm: Float
-    laser_m: Float
-    plane: Float
-    offset: Float
-    focal: Float
-    before: Float
-    radius: Float
-    deep: Float
-    local: Float
-    back: Float
-    tip: Float
-    surface2: Float
-    tip2: Float
+    palm: Float  # (4, 4) that of a straight wrist
+    laser_m: Float  # (3,) where the laser's light comes from, in its plane
+    plane: Float  # (3, 3) unit vectors across and along the plane, and its normal
+    offset: Float  # (1,) the plane is normal . X = offset
+    focal: Float  # (1,) [px]
+    before: Float  # (1,) on which side of the plane the wrist lies, 1 or -1
+    radius: Float  # (5, 8) of the spheres of the skin, finger by sphere
+    deep: Float  # (5, 8) how far behind the bone their centres lie, dorsally
+    local: Float  # (5, 8, 3) their centres in the frames of their bones' joints
+    back: Float  # (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint
+    tip: Float  # (5, 3) fingertip in the frame of the last joint but the tip
+    surface2: Float  # (5,) [m^2] variance of the skin's distance from the bone
+    tip2: Float  # (5,) [m^2] variance of where the skin ends
 
     @classmethod
     def of(cls, setup: WristSetup) -> "Device":
@@ -324,12 +252,10 @@ class Device:
         """Scratch of the same shape, of a rig without wrist device."""
         return record(
             cls,
+            **dict.fromkeys(("offset", "focal", "before"), 1),
             palm=(4, 4),
             laser_m=3,
             plane=(3, 3),
-            offset=1,
-            focal=1,
-            before=1,
             radius=(5, 8),
             deep=(5, 8),
             local=(5, 8, 3),
@@ -341,56 +267,33 @@ class Device:
 
 
 class LinesOfSight:
-    """What one strobe cycle shows of five fingers, as rows.
+    """What one strobe cycle shows of five fingers, as rows; rays are (x, y, 1)."""
 
-    x, y are those of undistorted rays (x, y, 1).
-
-    Attributes:
-        lit: (5,) 1 where a laser point is a row, and `shown` (5,) where a fingertip is.
-        laser: (5, 2) laser points x, y, and `laser_W` (5, 2, 2) their information.
-        lack: (5, 2) what the ridge lacks there to the exact cut (`master.estimator.finger_surface`), x, y.
-        laser_px: (5,) length of the line [px]; 0: not known.
-        tip: (5, 2) fingertips x, y, and `tip_W` (5, 2, 2) their information.
-        depth: (5,) logarithm of their distance by light, in a unit of its own, and `depth_w2` (5,) how sure; 0: none.
-        teaches: (5,) 1 where a finger constrains how its hinges are rolled.
-        laser_s, tip_s: (1,) how much later than the epoch laser points and fingertips were seen.
-        rows: (1,) whether there is any row.
-    """
-
-    lit: Float
+    lit: Float  # (5,) 1 where a laser point is a row, and `shown` where a fingertip is
     shown: Float
-    laser: Float
+    laser: Float  # (5, 2) laser points x, y, and `laser_W` (5, 2, 2) their information
     laser_W: Float
-    lack: Float
-    laser_px: Float
-    tip: Float
+    lack: Float  # (5, 2) x, y that the ridge lacks there to the exact cut (`finger_surface`)
+    laser_px: Float  # (5,) length of the line [px]; 0: not known
+    tip: Float  # (5, 2) fingertips x, y, and `tip_W` (5, 2, 2) their information
     tip_W: Float
-    depth: Float
-    depth_w2: Float
-    teaches: Float
-    laser_s: Float
+    depth: Float  # (5,) logarithm of their distance by light, in a unit of its own
+    depth_w2: Float  # (5,) how sure; 0: none
+    teaches: Float  # (5,) 1 where a finger constrains how its hinges are rolled
+    laser_s: Float  # (1,) how much later than the epoch the laser points were seen, as `tip_s` the tips
     tip_s: Float
-    rows: Float
+    rows: Float  # (1,) whether there is any row
 
     @classmethod
     def empty(cls) -> "LinesOfSight":
         """Nothing is seen."""
         return record(
             cls,
-            lit=5,
-            shown=5,
-            laser=(5, 2),
+            **dict.fromkeys(("lit", "shown", "laser_px", "depth", "depth_w2", "teaches"), 5),
+            **dict.fromkeys(("laser", "lack", "tip"), (5, 2)),
+            **dict.fromkeys(("laser_s", "tip_s", "rows"), 1),
             laser_W=(5, 2, 2),
-            lack=(5, 2),
-            laser_px=5,
-            tip=(5, 2),
             tip_W=(5, 2, 2),
-            depth=5,
-            depth_w2=5,
-            teaches=5,
-            laser_s=1,
-            tip_s=1,
-            rows=1,
         )
 
 
@@ -403,12 +306,9 @@ def inverse_2(a: float, b: float, c: float, out: Float) -> None:
 
 @inner
 def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
-    """Reduce the information (2, 2) of two rows by the uncertainty of wrist flexion.
+    """Reduce the information W (2, 2) of two rows by the uncertain wrist flexion.
 
-    Args:
-        W: Changed.
-        J: (5, 7) derivatives of what is seen, with those by the bend last, and `row` the first of the two.
-        cov: (K, K) of the extras.
+    `J` (5, 7): derivatives by the bend last; `row`: the first of the two; `cov` (K, K) of the extras.
     """
     det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
@@ -425,18 +325,9 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
 def loosen_short(
     device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
 ) -> bool:
-    """Reduce the information of a laser point on a partly hidden line.
+    """Take from a laser point's information what a partly hidden line leaves open.
 
-    What the point does not constrain of a line that is hidden in part is removed from its information.
-
-    Args:
-        device, sights: `LinesOfSight.laser_W` is changed.
-        f: Finger.
-        length_px: The line's, were all of it seen.
-        point, A: (3,), (2, 2) room.
-
-    Returns:
-        Whether the line is that short.
+    Changes `laser_W`; `length_px` is the line's, were all of it seen. Returns whether the line is that short.
     """
     seen_px = lines_of_sight.laser_px[f]
     x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
@@ -458,10 +349,7 @@ def loosen_short(
 
 @inner
 def on_plane(device: Any, x: float, y: float, out: Float, A: Float) -> bool:
-    """Intersect the ray (x, y, 1) with the laser plane.
-
-    Writes the intersection (3,) [m], and the derivatives (2, 2) of x, y by the plane's axes.
-    """
+    """Write where the ray (x, y, 1) meets the plane (3,) [m]; A (2, 2): d(x, y)/axes."""
     n = device.plane[2]
     towards = n[0] * x + n[1] * y + n[2]
     far = device.offset[0] / towards
@@ -488,17 +376,9 @@ def observe_wrist(
     tip_s: float,
     boxed_out: Any,
 ) -> None:
-    """Write the rows of a strobe cycle.
+    """Write the rows of a strobe cycle, with arguments as of `WristRows`.
 
-    Args:
-        boxed_device: (1,) `Device`.
-        laser, tip: (5, 2) x, y of undistorted rays; NaN: not seen.
-        laser_sigma_px, tip_sigma_px: (5,) their standard deviations per axis.
-        laser_px: (5,) lengths of the lines.
-        tip_depth: (5,) distances of the tips by light.
-        depth_sigma: Standard deviation of their logarithms; 0: they are not used.
-        laser_s, tip_s: How much later than the epoch laser points and tips were seen.
-        boxed_out: (1,) `LinesOfSight`, written.
+    `depth_sigma`: standard deviation of the logarithms of `tip_depth`; 0: they are not used.
     """
     device, out = boxed_device[0], boxed_out[0]
     point, A = np.zeros(3), np.zeros((2, 2))
@@ -534,9 +414,7 @@ def observe_wrist(
 
 @inner
 def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
-    """Write the palm (4, 4) of a flexed wrist.
-
-    Also writes the axes (2, 3) of flexion and deviation.
+    """Write the palm (4, 4) of a flexed wrist, and axes (2, 3) of its two bends.
 
     F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.hand.wrist`).
     """

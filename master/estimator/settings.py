@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple, Self, get_type_hints
 import numpy as np
 
 from common.errors import CalibrationError
-from common.kernels import filled
+from common.records import filled
 
 _HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
 _COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"
@@ -20,13 +20,7 @@ _CHI = "quantile of chi square"
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """What a setting may be.
-
-    Attributes:
-        unit: Of the value.
-        low, high: Least and most.
-        source: Where the value is from.
-    """
+    """What a setting may be, and where the value is from."""
 
     unit: str
     low: float

@@ -1,48 +1,26 @@
 """The 1 € filter smooths the solved hand, and a blend covers leaps.
 
-Blending of a hand over jumps that are no motion.
+**Signals.** Position and rotation of the palm and the angles go through one filter
+(`master.fabrik.one_euro`), the palm and each finger as a group. All 26 signals are in metres, so that the
+rig's settings mean for the hand what they mean for points: an angle counts by how far it moves the end of its
+finger, the rotation by the ends of the fingers. The palm's position is that of its middle knuckle: at the
+wrist the noise of the rotation would shake it as well. A rotation is the sum of the filter's own steps and
+the rotation vector from there to what was solved, so it is never near half a turn. Joints come from forward
+kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the PIP, what is filtered
+is by how much it does not.
 
-The hand is watched by several kinds of sensors. It is blended part by part: the palm and each finger.
+**Noise.** The variance of each signal is measured while it runs and is at most that of the markers it rests
+on: neither the markers' nor the solution's covariance states what is new in each frame.
 
-Such a hand is solved elsewhere from one epoch to the next whenever another marker is seen or one less, when another
-sensor measures a finger, and when what is measured without markers jumps. What is shown goes on as the hand moves,
-and all that leads elsewhere is led in, no faster than a given speed.
+**Leaps.** What is seen again, or by another sensor, is elsewhere than it was held. The difference between
+what was shown last and what is solved now fades within a tenth of a second, as networked games lead a player
+over: the motion goes on, the error goes. Meanwhile the covariance of a joint contains the square of how far
+it is shown off; otherwise it is the solution's. A hand that its tracker reports as wrong a moment ago is
+shown at once, and the filter begins anew.
 
-How the hand moves meanwhile is estimated without solving it: the palm goes as those markers on its back go that are in
-both epochs, and everything else at half the speed at which it was shown.
-
-Kernel of the filter of the solved hand, and its memory.
-
-`master.estimator.smoothing` has the law.
-
-Smooth the solved hand by the rig's 1 € filter, and blend over leaps.
-
-**Signals.** Position and rotation of the palm and the angles go through one filter (`master.fabrik.one_euro`), the
-palm and each finger as a group. All 26 signals are in metres, so that the rig's settings mean for the hand what they
-mean for points: an angle counts by how far it moves the end of its finger, the rotation by how far it moves the ends of
-the fingers. The palm's position is that of its middle knuckle, about which its rotation is unsure: at the wrist the
-noise of the rotation would shake the position as well. A rotation is filtered as the sum of the filter's own steps and
-the rotation vector from there to what was solved, so it is never near half a turn.
-
-**Noise.** The variance of each signal is measured while it runs (`master.fabrik.one_euro`) and is at most that of the
-markers it rests on. A solved pose is steadier than its markers in one pose and less steady in another, as its priors
-hold it, and its covariance contains errors that stay; neither states what is new in each frame.
-
-The joints come from forward kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the
-PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
-limits; what has to be cut is an abduction that the filtered flexion does not allow.
-
-**Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held; and where another sensor takes over
-from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
-solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
-the server has it: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
-of how far it is shown from where it is solved to be; one whose region is too large now is not tracked.
-
-A hand that was wrong a moment ago, as its tracker reports, is shown at once where it is, and the filter begins anew.
-
-A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.smoothing` has it.
-
-Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
+**Blend.** A hand that several kinds of sensors watch leaps more often. Palm and fingers are led in no faster
+than a given speed. How it moves meanwhile is estimated without solving it: the palm goes as those markers on
+its back that are in both epochs, and everything else at half the speed at which it was shown.
 """
 
 from dataclasses import replace
@@ -53,9 +31,10 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.hand.model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
-from common.kernels import bound, boxed, constant, fields, inner, kernel, record
+from common.kernels import bound, constant, inner, kernel
+from common.records import boxed, fields, record
 from master.estimator.covariance import is_small
-from master.estimator.epoch import Fitted, FittedHand
+from master.estimator.epoch import Fitted
 from master.estimator.kinematics import (
     Scratch,
     chains,
@@ -77,16 +56,10 @@ PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> fing
 
 
 class Blend:
-    """Push machine that holds the offsets that remain of jumps.
-
-    It also holds the sources the hand was based on, its markers and its speed.
-    """
+    """Push machine that holds what is left of jumps, by palm and finger."""
 
     def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
-        """Blend each part no faster than a speed [m/s].
-
-        `on_palm` (M,) marks which markers sit on the back.
-        """
+        """Blend no faster than a speed [m/s]; `on_palm` (M,): markers on the back."""
         self._blend_m_s, self._on_palm = blend_m_s, on_palm
         self._offset, self._speed = np.zeros(26), np.zeros(26)
         self._sources = np.zeros(6, np.int64)
@@ -95,13 +68,8 @@ class Blend:
     def push(self, gap_s: float, sources: Int, shown: Float, solved: Float, points_m: Float) -> Float:
         """Return the offset to be added to the solved signals (26,) [m].
 
-        The signals are those of `master.estimator.smoothing`.
-
-        Args:
-            gap_s: Time since the last; 0: there is none.
-            rests: (6,) as of `Fitted`.
-            shown, solved: (26,) what was shown last, what is solved now.
-            points_m: (M, 3) the markers; NaN: not seen.
+        `gap_s`: since the last; 0: there is none. `sources` (6,) as of `Fitted`; `shown`, `solved` (26,):
+        what was shown last, what is solved now; `points_m` (M, 3) the markers; NaN: not seen.
         """
         if gap_s > 0.0:
             # of it: a motion that is not seen any more rather ends than goes on
@@ -137,16 +105,13 @@ WHOLE, SIGNALS, REST = constant(0), constant(1), constant(2)
 
 
 class Pose(NamedTuple):
-    """Pose of a hand: palm, angles, joints and covariances.
+    """Pose of a hand: palm, angles, joints and covariances."""
 
-    They are palm (4, 4), angles (5, 4) [rad], joints (26, 3) [m], (26, 3, 3), and their covariances (26, 3, 3) [m^2].
-    """
-
-    palm: Float
-    angles: Float
-    position: Float
-    rotation: Float
-    cov: Float
+    palm: Float  # (4, 4)
+    angles: Float  # (5, 4) [rad]
+    position: Float  # (26, 3) [m]
+    rotation: Float  # (26, 3, 3)
+    cov: Float  # (26, 3, 3) [m^2]
 
     @classmethod
     def empty(cls) -> "Pose":
@@ -159,46 +124,30 @@ class Smoothing:
     """What was shown last, the filter of its 26 signals, and what is left of leaps.
 
     The signals are place (3), turn (3), angles (5, 4), all [m].
-
-    Attributes:
-        t_ns: (1,) when; NEVER_NS: there is no hand.
-        rests: (6,) what the fingers, and the palm, rested on: `Fitted.sources`.
-        values: (26,) [m] the filtered signals.
-        palm: (4, 4) as filtered.
-        offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
-        since_ns: (6,) when that was, and `until_ns` (1,) when nothing is left of any.
-        count, dt_s, past: The measured noise (`master.fabrik.one_euro.measure`).
-        x, speed, seen_ns: The filter (`master.fabrik.one_euro.filter_step`), and `filter` (5,) its settings.
-        part: (26,) finger of each signal, PALM_PART: the palm.
-        marker_of: (5,) marker of each finger; -1: there is none.
-        knuckle: (3,) [m] the place in the palm frame.
-        across: (1,) [m/rad] by how much a turn counts, and `reach` (20,) the angles.
-        dip_per_pip: (1,) how the DIP follows the PIP.
-        blend_s: (1,) in which leaps fade, and `tracked_m` (1,) how large the region of a tracked joint may be.
     """
 
-    t_ns: Int
-    sources: Int
-    values: Float
-    palm: Float
-    offset: Float
-    since_ns: Int
-    until_ns: Int
-    count: Int
+    t_ns: Int  # (1,) when; NEVER_NS: there is no hand
+    sources: Int  # (6,) what the fingers, and the palm, rested on: `Fitted.sources`
+    values: Float  # (26,) [m] the filtered signals
+    palm: Float  # (4, 4) as filtered
+    offset: Float  # (26,) [m] what was shown less what was solved, when each part was last seen again
+    since_ns: Int  # (6,) when that was
+    until_ns: Int  # (1,) when nothing is left of any
+    count: Int  # with `dt_s`, `past`: the measured noise (`master.fabrik.one_euro.measure`)
     dt_s: Float
     past: Float
-    x: Float
+    x: Float  # with `speed`, `seen_ns`: the filter (`master.fabrik.one_euro.filter_step`)
     speed: Float
     seen_ns: Int
-    filter: Float
-    part: Int
-    marker_of: Int
-    knuckle: Float
-    across: Float
-    reach: Float
-    dip_per_pip: Float
-    blend_s: Float
-    tracked_m: Float
+    filter: Float  # (5,) its settings
+    part: Int  # (26,) finger of each signal, PALM_PART: the palm
+    marker_of: Int  # (5,) marker of each finger; -1: there is none
+    knuckle: Float  # (3,) [m] the place in the palm frame
+    across: Float  # (1,) [m/rad] by how much a turn counts
+    reach: Float  # (20,) [m/rad] the angles
+    dip_per_pip: Float  # (1,) how the DIP follows the PIP
+    blend_s: Float  # (1,) in which leaps fade
+    tracked_m: Float  # (1,) how large the region of a tracked joint may be
     signals: Float  # (26,) [m] as solved, and what is left of leaps
     largest: Float  # (26,) room
     noise: Float  # (26,) room
@@ -248,7 +197,6 @@ class Smoothing:
 
 @inner
 def _write_signals(state: Smoothing, solved: Pose) -> None:
-    """Write the signals of a solved hand."""
     T, angles = solved.palm, solved.angles
     rotation = state.work.g
     rotation_between(T, state.palm, state.work.K, rotation)
@@ -265,10 +213,7 @@ def _write_signals(state: Smoothing, solved: Pose) -> None:
 
 @inner
 def _blend(state: Smoothing, t_ns: int, sources: Int) -> bool:
-    """Add what is left of leaps to the signals; return whether anything is.
-
-    What is seen again leaps now; without frames, nothing was seen.
-    """
+    """Add what is left of leaps to the signals; return whether anything is."""
     blend_s = state.blend_s[0]
     gap = (t_ns - state.t_ns[0]) * 1e-9 > blend_s
     for p in range(6):
@@ -288,10 +233,7 @@ def _blend(state: Smoothing, t_ns: int, sources: Int) -> bool:
 
 @inner
 def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
-    """Write variances (26,) [m^2] of the markers that each part rests on.
-
-    A finger rests on its own and the palm's; NaN: on none.
-    """
+    """Write largest variances (26,) [m^2], by own and palm's markers; NaN: none."""
     count, rotation, place = 0, 0.0, state.work.g
     for i in range(3):
         place[i] = 0.0
@@ -317,7 +259,6 @@ def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
 
 @inner
 def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> None:
-    """Write the filtered signals."""
     _write_largest(state, sources, marker_cov)
     measure(t_ns, state.signals, state.largest, state.count, state.dt_s, state.past, state.noise)
     filter_step(
@@ -336,7 +277,6 @@ def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> Non
 
 @inner
 def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
-    """Write palm, angles and joints of the filtered signals."""
     T, rotation, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
     for i in range(3):
         rotation[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
@@ -359,12 +299,7 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
 
 @inner
 def _add_offset(hand: HandTables, state: Smoothing, solved: Pose, shown: Pose, tracked: Bool) -> None:
-    """Write the covariance of the joints, widened by the display offset.
-
-    The offset is how far each joint is shown from where it is solved to be.
-
-    A region that is too large now is that of a joint that is not tracked.
-    """
+    """Widen joints' covariances by how far each is shown off; recheck `tracked`."""
     for joint in range(26):
         for i in range(3):
             for j in range(3):
@@ -387,18 +322,11 @@ def smooth(
     shown: Pose,
     tracked: Bool,
 ) -> bool:
-    """Filter one hand.
+    """Filter one hand; return whether anything was added to the solved signals.
 
-    Args:
-        boxed_hand, boxed_state: (1,) `HandTables`, `Smoothing` (`common.kernels.boxed`).
-        what: WHOLE; or SIGNALS: write the solved signals alone; or REST: filter them, with what was added to them.
-        t_ns, rests: Of the hand.
-        marker_cov: (M, 3, 3) [m^2].
-        solved, shown: The hand; `shown` is written, its covariance where anything was added.
-        tracked: (26,) as solved, changed to as shown.
-
-    Returns:
-        Whether anything was added to the solved signals.
+    `what`: WHOLE; or SIGNALS: write the solved signals alone; or REST: filter them, with what was added to
+    them. `marker_cov` (M, 3, 3) [m^2]. `shown` is written, its covariance where anything was added; `tracked`
+    (26,) is changed from as solved to as shown.
     """
     hand, state = boxed_hand[0], boxed_state[0]
     begins, added = state.t_ns[0] == NEVER_NS, what == REST
@@ -423,10 +351,7 @@ def smooth(
 
 
 class HandOneEuro:
-    """Push machine that holds the last output, the filter and jump offsets.
-
-    The offsets are what is left of leaps (`Smoothing`).
-    """
+    """Push machine that holds the last output, the filter, and what is left of leaps."""
 
     def __init__(
         self,
@@ -436,14 +361,9 @@ class HandOneEuro:
         blend_m_s: float | None = None,
         settings: Settings = DEFAULT,
     ) -> None:
-        """Set up.
+        """Set up; markers in the order of the covariances, parameters in [m, s].
 
-        Args:
-            model: The hand.
-            markers: Names of its markers in the order of the covariances.
-            parameters: Of the 1 € filter [m, s].
-            blend_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
-            settings: Of the estimator.
+        `blend_m_s`: how fast palm and fingers may be led over; None: within a tenth of a second.
 
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
@@ -466,12 +386,9 @@ class HandOneEuro:
     def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
         """Filter palm, angles and joints of a hand; the rest of it stays.
 
-        Args:
-            t_ns: The epoch; a hand that is not after the last one is passed on as it is.
-            hand: As solved. One that is not valid is passed on, and what follows begins anew.
-            cov_m2: (M, 3, 3) [m^2] noise of the markers; NaN: not measured. What rests on none is filtered by
-                the noise it shows.
-            points_m: (M, 3) [m] the markers, of a hand that other sensors watch, too; NaN: not seen.
+        A hand not after the last, or not valid, is passed on; after the latter what follows begins anew.
+        `cov_m2` (M, 3, 3) noise of the markers; NaN: not measured; what rests on none is filtered by the
+        noise it shows. `points_m` (M, 3) the markers, of a hand that other sensors watch, too; NaN: not seen.
         """
         solution, sources = hand.solution, hand.sources
         if solution is None or not hand.valid.any():
@@ -496,19 +413,11 @@ class HandOneEuro:
         off = self._kernel(self._hand, self._state, what, t_ns, sources, cov_m2, solved, shown, tracked)
         if blend is not None:
             blend.moved(gap_s, self._values - before)
-        smooth_hand = FittedHand(
+        smooth_hand = replace(
+            solution,
             T_rig_palm=shown.palm,
             angles_rad=shown.angles,
             joints=HandJoints(shown.position, shown.rotation, shown.palm),
             cov_m2=shown.cov if off else solution.cov_m2,
-            tilt_cov_rad2=solution.tilt_cov_rad2,
-            tilt_process_noise_rad2_s2=solution.tilt_process_noise_rad2_s2,
-            measurement_cov=solution.measurement_cov,
-            x=solution.x,
-            scale=solution.scale,
-            natural_weight=solution.natural_weight,
-            marker_chi2=solution.marker_chi2,
-            steps=solution.steps,
-            twist=solution.twist,
         )
         return replace(hand, solution=smooth_hand, tracked=tracked)

@@ -1,11 +1,7 @@
 """The fit minimises the residuals of one epoch under each hypothesis.
 
-Kernels of the fit of one epoch.
-
-They build normal equations, and search downhill inside the limits.
-
-Unknowns are the palm's turn and shift and the free angles (`master.estimator.kinematics`). What is minimised is half
-the sum of squares of the rows (`master.estimator.problem`) and of the priors:
+Unknowns are the palm's turn and shift and the free angles (`master.estimator.kinematics`). What is minimised
+is half the sum of squares of the rows (`master.estimator.problem`) and of the priors:
 
     posture   of one hypothesis (`master.estimator.priors`)
     own       single angles, of fingers that are curled out of sight
@@ -13,8 +9,6 @@ the sum of squares of the rows (`master.estimator.problem`) and of the priors:
     facing    the back of the hand looks towards the cameras that see a marker on it
     extras    what other sensors leave open: hinges, the wrist's bend, tilt and heading, the unit of light
     place     of a palm that stands still before a wrist device
-
-Records of a fit: a hand under each hypothesis, and both together.
 """
 
 from collections.abc import Sequence
@@ -23,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import boxed, inlined, inner, record
+from common.kernels import inlined, inner
+from common.records import boxed, record
 from master.estimator.kinematics import (
     PLACE,
     angles_of,
@@ -80,10 +75,7 @@ def past_cost(epoch_prior: EpochPrior, T: Float, x: Float, off: Float) -> float:
 
 @inlined
 def own_cost(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, x: Float) -> float:
-    """Return the cost of the posture prior and of single-angle priors.
-
-    The posture prior is that of hypothesis h; the single-angle priors are those of this epoch.
-    """
+    """Return the cost of hypothesis h's posture prior and of own angle priors."""
     cost = posture_prior.constant[h]
     for i in range(x.shape[0]):
         total = 0.0
@@ -195,19 +187,11 @@ def linearise(
     normal: Float,
     search: Search,
 ) -> float:
-    """Write gradient (N,) and Gauss-Newton normal matrix (N, N) at a hand.
+    """Write gradient (N,) and normal matrix (N, N) at a hand; return the cost.
 
-    Return the cost.
-
-    To search.marker_chi2 (M,) chi square of each marker, to search.outliers (1,) half of what non-meeting rays have
-    between them, and to search.information (M, 3, 3) what is known of each marker's place.
-
-    Args:
-        rig, posture_prior, epoch_prior, observed: What is known.
-        h: Hypothesis.
-        palm, x, z: (4, 4), (n,), (K,) the hand.
-        gradient, normal: Written.
-        search: Scratch.
+    Gauss-Newton, under hypothesis h. To search.marker_chi2 (M,) chi square of each marker, to search.outliers
+    (1,) half of what non-meeting rays have between them, to search.information (M, 3, 3) what is known of
+    each marker's place.
     """
     work = search.rows
     cost = _add_priors(posture_prior, epoch_prior, h, T, x, z, gradient, normal, search)
@@ -274,12 +258,9 @@ def _marker(
 
 @inner
 def _step(rig: Rig, x: Float, damping: float, gradient: Float, normal: Float, search: Search) -> float:
-    """Write the damped step (N,).
+    """Write the damped step (N,); return the cost's expected fall; < 0: no step.
 
     Angles that stand at a limit and are pushed outwards are omitted.
-
-    Returns:
-        By how much the cost should fall; negative: there is no step.
     """
     n, N, hand = x.shape[0], search.step.shape[0], rig.hand
     down, damped, step, held = search.down, search.damped, search.step, search.held
@@ -319,20 +300,13 @@ def descend(
     normal: Float,
     search: Search,
 ) -> tuple[float, int]:
-    """Search downhill by Levenberg-Marquardt from a hand, in place.
+    """Search downhill by Levenberg-Marquardt, in place; return cost and steps.
 
-    Return cost and steps.
-
-    The damping follows the gain ratio (Madsen, Nielsen, Tingleff, "Methods for Non-Linear Least Squares Problems",
-    2nd edition, 2004, eq. 2.21). The last step, of which an all but undamped model hopes for no more than the
-    tolerance, is taken without another linearisation.
-
-    Args:
-        rig, posture_prior, epoch_prior, observed, h: What is known, and the hypothesis.
-        tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
-        palm, x, z: (4, 4), (n,), (K,) where it begins, inside the limits, and then where it ended.
-        gradient, normal: Written: (N,), (N, N) there, or before the last step.
-        search: Scratch.
+    The damping follows the gain ratio (Madsen, Nielsen, Tingleff, "Methods for Non-Linear Least Squares
+    Problems", 2nd edition, 2004, eq. 2.21). A search ends where a step gains less than `tolerance` and that
+    `share` of the cost. The last step, of which an all but undamped model hopes for no more than the
+    tolerance, is taken without another linearisation. `gradient`, `normal` are those at the end, or before
+    the last step.
     """
     n, K, hand = x.shape[0], z.shape[0], rig.hand
     cost = linearise(rig, posture_prior, epoch_prior, observed, h, T, x, z, gradient, normal, search)
@@ -393,27 +367,17 @@ def descend(
 
 
 class Posterior:
-    """A hand by one epoch.
+    """A hand by one epoch."""
 
-    Attributes:
-        palm, x, z: (4, 4) palm, (n,) free angles, (K,) extras.
-        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras, by this epoch alone.
-        marker_chi2: (M,) chi square of each marker.
-        steps: (1,) of the search.
-        natural_weight: (1,) probability that the hand follows the posture prior.
-        scale: (1,) by how much the residual has scaled the covariance.
-        contrary: (1,) chi square of the palm against how other sensors have it turned, and of what the extras gave in.
-    """
-
-    palm: Float
-    x: Float
-    z: Float
-    cov: Float
-    marker_chi2: Float
-    steps: Float
-    natural_weight: Float
-    scale: Float
-    contrary: Float
+    palm: Float  # (4, 4)
+    x: Float  # (n,) free angles
+    z: Float  # (K,) extras
+    cov: Float  # (N, N) turn [rad], shift [m], rig axes, free angles [rad], extras, by this epoch alone
+    marker_chi2: Float  # (M,)
+    steps: Float  # (1,) of the search
+    natural_weight: Float  # (1,) probability that the hand follows the posture prior
+    scale: Float  # (1,) by how much the residual has scaled the covariance
+    contrary: Float  # (1,) chi square of the palm against other sensors, and of what the extras gave in
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Posterior":
@@ -421,23 +385,17 @@ class Posterior:
         N = 6 + n + extras
         return record(
             cls,
+            **dict.fromkeys(("steps", "natural_weight", "scale", "contrary"), 1),
             palm=(4, 4),
             x=n,
             z=extras,
             cov=(N, N),
             marker_chi2=markers,
-            steps=1,
-            natural_weight=1,
-            scale=1,
-            contrary=1,
         )
 
 
 class Blank(NamedTuple):
-    """Empty prior, used by `_onto` for a fit to points alone.
-
-    `epoch_prior`: the array that a `EpochPrior` lies in (`common.kernels.boxed`).
-    """
+    """Empty prior, in boxes, used by `_onto` for a fit to points alone."""
 
     posture_prior: PosturePrior
     epoch_prior: Any
@@ -451,29 +409,20 @@ class Blank(NamedTuple):
 
 
 class Hypothesis:
-    """A hand of N = 6 + n + K unknowns and M markers under one hypothesis.
+    """A hand of N = 6 + n + K unknowns and M markers under one hypothesis."""
 
-    Attributes:
-        palm, x, z: (4, 4), (n,), (K,) where its search ended.
-        gradient, normal: (N,), (N, N) there.
-        marker_chi2, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
-        cost, apart: (1,) half the sum of squares, and the half of what rays that do not meet have between them.
-        share: (1,) its probability.
-        step: (N,) from there to the mean within the limits, and `off` (N,) the same from the likelier hand.
-    """
-
-    palm: Float
-    x: Float
-    z: Float
-    gradient: Float
-    normal: Float
-    marker_chi2: Float
-    information: Float
-    cost: Float
-    outliers: Float
-    share: Float
-    step: Float
-    off: Float
+    palm: Float  # (4, 4) where its search ended
+    x: Float  # (n,)
+    z: Float  # (K,)
+    gradient: Float  # (N,) there
+    normal: Float  # (N, N)
+    marker_chi2: Float  # (M,)
+    information: Float  # (M, 3, 3) of the place of each marker
+    cost: Float  # (1,) half the sum of squares
+    outliers: Float  # (1,) half of what rays that do not meet have between them
+    share: Float  # (1,) its probability
+    step: Float  # (N,) from there to the mean within the limits
+    off: Float  # (N,) the same from the likelier hand
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Hypothesis":
@@ -481,18 +430,14 @@ class Hypothesis:
         N = 6 + n + extras
         return record(
             cls,
+            **dict.fromkeys(("gradient", "step", "off"), N),
+            **dict.fromkeys(("cost", "outliers", "share"), 1),
             palm=(4, 4),
             x=n,
             z=extras,
-            gradient=N,
             normal=(N, N),
             marker_chi2=markers,
             information=(markers, 3, 3),
-            cost=1,
-            outliers=1,
-            share=1,
-            step=N,
-            off=N,
         )
 
 
@@ -519,15 +464,12 @@ class Scratch:
         N, M = 6 + n + extras, markers
         return record(
             cls,
+            **dict.fromkeys(("A", "L", "work", "cov"), (N, N)),
             each=(Hypothesis.empty(n, extras, markers), 2),
             start_T=(4, 4),
             start_x=n,
             start_z=extras,
             middle=N,
-            A=(N, N),
-            L=(N, N),
-            work=(N, N),
-            cov=(N, N),
             here=(M, 3),
             there=(M, 3),
             cut=Cut.empty(n, N),

@@ -1,38 +1,29 @@
 """The state is the estimator's only memory; it predicts the next epoch.
 
-The state of a hand, the only memory of the estimator, and its prediction.
-
-A finger that is seen may be elsewhere at the next epoch by a wide random walk, so that what is seen decides. A finger
-that nobody sees moves on a little the way it was moving, and with its neighbours: fingers are moved by muscles and
-nerves that they share, so a hidden ring finger between closing neighbours closes with them (Hager-Ross, Schieber 2000,
-"Quantifying the independence of human finger movements"; Ingram, Kording, Howard, Wolpert 2008, "The statistics of
-natural hand movements"). How far it drifts from there is taken as a smooth stationary process, whose steps in a time
-have the variance (the structure function of a Gaussian correlation)
+A finger that is seen moves by a wide random walk, so that what is seen decides. One that nobody sees moves on
+a little the way it was moving, and with its neighbours, whose muscles and nerves it shares (Hager-Ross,
+Schieber 2000, "Quantifying the independence of human finger movements"; Ingram, Kording, Howard, Wolpert
+2008, "The statistics of natural hand movements"). From there it drifts as a smooth stationary process, whose
+steps in a time have the variance (the structure function of a Gaussian correlation)
 
     drift(t) = DRIFT^2 (1 - exp(-(t / DRIFT_S)^2))
 
-and the steps of two of the four fingers that are k apart correlate by ALIKE^k. So what the seen ones did since gives
-the conditional mean and variance of the hidden ones. A hand that defied it when the marker went moves its fingers
-one by one, and so does every hand its thumb.
-
-Kernels of the filtered extra unknowns that other sensors leave open.
-
-They cover how the extras go on by themselves, and what an epoch leaves.
+and the steps of two of the four fingers that are k apart correlate by ALIKE^k, which gives the conditional
+mean and variance of the hidden ones. A hand that defied it when the marker went moves its fingers one by one,
+and so does every hand its thumb. The extra unknowns that other sensors leave open are filtered:
 
     twist    of the hinges of each finger about its first bone: of the person, all but constant
-    bend     of the wrist, flexion and deviation, and their rates: motion about a posture that somebody keeps for a
-             while, a Gauss-Markov process of second order (Matern 3/2), stepped exactly (Hartikainen, Saerkkae 2010,
-             "Kalman filtering and smoothing solutions to temporal Gaussian process regression models")
+    bend     of the wrist, flexion and deviation, and their rates: Gauss-Markov of second order (Matern 3/2) about a
+             posture kept for a while, stepped exactly (Hartikainen, Saerkkae 2010, "Kalman filtering and smoothing
+             solutions to temporal Gaussian process regression models")
     tilt     what the IMU has the vertical off by, for seconds
     heading  walks as far as the IMU's drift is stated
     light    logarithm of the unit of distances by light: of the device and its subject, all but constant
 
-Wrists at work flex by a median of 1.4...54 deg/s about a median posture of -30...3 deg (43 types of work; Hansson et
-al. 2009, Int. J. Ind. Ergonomics 39, 221); most of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and
-15 of deviation (Palmer et al. 1985, J. Hand Surg. 10A, 39).
-
-The errors of an epoch are those of the last: shape, skin and hidden fingers hardly change from frame to frame. So of
-the information that it gains on what is constant only a share counts, as much as is new in that time.
+Wrists at work flex by a median of 1.4...54 deg/s about -30...3 deg (43 types of work; Hansson et al. 2009,
+Int. J. Ind. Ergonomics 39, 221); daily life takes 5 deg of flexion, 30 of extension, 10 and 15 of deviation
+(Palmer et al. 1985, J. Hand Surg. 10A, 39). The errors of an epoch are those of the last, so of the
+information that it gains on what is constant only a share counts, as much as is new in that time.
 """
 
 from math import exp, sqrt
@@ -40,7 +31,8 @@ from math import exp, sqrt
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.kernels import constant, inlined, inner, record
+from common.kernels import constant, inlined, inner
+from common.records import record
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.parameters import HandTables
 from master.estimator.problem import EpochPrior
@@ -54,59 +46,35 @@ PALM_PART = 5  # behind the five fingers
 
 
 class HandState:
-    """A hand with n free angles as the last epoch left it.
+    """A hand with n free angles as the last epoch left it."""
 
-    Attributes:
-        t_ns: (1,) when.
-        known: (1,) whether there is a hand.
-        seen_ns: (1,) when anything of it was measured last.
-        triangulated_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
-        measured_ns: (6,) when each finger, and the palm, was measured last.
-        palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
-        rates: (20,) [rad/s].
-        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
-        z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.state`).
-        z_ns: (1,) when they were stepped last, `stationary` (K,) variances to grow to, and `wrist_mean_rad` (2,) [rad]
-            the bend of the wrist that is kept.
-        solver_mode: (5,) `SolverMode` codes of what each finger was last solved from by the device; 0: markers since.
-        searched: (5,) strobe cycles since the whole cost map of a finger was searched.
-        vague: (5,) whether that was not well enough to be tracked.
-        coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.wrist_update`).
-        natural_weight: (1,) probability that it follows the posture prior.
-        speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing measures where it is.
-        hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
-        then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
-        then_alike: (5,) how neighbours correlated then.
-        measured_rotation: (3, 3) of the palm by other sensors, and `measured_rotation_known` (1,) if measured.
-    """
-
-    t_ns: Int
-    known: Bool
-    seen_ns: Int
-    triangulated_ns: Int
-    measured_ns: Int
-    palm: Float
-    x: Float
-    angles: Float
-    rates: Float
-    cov: Float
-    z: Float
-    z_cov: Float
-    z_ns: Int
-    stationary: Float
-    wrist_mean_rad: Float
-    solver_mode: Code
-    searched: Int
-    vague: Bool
-    coupling: Float
-    natural_weight: Float
-    speed: Float
-    lost_s: Float
-    hidden_ns: Int
-    then: Float
-    then_rates: Float
-    then_alike: Float
-    measured_rotation: Float
+    t_ns: Int  # (1,) when
+    known: Bool  # (1,) whether there is a hand
+    seen_ns: Int  # (1,) when anything of it was measured last
+    triangulated_ns: Int  # (1,) when two cameras, or a depth law, placed a marker of it last
+    measured_ns: Int  # (6,) when each finger, and the palm, was measured last
+    palm: Float  # (4, 4)
+    x: Float  # (n,) free angles [rad]
+    angles: Float  # (20,) all angles [rad]
+    rates: Float  # (20,) [rad/s]
+    cov: Float  # (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras
+    z: Float  # (K,) mean of the extras, which are filtered
+    z_cov: Float  # (K, K)
+    z_ns: Int  # (1,) when they were stepped last
+    stationary: Float  # (K,) variances to grow to
+    wrist_mean_rad: Float  # (2,) [rad] the bend of the wrist that is kept
+    solver_mode: Code  # (5,) `SolverMode` codes of a finger's last solution by the device; 0: markers since
+    searched: Int  # (5,) strobe cycles since the whole cost map of a finger was searched
+    vague: Bool  # (5,) whether that was not well enough to be tracked
+    coupling: Float  # (3,) sums of what was learnt of MCP and PIP (`master.estimator.wrist_update`)
+    natural_weight: Float  # (1,) probability that it follows the posture prior
+    speed: Float  # (1,) [m/s] of the palm
+    lost_s: Float  # (1,) how long nothing measures where it is
+    hidden_ns: Int  # (5,) when a finger hidden at the last epoch was seen last; NEVER_NS: seen there
+    then: Float  # (5, 20) the angles of the whole hand at that time
+    then_rates: Float  # (5, 20) [rad/s]
+    then_alike: Float  # (5,) how neighbours correlated then
+    measured_rotation: Float  # (3, 3) of the palm by other sensors
     measured_rotation_known: Bool
 
     @classmethod
@@ -115,34 +83,23 @@ class HandState:
         N = 6 + n + extras
         state = record(
             cls,
-            t_ns=("i8", 1),
-            known=("u1", 1),
-            seen_ns=("i8", 1),
-            triangulated_ns=("i8", 1),
+            **dict.fromkeys(("t_ns", "seen_ns", "triangulated_ns", "z_ns"), ("i8", 1)),
+            **dict.fromkeys(("searched", "hidden_ns"), ("i8", 5)),
+            **dict.fromkeys(("known", "measured_rotation_known"), ("u1", 1)),
+            **dict.fromkeys(("solver_mode", "vague"), ("u1", 5)),
+            **dict.fromkeys(("natural_weight", "speed", "lost_s"), 1),
+            **dict.fromkeys(("angles", "rates"), 20),
+            **dict.fromkeys(("then", "then_rates"), (5, 20)),
+            **dict.fromkeys(("z", "stationary"), extras),
             measured_ns=("i8", 6),
             palm=(4, 4),
             x=n,
-            angles=20,
-            rates=20,
             cov=(N, N),
-            z=extras,
             z_cov=(extras, extras),
-            z_ns=("i8", 1),
-            stationary=extras,
             wrist_mean_rad=2,
-            solver_mode=("u1", 5),
-            searched=("i8", 5),
-            vague=("u1", 5),
             coupling=3,
-            natural_weight=1,
-            speed=1,
-            lost_s=1,
-            hidden_ns=("i8", 5),
-            then=(5, 20),
-            then_rates=(5, 20),
             then_alike=5,
             measured_rotation=(3, 3),
-            measured_rotation_known=("u1", 1),
         )
         for never in (
             state.t_ns,
@@ -158,19 +115,12 @@ class HandState:
 
 
 class Hidden:
-    """Prediction of fingers that nobody sees.
+    """Prediction of fingers that nobody sees."""
 
-    Attributes:
-        angles: (20,) [rad]; those of fingers that are seen mean nothing.
-        sigma: (20,) [rad] standard deviations of these.
-        gone_s: (5,) time since they were seen last; 0: seen now.
-        own: (5,) share of the variance of a step that the fingers that are seen do not explain.
-    """
-
-    angles: Float
-    sigma: Float
-    gone_s: Float
-    own: Float
+    angles: Float  # (20,) [rad]; those of fingers that are seen mean nothing
+    sigma: Float  # (20,) [rad] standard deviations of these
+    gone_s: Float  # (5,) time since they were seen last; 0: seen now
+    own: Float  # (5,) share of the variance of a step that the fingers that are seen do not explain
     x: Float  # (n,) room
     K: Float  # (4, 4) room
     L: Float  # (4, 4) room
@@ -185,10 +135,7 @@ class Hidden:
 
 @inlined
 def growth(settings: Settings, a: int, gone_s: float) -> float:
-    """Return the variance [rad^2] of angle a of 20 of a hidden finger.
-
-    It is about where the angle was heading, a time after its finger was last seen.
-    """
+    """Return the variance [rad^2] of angle a about its course, `gone_s` after."""
     most = settings.growth_rad
     if a < 4:
         most = settings.growth_thumb_rad
@@ -228,10 +175,7 @@ def _neighbours(settings: Settings, state: HandState, f: int, shown: Bool, hidde
 def hide(
     hand: HandTables, settings: Settings, state: HandState, t_ns: int, shown: Bool, hidden: Hidden
 ) -> None:
-    """Write the predicted angles of fingers without a measurement.
-
-    Note when each was lost.
-    """
+    """Write the predicted angles of unmeasured fingers; note when each was lost."""
     for a in range(20):
         hidden.angles[a] = state.angles[a]
     for f in range(5):
@@ -269,18 +213,11 @@ def predict(
     hidden: Hidden,
     epoch_prior: EpochPrior,
 ) -> None:
-    """Write the state's prediction for an epoch.
+    """Write the state's prediction to `EpochPrior.past`, `palm` and their weights.
 
-    It goes to `EpochPrior.past`, `palm` and their weights.
-
-    A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand that was
-    seen meanwhile is measured by its marker, not by a hand that is let go for it.
-
-    Args:
-        hand, settings, state: The hand; `state.hidden_ns` and what goes with it are kept up.
-        t_ns: The epoch.
-        shown: (5,) fingers that are measured now.
-        hidden, epoch_prior: Written.
+    A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand
+    that was seen meanwhile is measured by its marker, not by a hand that is let go for it. `shown` (5,):
+    fingers measured now; `state.hidden_ns` and what goes with it are kept up.
     """
     hide(hand, settings, state, t_ns, shown, hidden)
     free_of(hand, hidden.angles, hidden.x)
@@ -365,14 +302,10 @@ class ExtrasScratch:
 
 
 def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
-    """Return the variances (K,) to which the uncertainty grows.
+    """Return the variances (K,) to which the extras grow, the heading's at first.
 
-    The heading's is that at the beginning.
-
-    Args:
-        settings: Widths.
-        loose: Whether the wrist may bend; False: the palm was calibrated and stands still.
-        tilt_rad: Of the IMU's vertical.
+    `loose`: the wrist may bend; else the palm was calibrated and stands still. `tilt_rad`: of the IMU's
+    vertical.
     """
     stationary = np.zeros(EXTRAS)
     stationary[:WRIST_ANGLES] = settings.hinge_rad**2
@@ -403,17 +336,7 @@ def predict_extras(
     epoch_prior: EpochPrior,
     scratch: ExtrasScratch,
 ) -> None:
-    """Predict the extras to an epoch, in the state.
-
-    Write `EpochPrior.z` and `z_info`.
-
-    Args:
-        settings: Paces.
-        state: Changed.
-        dt_s: Since they were stepped last.
-        process_noise_rad2: Variance of what the heading has drifted in that time.
-        epoch_prior, scratch: Written.
-    """
+    """Predict the extras to an epoch, `dt_s` on: state, `EpochPrior.z`, `z_info`."""
     K, z, P, M = state.z.shape[0], state.z, state.z_cov, scratch.M
     if K < EXTRAS:
         epoch_prior.z[0], epoch_prior.z_info[0, 0] = 0.0, 1.0
@@ -478,18 +401,10 @@ def keep_extras(
     scale: float,
     scratch: ExtrasScratch,
 ) -> None:
-    """Take over what an epoch leaves of the extras.
+    """Take over what an epoch, `dt_s` after the last, leaves of the extras.
 
-    The epoch's own information is what its posterior has beyond `EpochPrior.z_info`; so much of it counts as is new.
-
-    Args:
-        settings: How much of it is new.
-        state: Changed.
-        dt_s: Since the last epoch.
-        epoch_prior: The prior of the epoch.
-        z: (K,) their mean.
-        cov: (N, N) covariance, with theirs last, and `scale` by how much the residual has scaled it.
-        room: Scratch.
+    The epoch's own information is what its posterior (z (K,), cov (N, N), scaled by `scale`) has beyond
+    `EpochPrior.z_info`; so much of it counts as is new.
     """
     K, P, A, B, new = state.z.shape[0], state.z_cov, scratch.A, scratch.B, scratch.M[0]
     if K < EXTRAS:

@@ -26,51 +26,31 @@ _SOLVED, _MEASURED, _HELD, _WRIST = (
 
 
 class Estimate(NamedTuple):
-    """A hand at one epoch, as kernels write it.
+    """A hand at one epoch, as kernels write it."""
 
-    Attributes:
-        palm, angles: (4, 4) palm, (20,) all angles [rad].
-        position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
-        cov: (26, 3, 3) [m^2] of the joints.
-        tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this epoch alone.
-        tilt_process_noise: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
-        tracked: (26,), and `source` (26,) as of `HandPose`.
-    """
-
-    palm: Float
-    angles: Float
-    position: Float
-    rotation: Float
-    cov: Float
-    tilt: Float
-    tilt_process_noise: Float
-    tracked: Bool
+    palm: Float  # (4, 4)
+    angles: Float  # (20,) [rad]
+    position: Float  # (26, 3) [m], rig frame
+    rotation: Float  # (26, 3, 3)
+    cov: Float  # (26, 3, 3) [m^2] of the joints
+    tilt: Float  # (5, 3, 3) [rad^2] of the last phalanges' directions, by this epoch alone
+    tilt_process_noise: Float  # (5,) [rad^2/s^2] by how much their trace grows, by the time squared
+    tracked: Bool  # (26,), as `source`: as of `HandPose`
     source: Code
 
     @classmethod
     def empty(cls) -> "Estimate":
         """Scratch for one."""
-        return cls(
-            palm=np.empty((4, 4)),
-            angles=np.empty(20),
-            position=np.empty((26, 3)),
-            rotation=np.empty((26, 3, 3)),
-            cov=np.empty((26, 3, 3)),
-            tilt=np.empty((5, 3, 3)),
-            tilt_process_noise=np.empty(5),
-            tracked=np.empty(26, np.bool_),
-            source=np.empty(26, np.uint8),
-        )
+        shapes = (4, 4), 20, (26, 3), (26, 3, 3), (26, 3, 3), (5, 3, 3), 5
+        floats = (np.empty(shape) for shape in shapes)
+        return cls(*floats, tracked=np.empty(26, np.bool_), source=np.empty(26, np.uint8))
 
 
 @inner
 def chi_square(
     rig: Rig, observed: Observations, T: Float, x: Float, process_noise_m: float, search: Search
 ) -> float:
-    """Return the chi-square of the markers on a hand that may have moved meanwhile.
-
-    The hand may have moved by `process_noise_m` in any direction since.
-    """
+    """Return the markers' chi square on a hand that may move by `process_noise_m`."""
     work, mounts = search.rows, rig.mounts
     angles_of(rig.hand, x, work.angles, work.by)
     chains(rig.hand, T, work.angles, work.R, work.P)
@@ -97,18 +77,9 @@ def chi_square(
 
 @inner
 def _judge(
-    rig: Rig,
-    settings: Settings,
-    state: HandState,
-    t_ns: int,
-    observed: Observations,
-    out: Estimate,
+    rig: Rig, settings: Settings, state: HandState, t_ns: int, observed: Observations, out: Estimate
 ) -> None:
-    """Write which joints are tracked, and what each rests on.
-
-    Tracked is a joint whose 95 % region is small (`master.estimator.covariance.is_small`), and that rests on
-    measurements of its finger that are no older than `tracked_age_s`.
-    """
+    """Write which joints are tracked (small 95 % region, not too old), on what."""
     hand = rig.hand
     for joint in range(26):
         f = hand.finger[joint]
@@ -134,11 +105,9 @@ def _judge(
 def _depth_noise(
     settings: Settings, state: HandState, t_ns: int, ground: Ground, epoch_prior: EpochPrior, out: Estimate
 ) -> None:
-    """Add the possible depth drift of a hand that one camera alone saw.
+    """Add possible drift in depth over the time that one camera alone saw a hand.
 
-    The drift is along the line of sight, over the time in which that camera alone saw the hand.
-
-    Perspective constrains a hand's depth to centimetres only, and the fit is as sure of it as of the last epoch's.
+    Perspective constrains it to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
     triangulated, seen = ground.most[0] > 1, ground.seen[0] > 0
     if triangulated or state.triangulated_ns[0] == NEVER_NS:
@@ -161,15 +130,8 @@ def _depth_noise(
 def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_space: Any) -> float:
     """Write the state's prediction for an epoch, and the start of its search.
 
-    Args:
-        model: What is the same at every epoch.
-        boxed_state: (1,) `HandState` of the epoch before.
-        observed: What is measured.
-        boxed_space: (1,) `Workspace`, with the task.
-
-    Returns:
-        Chi square of the markers above which another hand explains them better; infinity: there is none; negative:
-        no motion explains them, but it does.
+    Returns chi square of the markers above which another hand explains them better; infinity: there is none;
+    negative: no motion explains them, but it does.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task, epoch_prior, scratch = (
@@ -198,10 +160,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
 
 @inner
 def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> None:
-    """Write the palm of the state, rotated on by other sensors.
-
-    The result goes to `epoch_prior.palm`; the rotation is the one that other sensors report.
-    """
+    """Write `epoch_prior.palm`: that of the state, rotated on by other sensors."""
     by = search.J
     for i in range(3):
         for j in range(3):
@@ -224,18 +183,10 @@ def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> Non
 def fit_epoch(
     model: Model, posture_prior: PosturePrior, observed: Observations, blank: Blank, boxed_space: Any
 ) -> float:
-    """Fit the hand of one epoch in place.
+    """Fit the hand of one epoch in place; return chi square of the markers.
 
-    The fit starts from the prediction of `predict_epoch`, or roughly from the task's hand.
-
-    Args:
-        model, posture_prior: What is the same at every epoch.
-        observed: What is measured.
-        blank: Scratch.
-        boxed_space: (1,) `Workspace`, with the task and the epoch prior; what is found is in its `found`.
-
-    Returns:
-        Chi square of the markers; of a rough search its cost.
+    From the prediction of `predict_epoch`, or roughly from the task's hand: then the cost is returned. What
+    is found is in `found` of `boxed_space`, (1,) `Workspace`.
     """
     space, settings = boxed_space[0], model.settings[0]
     rig, task, epoch_prior, scratch = (
@@ -290,10 +241,7 @@ def fit_epoch(
 
 @inner
 def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, angles: Float) -> None:
-    """Follow the rates of angles (20,) [rad/s].
-
-    That of a finger (5,) that shows again is taken since it was seen last.
-    """
+    """Follow rates of angles (20,) [rad/s]; of a finger shown again, since last seen."""
     for a in range(20):
         f, before_ns, rate, before = a // 4, state.t_ns[0], state.rates[a], state.angles[a]
         if shown[f] and state.hidden_ns[f] != NEVER_NS:
@@ -307,16 +255,7 @@ def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, an
 def take_over_epoch(
     model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, out: Estimate
 ) -> None:
-    """Write the hand that `fit_epoch` found, and the state behind it.
-
-    Args:
-        model: What is the same at every epoch.
-        boxed_state: (1,) `HandState`, changed.
-        goes_on: Whether the hand goes on from it; else nothing of it is kept.
-        observed: What is measured.
-        boxed_space: (1,) `Workspace`.
-        out: Written.
-    """
+    """Write the hand `fit_epoch` found, and the state; not `goes_on`: forget it."""
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0

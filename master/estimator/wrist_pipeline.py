@@ -1,28 +1,22 @@
 """Pipelines of a wrist device, alone or with marker cameras and an IMU.
 
-The palm by an IMU that sits on the forearm, through a wrist that bends.
+All are push machines without clock, socket or thread: live and offline runs push the same messages and get
+the same poses. `WristPipeline`: strobe cycles -> rows -> estimator -> pose, of a device alone. The rig's
+frame is the camera's, so the palm stands where calibration found it. A finger that was not seen for half a
+second is not valid, and NaN. `FusedPipeline`: an epoch of the cameras uses rows of the strobe cycle before
+it, if there is a new one, and how the IMU has the forearm turned; where the cameras are silent, epochs are
+those of the strobe cycles. A silent sensor adds no row: there is no state in which one is used and another
+not.
 
-The IMU measures how the forearm lies in a world of its own, whose z axis is up; the hand hangs on it by the wrist:
+The IMU measures how the forearm lies in a world of its own, whose z axis is up; the hand hangs on it by the
+wrist:
 
     R_rig_palm = R_rig_world exp(tilt) R_z(heading) R_world_forearm R_forearm_palm(bend)
 
 `imu.q_rig_world` states where up is in the rig. Tilt, heading and bend are unknowns of the estimator
-(`master.estimator.state`); here is what comes and goes: samples, sessions and clocks.
-
-An IMU that restarts lies in a new world, and the heading begins anew. Mostly it shows: silent for a while, it begins
-to count its drift again. If not, palms that contradict for long reveal it.
-
-Pipeline of a wrist device alone: strobe cycles -> rows -> estimator -> pose.
-
-`WristPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages and get
-the same poses. The rig's frame is the camera's, so the palm stands where calibration found it. A finger that was not
-seen for half a second is not valid, and NaN: nothing is made up for it.
-
-One hand from marker cameras, a wrist device and its IMU: rows of one fit.
-
-`FusedPipeline` is push-driven, without clock, socket or thread. An epoch of the cameras uses rows of the strobe cycle
-before it, if there is a new one, and how the IMU has the forearm turned; where the cameras are silent, epochs are those
-of the strobe cycles. A silent sensor adds no row: there is no state in which one is used and another not.
+(`master.estimator.state`); `Forearm` has samples, sessions and clocks. An IMU that restarts lies in a new
+world, and the heading begins anew. Mostly it shows: silent for a while, it begins to count its drift again.
+If not, palms that contradict for long reveal it.
 """
 
 from collections import Counter, deque
@@ -60,21 +54,20 @@ from master.rig.wrist import WristSetup
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 LOST_RAD = 1.0  # a heading less sure than this may point anywhere
-_PROCESS_NOISE2, _MOST2 = (
-    np.radians([0.2, 5.0]) ** 2
-)  # [rad^2/s] a heading walks at least and, unless evenly, at most
+# [rad^2/s] a heading walks at least and, unless evenly, at most
+_PROCESS_NOISE2, _MOST2 = np.radians([0.2, 5.0]) ** 2
 _EYE = np.eye(3)
+_WRIST = slice(WRIST_ANGLES, WRIST_ANGLES + 2)
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
 
 
 class Forearm:
     """Push machine. Holds the samples of an IMU, and since when palms contradict it.
 
-    Attributes:
-        lost: Whether the IMU began anew since `orientation_at` was asked.
-        counts: `orientation.used`, epochs that had a sample, `orientation.absent`, those farther than 50 ms from any;
-            samples rejected, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
-            `forearm.outlier`, palms that contradicted it.
+    `lost`: whether the IMU began anew since `orientation_at` was asked. Counts `orientation.used`, epochs
+    that had a sample, `orientation.absent`, those farther than 50 ms from any; samples rejected, as of
+    `OrientationSamples`; `forearm.begun`, how often the heading began anew, and `forearm.outlier`, palms that
+    contradicted it.
     """
 
     def __init__(self, imu: ImuCalibration, counts: Counter[str] | None = None) -> None:
@@ -101,10 +94,7 @@ class Forearm:
         return self._rig_world is not None
 
     def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take one sample of the IMU.
-
-        The quaternion (4,) is IMU axes -> its world, and the heading drift is given if reported.
-        """
+        """Take one sample (4,), IMU axes -> its world, and its heading drift if known."""
         self._samples.push(t_ns, wxyz, heading_sigma_rad)
         if isnan(sum(wxyz.tolist())):
             return
@@ -116,14 +106,7 @@ class Forearm:
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
 
     def orientation_at(self, t_ns: int, z: Float, z_cov: Float) -> OrientationMeasurement | None:
-        """Return how the forearm rotates the palm at an epoch.
-
-        None: no sample is near, or the rig does not place the IMU's world.
-
-        Args:
-            t_ns: The epoch.
-            z, z_cov: The estimator's extras.
-        """
+        """Return how the forearm turns the palm; None: no sample near, or world unplaced."""
         found = self._between(t_ns)
         if found is None or self._rig_world is None:
             return None
@@ -134,11 +117,7 @@ class Forearm:
         sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the estimated vertical it turns
-        wide = (
-            z_cov[HEADING, HEADING]
-            + process_noise
-            + np.trace(z_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2])
-        )
+        wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[_WRIST, _WRIST])
         return OrientationMeasurement(
             rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise
         )
@@ -148,16 +127,13 @@ class Forearm:
         found = self._samples.between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        flexion, deviation = z[WRIST_ANGLES : WRIST_ANGLES + 2].tolist()
+        flexion, deviation = z[_WRIST].tolist()
         palm = matrix_of(quaternion_product(self._forearm(found), wrist_quaternion(flexion, deviation)))
         rotation = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
         return atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
 
     def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
-        """Note whether the palm contradicts the forearm at an epoch.
-
-        Return whether it did so for long, and is right.
-        """
+        """Note if the palm contradicts the forearm; return if it did so for long."""
         if not by_palm:
             self._contrary_ns.clear()
             return False
@@ -168,17 +144,10 @@ class Forearm:
         return long and len(self._contrary_ns) >= contrary
 
     def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
-        """Return the palm orientation at a time in the IMU's own world.
+        """Return the palm orientation at a time in the IMU's own world; needs no heading.
 
-        This needs no heading.
-
-        Args:
-            t_ns: The epoch.
-            wrist_angles_rad, wrist_cov: (2,), (2, 2) of the wrist.
-
-        Returns:
-            Quaternion (4,), palm axes -> the IMU's world, and standard deviations (2,) [rad]: tilt per axis, heading;
-            NaN: not known.
+        Of wrist angles (2,), cov (2, 2): a quaternion (4,), palm axes -> the IMU's world, and standard
+        deviations (2,) [rad]: tilt per axis, heading; NaN: not known.
         """
         found = self._between(t_ns)
         if found is None:
@@ -216,8 +185,8 @@ class Forearm:
     def _process_noise_rad2(self, t_ns: int, found: Between) -> float:
         """Variance [rad^2] of what the heading has drifted since the epoch before.
 
-        Drifts that a filter reports are no walks: mostly an unknown bias, whose variance grows with the square
-        of the time. Of a long silence that counts; from epoch to epoch it is a walk, of as much as can be followed.
+        Drifts that a filter reports are mostly an unknown bias, whose variance grows with the square of the
+        time. Of a long silence that counts; from epoch to epoch it is a walk, of as much as can be followed.
         """
         since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
         even_rad = abs(found.drift_rad - self._drift_rad)
@@ -252,14 +221,7 @@ class WristPipeline:
         stage: Stage = lambda name: nullcontext(),
         settings: Settings = DEFAULT,
     ) -> None:
-        """Join the parts.
-
-        Args:
-            setup: Device and hand.
-            continuous: False: every message is an unrelated pose; no memory but of what is constant.
-            stage: Opens a timer by stage name.
-            settings: Of the estimator.
-        """
+        """Join the parts; not `continuous`: no memory but of what is constant."""
         self.counts: Counter[str] = Counter()
         self._setup, self._stage, self._continuous = setup, stage, continuous
         self._model, self._hand = WristModel.of(setup, loose=False), loosened(setup.model)
@@ -279,10 +241,7 @@ class WristPipeline:
         self._forget_ns = round(1e9 * settings.forget_s)
 
     def push(self, message: WristDetections) -> list[SolvedPose]:
-        """Solve one strobe cycle and return its pose.
-
-        A message that is not later than the last is counted and dropped.
-        """
+        """Solve one strobe cycle; one not later than the last is counted and dropped."""
         t_ns = message.t_ns + self._setup.late_ns
         if t_ns <= self._last_ns:
             self.counts["late"] += 1
@@ -306,10 +265,7 @@ class WristPipeline:
         return [SolvedPose(pose, message.ready_t_ns)]
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take the orientation (4,) that the IMU reports of itself.
-
-        It is the orientation of the forearm, and so of the palm, in the IMU's world frame.
-        """
+        """Take the IMU's orientation (4,): the forearm, and the palm, in its world."""
         if self._forearm is None:
             self.counts["orientation.unplaced"] += 1
         else:
@@ -321,10 +277,7 @@ class WristPipeline:
 
     def _pose(self, t_ns: int, hand: Fitted, laser_m: Float) -> HandPose:
         """The message of a hand; fingers that were not seen lately are not valid."""
-        model, world = (
-            self._hand,
-            NO_WORLD if self._forearm is None else self._forearm.world_at(t_ns, *_STRAIGHT),
-        )
+        world = NO_WORLD if self._forearm is None else self._forearm.world_at(t_ns, *_STRAIGHT)
         measured: Bool = hand.solver_mode > 0
         self._seen_ns[measured] = t_ns
         known: Bool = t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0)
@@ -354,11 +307,11 @@ class WristPipeline:
                 angles[~known] = nan
             tracked[_PALM], source[_PALM] = tracked[CHAINS[measured]].any(), Source.WRIST
         return HandPose.known_good(
-            hand=model.profile.name,
+            hand=self._hand.profile.name,
             t_ns=t_ns,
             position_m=position,
             orientation_wxyz=orientation,
-            radius_m=model.radius_m,
+            radius_m=self._hand.radius_m,
             valid=valid,
             tracked=tracked,
             cov_m2=cov,
@@ -380,12 +333,9 @@ _MAX_AGE_NS = 70_000_000  # an older strobe cycle constrains no finger now
 
 
 class WristSide:
-    """Push machine that holds the wrist device's pending strobe cycles.
+    """Push machine that holds strobe cycles that wait for an epoch, and IMU samples.
 
-    They wait for an epoch; it also holds the last strobe cycle and the samples of the IMU.
-
-    Attributes:
-        forearm: Of the IMU; None: there is none, or it is not known how it is mounted or placed.
+    `forearm`: of the IMU; None: there is none, or it is not known how it is mounted or placed.
     """
 
     def __init__(
@@ -393,12 +343,8 @@ class WristSide:
     ) -> None:
         """Join the parts.
 
-        Args:
-            setup: Device and hand.
-            reader: Makes rows of strobe cycles.
-            counts: Counted into, by event and finger: `late`, `outside`, `no_plane`, `tip_refused`, `off`, `ambiguous`;
-                and as of `Forearm`.
-            continuous: False: every message is an unrelated pose.
+        `counts` are by event and finger: `late`, `outside`, `no_plane`, `tip_refused`, `off`, `ambiguous`;
+        and as of `Forearm`. `continuous`: False: every message is an unrelated pose.
         """
         self.counts, self._setup, self._continuous = counts, setup, continuous
         forearm = None if setup.imu is None else Forearm(setup.imu, counts)
@@ -411,10 +357,7 @@ class WristSide:
         self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
 
     def push(self, message: WristDetections) -> int | None:
-        """Take a strobe cycle and return its time.
-
-        None: it is not later than the last.
-        """
+        """Take a strobe cycle and return its time; None: it is not after the last."""
         t_ns = message.t_ns + self._setup.late_ns
         if t_ns <= self._last_ns:
             self.counts["late"] += 1
@@ -424,10 +367,7 @@ class WristSide:
         return t_ns
 
     def rows_at(self, t_ns: int) -> WristRows | None:
-        """Return the rows of the newest unused strobe cycle, for an epoch at `t_ns`.
-
-        None: there is no fresh one.
-        """
+        """Return the rows of the newest unused strobe cycle, for an epoch; None: none."""
         late_ns, message = self._setup.late_ns, None
         if not self._continuous:
             near = min(self._waiting, key=lambda one: abs(one.t_ns + late_ns - t_ns), default=None)
@@ -445,10 +385,7 @@ class WristSide:
         return rows
 
     def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
-        """Return the palm orientation by the IMU at an epoch.
-
-        None: the IMU does not report it, or its heading may be any.
-        """
+        """Return the IMU's palm orientation; None: not reported, or any heading."""
         if self.forearm is None:
             return None
         if self.forearm.lost:
@@ -459,14 +396,7 @@ class WristSide:
         return None if unknown else orientation
 
     def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
-        """Learn from an epoch that was solved.
-
-        Args:
-            t_ns: The epoch.
-            hand: As it was solved.
-            estimator: What solved it.
-            oriented: Whether it had a TURN row to begin with.
-        """
+        """Learn from an epoch; `oriented`: it had a TURN row to begin with."""
         if hand.solver_mode.any():
             self.solver_mode, self.ambiguous = hand.solver_mode, hand.ambiguous
         self._count("tip_refused", hand.refused)
@@ -482,33 +412,23 @@ class WristSide:
         heading = self.forearm.heading_of(t_ns, hand.solution.T_rig_palm[:3, :3], estimator.extras)
         if heading is not None:
             self.counts["forearm.begun"] += 1
-            wrist_angles = estimator.extras_cov[
-                WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2
-            ]
-            estimator.begin_heading(
-                heading, float(np.trace(wrist_angles) + np.trace(hand.solution.measurement_cov[:3, :3]))
-            )
+            rotation_cov = hand.solution.measurement_cov[:3, :3]
+            variance_rad2 = np.trace(estimator.extras_cov[_WRIST, _WRIST]) + np.trace(rotation_cov)
+            estimator.begin_heading(heading, float(variance_rad2))
 
     def completed(self, pose: HandPose, estimator: Estimator) -> HandPose:
         """The pose with what else is known of the hand."""
         changes: dict[str, Float | Code | Bool] = {}
         if self.forearm is not None:
-            wrist_angles, cov = (
-                estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy(),
-                estimator.extras_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2],
-            )
-            changes["wrist_angles_rad"], changes["wrist_angles_sigma_rad"] = (
-                wrist_angles,
-                np.sqrt(np.diag(cov)),
-            )
+            wrist_angles = estimator.extras[_WRIST].copy()
+            cov = estimator.extras_cov[_WRIST, _WRIST]
+            changes["wrist_angles_rad"] = wrist_angles
+            changes["wrist_angles_sigma_rad"] = np.sqrt(np.diag(cov))
             world = self.forearm.world_at(pose.t_ns, wrist_angles, cov)
             changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
         if abs(pose.t_ns - self.laser_ns) <= _MAX_AGE_NS:
-            changes["laser_m"], changes["solver_mode"], changes["ambiguous"] = (
-                self.laser_m,
-                self.solver_mode,
-                self.ambiguous,
-            )
+            changes["laser_m"] = self.laser_m
+            changes["solver_mode"], changes["ambiguous"] = self.solver_mode, self.ambiguous
         return msgspec.structs.replace(pose, **changes)
 
     def _count(self, event: str, fingers: Bool) -> None:
@@ -518,17 +438,13 @@ class WristSide:
 
 
 class FusedPipeline:
-    """Push machine that joins the marker line and its wrist side.
-
-    It holds the marker line, whose wrist side it feeds, and when the cameras last made a pose.
-    """
+    """Push machine: a marker line, its wrist side, when cameras last made a pose."""
 
     def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
         """Join the parts.
 
         Args:
             markers: The marker line with that wrist side; both count into the same.
-            side: Wrist device and IMU.
             slowest_hz: Frame rate of the slowest marker camera.
         """
         self.counts, self._markers, self._side = markers.counts, markers, side

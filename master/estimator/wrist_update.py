@@ -1,18 +1,12 @@
 """Wrist data updates the fingers before the fit, and after it.
 
-Kernels of the coupling between MCP and PIP of a hand.
-
-It is learnt from the fingers whose tips are seen.
-
-A natural MCP is a share of the PIP (`master.estimator.priors`). But each hand has its own share, and keeps
-to it more closely or less. Both are those of a regression through the origin,
+A natural MCP is a share of the PIP (`master.estimator.priors`). Each hand has its own share, and keeps to it
+more closely or less. Both are learnt from fingers whose tips are seen, by a regression through the origin,
 
     e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,
 
-of expected squares, so that a finger that is hardly known feigns no closeness. The sums begin as if some fingers
-of usual hands had been seen, and fade back to that.
-
-Kernels of one epoch for wrist-device data: before the fit, and after it.
+of expected squares, so that a finger that is hardly known feigns no closeness. The sums begin as if some
+fingers of usual hands had been seen, and fade back to that.
 """
 
 from math import exp, inf, radians, sqrt
@@ -45,10 +39,7 @@ _BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
 
 @inner
 def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Prior) -> None:
-    """Write the expected coupling share and spread.
-
-    They hold for a time after the last strobe cycle.
-    """
+    """Write the coupling share and spread expected after a time."""
     kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
     for i in range(3):
         sums[i] *= kept
@@ -84,10 +75,7 @@ def _expected(
     scan: Scan,
     prior: Prior,
 ) -> None:
-    """Write the prior of the fingers before a strobe cycle.
-
-    Also brings what was seen to the epoch, by the rates of the fingers.
-    """
+    """Write the fingers' prior before a strobe cycle; bring its rows to the epoch."""
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
     measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
     prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
@@ -129,17 +117,10 @@ def _expected(
 
 @kernel
 def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
-    """Propagate the extras to an epoch and search the minima of the fingers.
+    """Step the extras to an epoch; search the minima of fingers a wrist device sees.
 
-    The fingers are those that a wrist device sees.
-
-    What no pose explains is no row: a fingertip that is another thing, a laser point on one. The rows that are left are
-    counted.
-
-    Args:
-        model: What is the same at every epoch.
-        boxed_state: (1,) `HandState` of the epoch before; its extras are stepped.
-        boxed_space: (1,) `Workspace`, with the task and what is seen.
+    What no pose explains is no row: a fingertip that is another thing, a laser point on one. The rows that
+    are left are counted.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     hand, device, task, epoch_prior = model.hand[0], model.device[0], space.task, space.epoch_prior
@@ -170,9 +151,8 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             prior.near_rad[f] = 0.0
             scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
         if scan.chi2[f] > settings.refused and lines_of_sight.depth_w2[f] > 0.0:
-            lines_of_sight.depth_w2[f] = (
-                0.0  # a tip may shine, or lie in shade: what it is off then is its light
-            )
+            # a tip may shine, or lie in shade: what it is off then is its light
+            lines_of_sight.depth_w2[f] = 0.0
             scan_finger(hand, device, settings, lines_of_sight, prior, f, True, scan)
         gate = settings.refused if lines_of_sight.depth_w2[f] > 0.0 else settings.refused_unlit
         if scan.chi2[f] > gate and lines_of_sight.shown[f] > 0.0:
@@ -213,10 +193,7 @@ def _length_px(scan: Scan, f: int) -> float:
 
 @inner
 def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
-    """Count the rows of a wrist device.
-
-    Fingertips alone, without laser points, count for nothing.
-    """
+    """Count the rows of a wrist device; tips without laser points count for nothing."""
     lit, shown = 0, 0
     for f in range(5):
         shown += 1 if lines_of_sight.shown[f] > 0.0 else 0
@@ -229,10 +206,7 @@ def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
 
 @inner
 def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: Float) -> None:
-    """Write the free angles (n,) of fingers whose minimum was searched.
-
-    They are taken from angles (20,); `x` is (n,) room.
-    """
+    """Write the free angles (n,) of scanned fingers from angles (20,)."""
     free_of(hand, scanned, x)
     for f in range(5):
         if scan.known[f] > 0.0:
@@ -244,9 +218,8 @@ def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: F
 def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> None:
     """Move the extras to their estimate from this epoch alone.
 
-    The covariance of the epoch gives the step.
-
-    At the solution the pull of the past is that of the epoch, reversed: a Newton step without it.
+    At the solution the pull of the past is that of the epoch, reversed: a Newton step, by the epoch's
+    covariance, without it.
     """
     n, K, off = found.x.shape[0], found.z.shape[0], search.off
     palm_off(found.palm, epoch_prior.palm, off)
@@ -268,9 +241,7 @@ def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> No
 
 @inner
 def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: Scratch) -> None:
-    """Take fingers without markers from their searched minima.
-
-    The median is taken, and a covariance that holds all of the minimum.
+    """Take fingers without markers from their minima: median, covariance of all.
 
     What the others know of the finger beside its PIP is in the fit's covariance given the PIP.
     """

@@ -1,12 +1,6 @@
 """Score runs against exact truth and write their report.
 
-Comparison of a simulated run of a wrist device with its scene.
-
-It has the exact truth at the poses, and what its camera saw.
-
-Report of a simulated run against the scene's exact truth.
-
-Figures, a picture and a Rerun file of its poses.
+A simulated run is compared with the exact scene at its poses: figures, a picture and a Rerun file.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -43,10 +37,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, progress: Progress) -> WristTruth:
-    """Return the exact scene at the times (N,) [ns] of poses.
-
-    `epoch_ns` is scene time 0 on their clock.
-    """
+    """Return the exact scene at times (N,) [ns]; `epoch_ns` is scene time 0."""
     now: list[WristEpoch] = []
     for row, at_ns in enumerate(t_ns.tolist()):
         now.append(scene.truth((at_ns - epoch_ns) * 1e-9))
@@ -64,11 +55,10 @@ def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, progress: Progre
 
 
 def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress) -> dict[str, float]:
-    """Compute errors of the laser points where other sensors also give poses.
+    """Errors of the laser points where other sensors also give poses.
 
-    The errors are as `score_wrist` has them.
-
-    Such a pose carries the points of the last strobe cycle. Each cycle counts once, at the first pose after it.
+    Such a pose carries the points of the last strobe cycle. Each cycle counts once, at the first pose after
+    it.
     """
     point = poses.laser_m.reshape(len(poses), -1)
     measured = np.asarray(np.isfinite(point).any(axis=1))
@@ -80,10 +70,7 @@ def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progr
 
 
 def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, float]:
-    """Compute the rms error [deg] of the forearm's vertical: `forearm_tilt_deg`.
-
-    The result is empty where no pose reports the forearm's orientation.
-    """
+    """Rms error [deg] of the forearm's vertical, `forearm_tilt_deg`, where reported."""
     imu = scene.rig.imu
     rows = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
     if imu is None or imu.q_rig_world is None or not len(rows):
@@ -99,10 +86,7 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
 
 
 def lit_view(renderer: WristRenderer, t_s: float) -> Image:
-    """Render what laser and LEDs together light at scene time `t_s` [s].
-
-    The image is (H, W) grey and without the light of the room.
-    """
+    """Render (H, W) grey what laser and LEDs together light, without room light."""
     ambient = renderer.render(t_s, Illumination.AMBIENT)
     laser, led = (renderer.render(t_s, lit) for lit in (Illumination.LASER, Illumination.LED))
     return np.asarray(cv2.add(cv2.subtract(laser, ambient), cv2.subtract(led, ambient)), np.uint8)
@@ -123,17 +107,11 @@ def wrist_images(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """What the synthetic sensors of one hand sensed.
+    """What the synthetic sensors of one hand sensed."""
 
-    Attributes:
-        shown: What cameras of markers saw, or None.
-        wrist_scene: What a wrist device saw, or None.
-        together: The scene is one for both kinds of rig, whether or not there are both.
-    """
-
-    shown: Scene | None = None
-    wrist_scene: WristScene | None = None
-    together: bool = False
+    shown: Scene | None = None  # what cameras of markers saw, or None
+    wrist_scene: WristScene | None = None  # what a wrist device saw, or None
+    together: bool = False  # the scene is one for both kinds of rig, whether or not there are both
 
     @classmethod
     def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
@@ -159,10 +137,7 @@ class Played:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
-    """A run beside its truth.
-
-    Scores, the true hand, what the cameras saw, and how to draw a wrist device.
-    """
+    """A run beside its truth: scores, the true hand, and what to draw."""
 
     scores: dict[str, float]
     truth: PosesTruth
@@ -183,12 +158,11 @@ def report_scene(
 
     Args:
         poses_file: poses.npz of the run.
-        setup: Rigs, cameras, hand.
-        played: What their synthetic sensors sensed.
+        played: What its synthetic sensors sensed.
         epoch_ns: Scene time 0 on the master's clock.
         out: Existing folder.
         summary: Figures of the run so far; drawn with the scores.
-        tell: Called with what is being done, and how much of how much.
+        progress: Called with what is being done, and how much of how much.
 
     Returns:
         The summary with the scores added.
@@ -263,10 +237,7 @@ def _of_wrist(
 
 
 def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Truth:
-    """Return the scene at the times of the poses, with each camera's visibility.
-
-    The visibility is what each camera could see.
-    """
+    """Return the scene at the times of the poses, with what each camera could see."""
     times = (poses.t_ns - epoch_ns) * 1e-9
     renderers = [Renderer(scene, camera) for camera in scene.rig.cameras]
     joints = np.empty((len(times), 25, 3))
@@ -277,14 +248,10 @@ def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> T
         now = scene.truth(float(t))
         joints[row], pip[row], markers[row] = now.joints.position_m[1:], now.angles_rad[1:, 2], now.markers_m
         for c, renderer in enumerate(renderers):
-            visible[row, c] = _fraction(renderer, float(t))
+            visible[row, c] = np.nan_to_num(renderer.visible_fraction(float(t)))
         if row % 20 == 0:
             progress("comparing with the truth", row, len(times))
     return Truth(poses.t_ns, joints, pip, markers, visible)
-
-
-def _fraction(renderer: Renderer, t_s: float) -> Float:
-    return np.nan_to_num(renderer.visible_fraction(t_s))
 
 
 def _images(

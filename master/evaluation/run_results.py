@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from common.arrays import Bool, Int
-from common.messages import Contact, Gesture, ObjectPose, ResultMessage
+from common.messages import Gesture, ResultMessage
 from common.sim.scene import Scene
 from master.evaluation.score import ObjectTruth, score_object, score_objects
 from master.outputs.result_files import (
@@ -31,10 +31,7 @@ _LATE_S = 0.4  # a gesture that is reported so long after it was made is not tha
 
 
 class Annotation(Protocol):
-    """One gesture of a simulated hand.
-
-    As in a Gesture message, with the times when it begins and is complete [s].
-    """
+    """One gesture of a simulated hand as in `Gesture`, with begin and completion [s]."""
 
     @property
     def kind(self) -> str: ...  # noqa: D102
@@ -67,27 +64,15 @@ class Annotated(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResults:
-    """Results of a run for one hand and its objects.
-
-    Attributes:
-        objects: One for each object of the rig.
-        contacts: Of this hand and each object.
-        gestures: Of this hand, in the order of time.
-    """
+    """Results of a run for one hand and its objects."""
 
     objects: tuple[ObjectPoses, ...] = ()
     contacts: tuple[Contacts, ...] = ()
-    gestures: tuple[Gesture, ...] = ()
+    gestures: tuple[Gesture, ...] = ()  # in the order of time
 
     @classmethod
     def load(cls, folder: Path, setup: RigSetup, from_ns: int) -> "RunResults":
-        """Read the files beside poses.npz.
-
-        What a run did not write is not there. Gestures are read from a given time on.
-
-        Raises:
-            RecordingError: A file is broken.
-        """
+        """Read the files beside poses.npz, gestures from a time on; RecordingError."""
         names, hand = [one.name for one in setup.objects], setup.hand.profile.name
         objects = [object_path(folder, name) for name in names]
         contacts = [contact_path(folder, hand, name) for name in names]
@@ -103,9 +88,9 @@ class RunResults:
         """All of it, each kind in the order of time."""
         out: list[ResultMessage] = [*self.gestures]
         for poses in self.objects:
-            out += [object_row(poses, row) for row in range(len(poses))]
+            out += poses.messages()
         for near in self.contacts:
-            out += [contact_row(near, row) for row in range(len(near))]
+            out += near.messages()
         return out
 
     def figures(self, scene: Scene | None, epoch_ns: int, from_ns: int, until_ns: int) -> dict[str, object]:
@@ -148,16 +133,12 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 def judge_gestures(
     published: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
-    """Compare the published gestures with those of a scene's hand.
-
-    Poses of the hand are not judged.
+    """Compare the published gestures, but poses, with those of a scene's hand.
 
     Args:
-        told: Gestures in the order of time.
-        motion: The hand of the scene.
+        published: Gestures in the order of time.
         epoch_ns: Scene time 0 on the clock of the messages.
-        from_ns: The first pose of the run.
-        until_ns: Its last one.
+        from_ns, until_ns: The first and last pose of the run.
     """
     begun = [one for one in _beginnings(published) if one.kind != "pose"]
     first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
@@ -196,39 +177,6 @@ def judge_gestures(
     return out | ({"dial_deg": round(float(np.degrees(np.median(error))), 2)} if error else {})
 
 
-def object_row(poses: ObjectPoses, row: int) -> ObjectPose:
-    """Row of the poses of an object as the message it was."""
-    return ObjectPose(
-        object=poses.object,
-        t_ns=int(poses.t_ns[row]),
-        position_m=poses.position_m[row],
-        orientation_wxyz=poses.orientation_wxyz[row],
-        cov=poses.cov[row],
-        residual_m=float(poses.residual_m[row]),
-        source=int(poses.source[row]),
-        tracked=bool(poses.tracked[row]),
-        seen=int(poses.seen[row]),
-        expected=int(poses.expected[row]),
-        occluded=bool(poses.occluded[row]),
-        latency_ns=int(poses.latency_ns[row]),
-    )
-
-
-def contact_row(near: Contacts, row: int) -> Contact:
-    """Row of contact as the message it was."""
-    return Contact(
-        hand=near.hand,
-        object=near.object,
-        t_ns=int(near.t_ns[row]),
-        distance_m=near.distance_m[row],
-        sigma_m=near.sigma_m[row],
-        point_m=near.point_m[row],
-        touching=near.touching[row],
-        palm_distance_m=float(near.palm_distance_m[row]),
-        held=bool(near.held[row]),
-    )
-
-
 def _beginnings(published: Sequence[Gesture]) -> list[Gesture]:
     """One message of each gesture: its first, of a tap the only one."""
     return [one for one in published if one.phase == "begin" or one.kind == "tap"]
@@ -239,10 +187,7 @@ def _label(one: Gesture) -> str:
 
 
 def _cut(published: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
-    """Check whether a gesture is cut off by the run.
-
-    The hand had begun it before the first pose, or had not completed it at the last.
-    """
+    """Whether the hand made a gesture only in part between first and last pose."""
     turns = range(int(end_s // motion.period_s) + 1)
     spans = (
         (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)

@@ -1,13 +1,8 @@
 """The score of hands and objects is their error against exact truth.
 
-Errors against exact truth, in millimetres and degrees.
-
 A finger counts as *visible* where its marker is at least half seen by two cameras. Scores come twice: over
-visible fingers (the palm's joints with them), and over all.
-
-Score of tracked objects against their truth.
-
-It has millimetres, degrees, how often they were tracked, and whether the stated uncertainty was consistent.
+visible fingers (the palm's joints with them), and over all. Of objects: millimetres, degrees, how often they
+were tracked, and whether the stated covariance was consistent.
 """
 
 from collections.abc import Callable
@@ -26,7 +21,7 @@ from common.geometry.transforms import (
 from common.hand.model import FINGER_JOINTS
 from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
-from master.outputs.result_files import ObjectPoses
+from master.outputs.result_files import ObjectPoses, nearest_rows
 
 _OF_HAND = ("t_ref", "joints", "angles", "paint_centroid", "frac")  # arrays of a truth
 _OF_SWEEP = ("depth", "center", "frac")
@@ -37,29 +32,19 @@ for _f, _joints in enumerate(FINGER_JOINTS):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Exact values at N moments.
+    """Exact values at N moments."""
 
-    Attributes:
-        t_ns: (N,) the moments, on the clock of the poses.
-        joints_m: (N, 25, 3) WebXR joints [m], rig frame; NaN where the scene has no hand.
-        pip_rad: (N, 4) PIP of index ... little.
-        markers_m: (N, M, 3) cap centroids.
-        visible: (N, C, M) visible share of each marker in each camera.
-    """
-
-    t_ns: Int
-    joints_m: Float
-    pip_rad: Float
-    markers_m: Float
-    visible: Float
+    t_ns: Int  # (N,) on the clock of the poses
+    joints_m: Float  # (N, 25, 3) WebXR joints [m], rig frame; NaN where the scene has no hand
+    pip_rad: Float  # (N, 4) PIP of index ... little
+    markers_m: Float  # (N, M, 3) cap centroids
+    visible: Float  # (N, C, M) visible share of each marker in each camera
 
 
 def load_truth(folder: Path, shown: Bool) -> Truth | None:
     """Truth of a rendered recording; None where the folder holds none.
 
-    Args:
-        folder: The recording.
-        shown: (M,) markers found most often; a sweep of the depth shows a single flat one.
+    `shown`: (M,) markers found most often; a sweep of the depth shows a single flat one.
 
     Raises:
         RecordingError: truth.npz is broken, lacks an array, or leads out of the folder.
@@ -76,18 +61,14 @@ def load_truth(folder: Path, shown: Bool) -> Truth | None:
 
 
 def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
-    """Mean errors over the frames that have a truth.
+    """Mean errors over the frames that have a truth; empty scores are left out.
 
-    Args:
-        poses: Solved poses.
-        truth: Exact values.
-        fingers: For each marker the finger it sits on, or -1.
+    `fingers`: for each marker the finger it sits on, or -1.
 
     Returns:
         marker_mm (median over markers seen at least half by two cameras), marker_raw_mm (the same before the
         filter), markers_missed (such markers not found), joint_mm, joint_mm_visible, pip_deg, pip_deg_visible,
         frames_without_pose.
-        A score with nothing to average is left out.
     """
     rows, columns = _match(poses.t_ns, truth.t_ns)
     clear = (truth.visible[columns] >= 0.5).sum(axis=1) >= 2
@@ -113,16 +94,13 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
 
 
 def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
-    """Score poses where the cameras see nothing of a finger.
-
-    Also when the source of information on it changes.
+    """Score fingers that the cameras do not see, and changes of a joint's source.
 
     Returns:
         joint_mm_hidden, pip_deg_hidden: Mean errors of fingers that are valid while their marker is at least half seen
             by less than two cameras; hidden_invalid: share of hidden fingers that are not valid.
         hand_over_step_mm: Largest step of a joint from pose to pose beyond its true step, within 0.2 s of a change of
-            any joint's source.
-        A score with nothing to average is left out.
+            any joint's source. A score with nothing to average is left out.
     """
     rows, columns = _match(poses.t_ns, truth.t_ns)
     found, exact = poses.position_m[rows][:, 1:], truth.joints_m[columns]
@@ -148,10 +126,7 @@ def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[s
 
 
 def _near_change(t_ns: Int, source: Code) -> Bool:
-    """Return a mask (N,) of the times near a change of any joint's source.
-
-    Within 0.2 s of each of the times (N,), of sources (N, 26).
-    """
+    """Mask (N,) of the times within 0.2 s of a change of any joint's source (N, 26)."""
     changed = t_ns[1:][(source[1:] != source[:-1]).any(axis=1)]
     hand_over_ns = 200_000_000
     after = np.searchsorted(changed, t_ns - hand_over_ns)
@@ -174,11 +149,7 @@ def _fingers_clear(clear: Bool, fingers: tuple[int, ...]) -> Bool:
 
 
 def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
-    """Rows of the poses and of the truth that belong together.
-
-    A recording has one truth per frame of the reference camera, hence per pose, or one for all its frames;
-    any other truth is matched by time.
-    """
+    """Rows of poses and truth: one truth for each pose, one for all, or by time."""
     rows = np.arange(len(t_ns))
     if len(truth_ns) == 1:
         return rows, np.zeros_like(rows)
@@ -192,11 +163,7 @@ def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
 
 
 def _check(truth: Truth, markers: int) -> None:
-    """Refuse arrays that do not fit together.
-
-    Raises:
-        ValueError: Naming the array, its shape and what is expected.
-    """
+    """Refuse arrays that do not fit together; the ValueError names the array."""
     n = len(truth.t_ns)
     cameras = truth.visible.shape[1] if truth.visible.ndim == 3 else 1
     for name, array, shape in (
@@ -239,21 +206,13 @@ _NEAR_NS = 100_000_000  # between truths farther apart nothing is interpolated
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectTruth:
-    """Where an object truly was.
+    """Where an object truly was."""
 
-    Attributes:
-        t_ns: (N,) rising, on the clock of the poses.
-        T_rig_object: (N, 4, 4) [m].
-    """
-
-    t_ns: Int
-    T_rig_object: Float
+    t_ns: Int  # (N,) rising, on the clock of the poses
+    T_rig_object: Float  # (N, 4, 4) [m]
 
     def at(self, t_ns: Int) -> Float:
-        """Interpolate poses (T, 4, 4) at other times (T,).
-
-        NaN outside, and where truths are too far apart.
-        """
+        """Interpolate poses (T, 4, 4) at times (T,); NaN outside and in long gaps."""
         out = np.full((len(t_ns), 4, 4), np.nan)
         if len(self.t_ns) == 0:
             return out
@@ -272,7 +231,7 @@ class ObjectTruth:
 
 
 def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
-    """Truth of an object of a rendered recording; None where the folder holds none.
+    """Truth of an object of a rendered recording; None where there is none.
 
     Raises:
         RecordingError: truth.npz is broken, leads out of the folder, or its arrays do not fit together.
@@ -294,10 +253,7 @@ def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
 
 
 def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:
-    """Return distance [mm] of the origin and angle [deg] of each pose (T,).
-
-    Both are from the truth; NaN where either is not known.
-    """
+    """Distance [mm] of the origin and angle [deg] (T,) from the truth; NaN: unknown."""
     true = truth.at(poses.t_ns)
     off_mm = 1e3 * np.linalg.norm(poses.position_m - true[:, :3, 3], axis=1)
     rotation = np.swapaxes(true[:, :3, :3], 1, 2) @ quaternion_to_matrix(poses.orientation_wxyz)
@@ -306,12 +262,12 @@ def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:
 
 
 def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
-    """Of one object.
+    """Score one object; what has nothing to average is omitted.
 
     Returns:
         mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true epochs at which it
         was), occluded (share of the tracked poses that report it), nees (median of the squared error by
-        its covariance, six numbers: about 5.3 where that is consistent). What has nothing to average is omitted.
+        its covariance, six numbers: about 5.3 where that is consistent).
     """
     mm, deg = errors(poses, truth)
     seen = poses.tracked & np.isfinite(mm) & np.isfinite(deg)
@@ -331,28 +287,17 @@ def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
 
 
 def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
-    """Return the share of true epochs at which the nearest pose is tracked.
-
-    The nearest pose must not be farther away than the usual spacing of poses.
-    """
+    """Share of true epochs whose nearest pose, not farther than usual, is tracked."""
     if len(truth.t_ns) == 0 or len(poses) == 0:
         return 0.0
     apart = [np.median(np.diff(t_ns)) for t_ns in (truth.t_ns, poses.t_ns) if len(t_ns) > 1]
-    after = np.clip(np.searchsorted(poses.t_ns, truth.t_ns), 0, len(poses) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(poses.t_ns[before] - truth.t_ns) <= np.abs(poses.t_ns[after] - truth.t_ns)
-    nearest = np.where(nearer, before, after)
+    nearest = nearest_rows(poses.t_ns, truth.t_ns)
     near = np.abs(poses.t_ns[nearest] - truth.t_ns) < max(apart, default=_NEAR_NS)
     return float((near & poses.tracked[nearest]).mean())
 
 
 def score_objects(scores: dict[str, dict[str, float]]) -> dict[str, object]:
-    """Return the object metrics for a summary.
-
-    `objects` (each by its name), and of all together object_mm, object_deg, object_tracked.
-
-    These are of the object that is worst in each.
-    """
+    """Object metrics of a summary: `objects` by name, and the worst as object_*."""
     if not scores:
         return {}
     out: dict[str, object] = {"objects": scores}

@@ -1,8 +1,7 @@
 """Errors of a wrist device against exact truth.
 
-They cover its laser points, its fingertips, and the hand solved from them.
-
-Every strobe cycle of the truth counts once, also one of which nothing was made: what is not found is missed there.
+They cover its laser points, its fingertips, and the hand solved from them. Every strobe cycle of the truth
+counts once, also one of which nothing was made: what is not found is missed there.
 """
 
 import logging
@@ -23,9 +22,8 @@ from master.rig.wrist import WristSetup
 
 GROUPS = ("palm", *FINGERS, "thenar")  # rows of the truth's laser line
 _OF_FINGERS = slice(1, 1 + FINGER_COUNT)
-_STRAIGHT_RAD = np.radians(
-    85.0
-)  # up to here the laser measures the flexion; from about 95 degrees its point stands still
+# up to here the laser measures the flexion; from about 95 degrees its point stands still
+_STRAIGHT_RAD = np.radians(85.0)
 _OF_WRIST = "wrist_"
 _ARRAYS = ("t_ns", "laser_pt", "laser_len_vis", "tip_uv", "tip_visible", "joints", "angles")
 _LOG = logging.getLogger(__name__)
@@ -33,34 +31,19 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristTruth:
-    """Exact values at N strobe cycles, in the frame of the wrist camera.
+    """Exact values at N strobe cycles, in the frame of the wrist camera; NaN: none."""
 
-    NaN: there is none.
-
-    Attributes:
-        t_ns: (N,) middle of the exposure of the laser frames.
-        laser_m: (N, 7, 3) what an ideal camera makes of the part of the line that is lit and seen on each of `GROUPS`.
-        laser_seen_m: (N, 7) length of that part.
-        tip_uv: (N, 5, 2) fingertips [px], whether seen or not.
-        tip_visible: (N, 5) whether they are seen.
-        joints_m: (N, 25, 3) WebXR joints.
-        pip_rad: (N, 5) PIP of index ... little, before them the MCP of the thumb.
-    """
-
-    t_ns: Int
+    t_ns: Int  # (N,) middle of the exposure of the laser frames
+    # (N, 7, 3) what an ideal camera makes of the part of the line that is lit and seen on each of `GROUPS`
     laser_m: Float
-    laser_seen_m: Float
-    tip_uv: Float
-    tip_visible: Bool
-    joints_m: Float
-    pip_rad: Float
+    laser_seen_m: Float  # (N, 7) length of that part
+    tip_uv: Float  # (N, 5, 2) fingertips [px], whether seen or not
+    tip_visible: Bool  # (N, 5) whether they are seen
+    joints_m: Float  # (N, 25, 3) WebXR joints
+    pip_rad: Float  # (N, 5) PIP of index ... little, before them the MCP of the thumb
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together.
-
-        Raises:
-            ValueError: Naming the array, its shape and what is expected.
-        """
+        """Refuse arrays that do not fit together; the ValueError names the array."""
         n, groups = len(self.t_ns), len(GROUPS)
         for name, shape in (
             ("laser_m", (n, groups, 3)),
@@ -93,13 +76,8 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     rows = [row.t_ns for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
     points = len(np.atleast_1d(data["laser_pt"])) if "laser_pt" in data else len(rows)
     if "t_ns" not in data and points != len(rows):
-        _LOG.warning(
-            "%s: nothing is scored: it has %d rows and no t_ns, camera %s has %d laser frames",
-            path,
-            points,
-            camera,
-            len(rows),
-        )
+        text = "%s: nothing is scored: it has %d rows and no t_ns, camera %s has %d laser frames"
+        _LOG.warning(text, path, points, camera, len(rows))
         return None
     try:
         return WristTruth(
@@ -160,13 +138,10 @@ def cycles_missed(poses: Poses, truth: WristTruth) -> int:
 def score_cycles(
     setup: WristSetup, messages: Sequence[WristDetections], truth: WristTruth
 ) -> dict[str, float]:
-    """Compute errors of the laser points of strobe cycles.
-
-    They do not depend on the hand that is solved from them.
+    """Errors of the laser points of strobe cycles, whatever hand is solved from them.
 
     Returns:
-        triples: How many there are; cycles_missed: how many of the truth's are missing. Of the laser points as
-        `score_wrist`.
+        cycles; cycles_missed: how many of the truth's are missing; of the laser points as `score_wrist`.
     """
     at_ns = np.array([message.t_ns for message in messages], np.int64)
     uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
@@ -200,10 +175,7 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
 
 
 def score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
-    """Score the laser points (N, 5, 3) of all strobe cycles.
-
-    The scores are as in `score_wrist`.
-    """
+    """Score the laser points (N, 5, 3) of all strobe cycles, as in `score_wrist`."""
     to_groups = 1e3 * np.linalg.norm(found[:, :, None] - truth.laser_m[:, None], axis=3)
     own = np.stack([to_groups[:, f, 1 + f] for f in range(FINGER_COUNT)], axis=1)
     reported = np.isfinite(found).all(axis=2)
@@ -220,10 +192,7 @@ def score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
 
 
 def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
-    """Score the fingers whose laser line and tip are both in sight.
-
-    `row` (N,) are the rows of the poses.
-    """
+    """Score fingers with laser line and tip in sight; `row` (N,) of the poses."""
     both = clear_line(truth) & truth.tip_visible
     error = np.abs(np.degrees(at_rows(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
     by_ik = at_rows((poses.solver_mode == SolverMode.IK).astype(np.float64), row) == 1.0
@@ -242,10 +211,7 @@ def clear_line(truth: WristTruth) -> Bool:
 
 
 def rows_at(truth_ns: Int, t_ns: Int) -> Int:
-    """Return for each true strobe cycle the row of the same time in `t_ns`.
-
-    `t_ns` (T,) is in rising order; -1: there is none.
-    """
+    """Row of the same time in rising `t_ns` (T,) for each true cycle; -1: none."""
     if not len(t_ns):
         return np.full(len(truth_ns), -1)
     after = np.clip(np.searchsorted(t_ns, truth_ns), 0, len(t_ns) - 1)
@@ -263,10 +229,7 @@ def at_rows(values: Float, row: Int) -> Float:
 
 
 def _any_of(joints: Bool) -> Bool:
-    """Return (N, 4) whether any finger joint is among the joints (N, 26).
-
-    The fingers are index ... little, and only joints beyond the metacarpal count.
-    """
+    """Mask (N, 4) of index ... little with any joint but the metacarpal in (N, 26)."""
     return np.stack([joints[:, list(finger[1:])].any(axis=1) for finger in FINGER_JOINTS[1:]], axis=1)
 
 

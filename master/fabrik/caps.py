@@ -1,27 +1,16 @@
 """Painted finger tips and lenses shift centroids; tables correct them.
 
-Painted finger tips as tables: how a cap looks from all sides.
-
 A cap is the rounded end of a finger: half a sphere of the tip's radius about the tip joint, and a stretch of
-cylinder behind it whose length follows from the profile's offset (the centroid of half a sphere and of a cylinder of
-length L lies (r - L) / 2 ahead of the centre). A camera sees the part that faces it, and the centroid of that
-silhouette is the mean of the facing surface weighted by the cosine of its tilt. The kernels of
-`master.fabrik.caps` take the difference from the detection, at the hand pose known so far.
+cylinder behind it whose length follows from the profile's offset (the centroid of half a sphere and of a
+cylinder of length L lies (r - L) / 2 ahead of the centre). A camera sees the part that faces it, and the
+centroid of that silhouette is the mean of the facing surface weighted by the cosine of its tilt.
 
-Kernels over the tables of `master.fabrik.caps`: what a camera sees of a cap.
-
-Centroid bias of a marker in an image whose lens distorts its outline.
-
-It gives the image position of the marker's centre.
-
-The centroid of a blob is not the image of the marker's centre: distortion magnifies the outer part of the marker more
-(or less) than the inner one and so shifts the centroid, by the third derivative of the lens, in proportion to the
-blob's area. For the lens of k1 = 0.1 at 500 px focal length, half way to the corner, that is 0.02 px for a finger cap
-(500 px^2) and 1 px for a card that fills a tenth of the image. Perspective shifts the centroid as well, but not of a
-target that faces the camera.
-
-Where the outline is known, the shift is computed (`centre_of_blob`): sent through the lens, the outline is a polygon,
-and its centroid follows from its corners. In every frame it is expanded to second order (`LensShift`).
+The centroid of a blob is not the image of the marker's centre either: distortion magnifies the outer part of
+the marker more (or less) than the inner one and so shifts the centroid, by the third derivative of the lens,
+in proportion to the blob's area. For the lens of k1 = 0.1 at 500 px focal length, half way to the corner,
+that is 0.02 px for a finger cap (500 px^2) and 1 px for a card that fills a tenth of the image. Perspective
+shifts the centroid as well, but not of a target that faces the camera. Where the outline is known, it is sent
+through the lens as a polygon (`centre_of_blob`); in every frame it is expanded to second order (`LensShift`).
 """
 
 from functools import lru_cache
@@ -44,32 +33,20 @@ _ANGLES = 90  # steps of the tables
 class CapSettings(NamedTuple):
     """Numbers of the caps' observation model.
 
-    Attributes:
-        flat_share: A flat marker that shows less of what the best camera sees is tilted by 53 degrees, or partly
-            hidden.
-        least_share: Least part of a whole cap's area that counts as whole: its radius is a tenth smaller than the
-            profile states.
-        alike_share: Least part of the share that another camera sees: what edges of two blobs of 200 px do not explain.
-        reach: Least hidden part by the largest of all cameras. What hides a part from one is near the line of sight of
-            the others, and none of them can measure what is hidden from all: of 20 rendered caps the lesser hidden
-            part by the larger is 0.16 in the mean, 0.28 rms.
-        rotation_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
-        radius_share: Relative error of a profile's radii: 0.8 mm.
-        relief_m: [m] of a flat marker on a back that is not flat: 16 mm of colour on a radius of curvature of 50 mm
-            bulge by 0.6 mm.
-        most_tilt: Largest tangent of the tilt of a sigma point, which stays on its side.
-        bent_rad: [rad] farthest from the camera that a cap of an unknown hand points: it still shows a strip.
+    `alike_share`: what edges of two blobs of 200 px do not explain. `reach`: what hides a part from one
+    camera is near the line of sight of the others, and none of them can measure what is hidden from all: of
+    20 rendered caps the lesser hidden part by the larger is 0.16 in the mean, 0.28 rms.
     """
 
-    flat_share: float = 0.6
-    least_share: float = 0.8
-    alike_share: float = 0.9
-    reach: float = 0.2
-    rotation_rad_s: float = 2.0
-    radius_share: float = 0.1
-    relief_m: float = 0.4e-3
-    most_tilt: float = 2.0
-    bent_rad: float = 2.356194490192345
+    flat_share: float = 0.6  # a flat marker that shows less of the best camera's is tilted (53 deg) or hidden
+    least_share: float = 0.8  # least part of a cap that counts as whole: its radius is a tenth smaller
+    alike_share: float = 0.9  # least part of the share that another camera sees
+    reach: float = 0.2  # least hidden part by the largest of all cameras
+    rotation_rad_s: float = 2.0  # standard deviation: a fist closes in a second
+    radius_share: float = 0.1  # relative error of a profile's radii: 0.8 mm
+    relief_m: float = 0.4e-3  # of a flat marker: 16 mm of colour on a curvature of 50 mm bulge by 0.6 mm
+    most_tilt: float = 2.0  # largest tangent of the tilt of a sigma point, which stays on its side
+    bent_rad: float = 2.356194490192345  # from the camera, of an unknown hand: it still shows a strip
 
 
 CAPS = CapSettings()
@@ -78,27 +55,19 @@ CAPS = CapSettings()
 class CapTables(NamedTuple):
     """How the M markers of a rig look from all sides; K of them are caps.
 
-    Attributes:
-        row: (M,) row of `appearances`; -1: flat, its centroid is what is seen.
-        looks: (K, A + 1, 3) over the angle between finger and sight, 0 to pi: shift of the seen centroid along the
-            finger and towards the eye [m], and the area seen [m^2].
-        radius_m: (K,).
-        joint: (K,) index of the tip joint.
-        finger: (K,).
+    `appearances` (K, A + 1, 3), over the angle between finger and sight, 0 to pi: shift of the seen centroid
+    along the finger and towards the eye [m], and the area seen [m^2].
     """
 
-    row: Int
+    row: Int  # (M,) row of `appearances`; -1: flat, its centroid is what is seen
     appearances: Float
-    radius_m: Float
-    joint: Int
-    finger: Int
+    radius_m: Float  # (K,)
+    joint: Int  # (K,) index of the tip joint
+    finger: Int  # (K,)
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...]) -> "CapTables":
-        """Tabulate the caps of a hand; once for the same hand and markers.
-
-        A marker on the palm, or on no hand, is flat.
-        """
+        """Tabulate the caps of a hand, cached; markers on the palm or no hand are flat."""
         return _tables(model, markers)
 
     @classmethod
@@ -151,9 +120,8 @@ def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
 def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     """Tabulate a cap whose finger points 0..180 degrees away from the eye.
 
-    Returns:
-        (_ANGLES + 1, 3): the seen centroid along the finger and, square to it, towards the eye [m], from the cap's
-        own; and the area seen [m^2]. A cap is round, so that the one angle is enough.
+    (_ANGLES + 1, 3): the seen centroid along the finger and, square to it, towards the eye [m], from the
+    cap's own; and the area seen [m^2]. A cap is round, so that the one angle is enough.
     """
     angle = np.arange(_ANGLES + 1) * (np.pi / _ANGLES)
     eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
@@ -167,9 +135,7 @@ def _appearances(points: Float, normals: Float, areas: Float) -> Float:
 def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
     """Sample a cap in the tip joint's frame (-z to the finger's end).
 
-    Args:
-        radius_m: Radius of tip and finger.
-        ahead_m: How far the cap's centroid lies ahead of the tip joint, at most half a radius.
+    `ahead_m`: how far the cap's centroid lies ahead of the tip joint, at most half a radius.
 
     Returns:
         Points (N, 3) [m], outward normals (N, 3), areas (N,) [m^2].
@@ -199,28 +165,16 @@ ANY = 5  # and while no hand is known
 
 
 class Views(NamedTuple):
-    """How one marker looks; T directions that a cap may have, C cameras.
+    """How one marker looks; T directions that a cap may have, C cameras."""
 
-    Attributes:
-        area: (C,) [px^2]; NaN: not seen.
-        scale: (C,) [m/px] at the marker.
-        hidden: (C,) [px^2] variance that occlusion adds.
-        aim: (T, 3) directions.
-        bias: (T, C, 2) [px] seen centroid less the cap's own.
-        whole: (T, C) [m^2] area that the whole cap shows.
-        moved: (T, 3) [m] by how much the correction moves the point.
-        back, shift: (3,) room.
-        gain, step, both: (3, 2), (3, 3), (3, 3) room.
-    """
-
-    area: Float
-    scale: Float
-    hidden: Float
-    aim: Float
-    bias: Float
-    whole: Float
-    correction_jacobian_m: Float
-    back: Float
+    area: Float  # (C,) [px^2]; NaN: not seen
+    scale: Float  # (C,) [m/px] at the marker
+    hidden: Float  # (C,) [px^2] variance that occlusion adds
+    aim: Float  # (T, 3) directions
+    bias: Float  # (T, C, 2) [px] seen centroid less the cap's own
+    whole: Float  # (T, C) [m^2] area that the whole cap shows
+    correction_jacobian_m: Float  # (T, 3) [m] by how much the correction moves the point
+    back: Float  # (3,) from here on scratch
     shift: Float
     gain: Float
     step: Float
@@ -229,30 +183,16 @@ class Views(NamedTuple):
     @classmethod
     def empty(cls, cameras: int) -> "Views":
         """Room for a number of cameras."""
-        return cls(
-            np.empty(cameras),
-            np.empty(cameras),
-            np.empty(cameras),
-            np.empty((TILTED, 3)),
-            np.empty((TILTED, cameras, 2)),
-            np.empty((TILTED, cameras)),
-            np.empty((TILTED, 3)),
-            np.empty(3),
-            np.empty(3),
-            np.empty((3, 2)),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-        )
+        by_camera = cameras, cameras, cameras
+        by_direction = (TILTED, 3), (TILTED, cameras, 2), (TILTED, cameras), (TILTED, 3)
+        return cls(*(np.empty(shape) for shape in (*by_camera, *by_direction, 3, 3, (3, 2), (3, 3), (3, 3))))
 
 
 @kernel
 def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float) -> float:
     """Write a cap's seen centroid less its own (3,) [m]; return the area seen [m^2].
 
-    Args:
-        caps, row: The cap.
-        ahead, back: Unit vectors (3,) along the finger and to the eye; NaN: so is what is seen.
-        out: Written.
+    `ahead`, `back`: unit vectors (3,) along the finger and to the eye; NaN: so is what is seen.
     """
     cosine = ahead[0] * back[0] + ahead[1] * back[1] + ahead[2] * back[2]
     if not np.isfinite(cosine):  # no row of the table
@@ -275,16 +215,10 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
 def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Float) -> None:
     """Write the direction of a cap, and six tilted as far as it is uncertain.
 
-    The six are sigma points of two uncertain numbers: the mean square of what differs between them and the first is
-    its variance (Julier and Uhlmann 1997; four would do where all is linear, but a cap seen from behind looks
-    different from every side).
-
-    Args:
-        row: Which.
-        R: (K, 3, 3) rotations of the tip joints, rig frame; -z is the finger's direction.
-        tilt_rad2: (K, 3, 3) covariance of these directions; only that across them counts.
-        rotation_rad2: Variance that their age adds.
-        out: Written: (TILTED, 3) unit vectors.
+    The six are sigma points of two uncertain numbers: the mean square of what differs between them and the
+    first is its variance (Julier and Uhlmann 1997; four would do where all is linear, but a cap seen from
+    behind looks different from every side). `R` (K, 3, 3): -z is the finger's direction, rig frame;
+    `tilt_rad2` (K, 3, 3) its covariance; `rotation_rad2`: variance that its age adds; `out` (TILTED, 3).
     """
     xx, xy, yy = rotation_rad2, 0.0, rotation_rad2
     for a in range(3):
@@ -312,14 +246,9 @@ def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Floa
 
 @inner
 def any_direction(cameras: CameraArrays, point: Float, out: Float) -> None:
-    """Write directions in which a cap may point while no hand is known.
+    """Write directions (ANY, 3) in which a cap at a point may point, hand unknown.
 
     Towards the middle of the cameras, and four bent away from it as far as the cap is still seen.
-
-    Args:
-        cameras: Of the rig.
-        point: (3,) [m] about where the cap is.
-        out: Written: (ANY, 3) unit vectors and more rows.
     """
     back, length = out[0], 0.0
     count = cameras.centre.shape[0]
@@ -355,19 +284,18 @@ def hidden_part(
 ) -> None:
     """Write the variance (C,) [px^2] of centroids of a marker that is partly hidden.
 
-    What is missing lies to one side, so the centroid of a cap moves by up to a radius, in each camera another way. The
-    radius of a cap may be wrong, but it is wrong for all cameras: one that sees less of its share than another sees a
-    cap that is partly hidden. Whatever part of a disc is cut off, its centroid moves by about that part of the radius,
-    until half is gone. A flat marker may show little because it is tilted or because skin hides it: a camera that sees
-    much less of it than the one that sees most knows it to half of its side only.
+    What is missing lies to one side, so the centroid of a cap moves by up to a radius, in each camera another
+    way. The radius of a cap may be wrong, but it is wrong for all cameras: one that sees less of its share
+    than another sees a cap that is partly hidden. Whatever part of a disc is cut off, its centroid moves by
+    about that part of the radius, until half is gone. A flat marker (row -1) may show little because it is
+    tilted or because skin hides it: a camera that sees much less of it than the one that sees most knows it
+    to half of its side only.
 
     Args:
-        caps, row: The marker; row -1: flat.
         area_px2: (C,) seen areas; NaN: not measured.
         scale_m: (C,) [m/px] at the marker.
         whole_m2: (count, C) area that the whole cap shows, square to the sight, in each direction that it may have:
             only what none of them explains is hidden. Not used of a flat marker.
-        count: Directions.
         out: Written; 0: nothing is hidden.
     """
     cameras, largest = area_px2.shape[0], 0.0
@@ -410,10 +338,7 @@ def hidden_part(
 def appearance(
     cameras: CameraArrays, caps: CapTables, row: int, count: int, rays: Rays, views: Views
 ) -> None:
-    """Write bias and area of a cap in all cameras for `count` directions.
-
-    A flat marker has neither.
-    """
+    """Write bias and area of a cap, none of a flat marker, for `count` directions."""
     back, shift = views.back, views.shift
     for c in range(rays.weight.shape[0]):
         distance = 0.0
@@ -462,10 +387,7 @@ def round_outline() -> Float:
 
 
 def card_outline(width: float, height: float) -> Float:
-    """Return an upright rectangle of unit area around the origin, (K, 2).
-
-    The ratio of its sides is `width` : `height`.
-    """
+    """Return an upright rectangle (K, 2) of unit area, `width` : `height`, around 0."""
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     along = np.linspace(0.0, 1.0, _CORNERS // 4, endpoint=False)[:, None]  # the lens bends the sides
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
@@ -476,7 +398,6 @@ def centre_of_blob(camera: CameraModel, uv: Float, area_px2: Float, outline: Flo
     """Pixels (N, 2) at which the camera sees the centres of markers that face it.
 
     Args:
-        camera: The camera.
         uv: Centroids of the blobs (N, 2) [px], distorted image. NaN: not seen.
         area_px2: Areas of the blobs (N,) [px^2]. NaN: not known, the centroid is returned.
         outline: Corners (K, 2) of the marker's shape, of unit area, around its centre.
@@ -501,24 +422,18 @@ def centre_of_blob(camera: CameraModel, uv: Float, area_px2: Float, outline: Flo
 class LensShift:
     """Centroid shift of round blobs in all cameras of a rig, from their areas.
 
-    Holds no state between calls.
-
-    With g the lens (normalised point -> pixel), S its determinant |dg/dx| and a region around x of the isotropic second
-    moment m per axis, the centroid of the region's image is, to second order in its size (Taylor expansion of
-    integral g S / integral S; the first moments vanish about the centre),
+    With g the lens (normalised point -> pixel), S its determinant |dg/dx| and a region around x of the
+    isotropic second moment m per axis, the centroid of the region's image is, to second order in its size
+    (Taylor expansion of integral g S / integral S; the first moments vanish about the centre),
 
         g(x) + m (1/2 Laplacian g + dg/dx grad ln S),      m = area_px2 / (4 pi S) for a disc
 
     For the radial lens R(s) = 1 + k1 s + k2 s^2 + k3 s^3, s = x^2 + y^2, the bracket is
     f (12 R' + 6 s R'' + 4 s R'^2 / R) (x, y); p1 and p2 add 12 f (p2, p1), their products with k left out.
-    It is tabulated once, on a grid of the image.
-
-    Attributes:
-        any: Whether a lens distorts.
+    It is tabulated once, on a grid of the image. `any`: whether a lens distorts.
     """
 
     def __init__(self, cameras: tuple[CameraModel, ...]) -> None:
-        """Tabulate the lenses of these cameras."""
         self.any = any(camera.distortion.any() for camera in cameras)
         cells = np.array([[camera.width_px, camera.height_px] for camera in cameras]) // _CELL_PX + 1
         columns, rows = (int(n) for n in cells.max(axis=0))
@@ -530,22 +445,14 @@ class LensShift:
         self._camera = np.arange(len(cameras))[:, None]
 
     def centres(self, uv: Float, area_px2: Float) -> Float:
-        """Where the cameras see the centres (C, M, 2) [px] of round blobs.
-
-        Args:
-            uv: Centroids (C, M, 2) [px], distorted images. NaN: not seen.
-            area_px2: Areas (C, M) [px^2]. NaN: not known, the centroid is returned.
-        """
+        """Where cameras see blobs' centres (C, M, 2) [px]; area NaN: the centroids."""
         cell = np.fmin(np.fmax(uv / _CELL_PX + 0.5, 0.0), self._last).astype(np.int64)  # NaN: any
         shift = self._per_px2[self._camera, cell[..., 1], cell[..., 0]]
         return uv - shift * np.fmax(area_px2, 0.0)[..., None]
 
 
 def _shift_per_px2(camera: CameraModel, uv: Float) -> Float:
-    """Return the centroid shift by area [px/px^2] at image positions (..., 2) [px].
-
-    It is 0 where the lens model is folded.
-    """
+    """Return the shift by area [px/px^2] at (..., 2) [px]; 0: the lens folds there."""
     k1, k2, p1, p2, k3 = camera.distortion.tolist()
     focal = camera.matrix[[0, 1], [0, 1]]
     xy = camera.undistort(uv)

@@ -1,35 +1,21 @@
 """Angles of a finger follow from one point on it, in closed form.
 
-The legal pose of a finger whose end is nearest to a target.
-
-Damped least squares (Wampler 1986; Levenberg-Marquardt) on the four angles, with an active set: an angle at its limit
-that the gradient would push outside is left out of the step. Three equations, so the step is
-J^T (J J^T + damping I)^-1 r with one 3x3 solve; with more angles than equations it is the step of least change, which
-keeps a redundant finger near its seed.
-
-Where abduction narrows with flexion the region is no box. So the first unknown is not the abduction a but
-a / (share of the range that is left at this flexion): its limits are constant, and the region is a box again.
-
-Finger angles from one point on the finger, in closed form.
-
-A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
+Angles are (4,): abduction, flexion, PIP, DIP (thumb: CMC abduction, CMC flexion, MCP, IP) [rad]. A point
+leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
 point lies at w(PIP), which neither flexion nor abduction can stretch:
 
     |target - root| = |w(PIP)|       monotone but for a few degrees round the straight finger -> PIP
     R_y(a) rest R_x(-f) w = target   y gives the flexion, x and z the abduction: two atan2
 
-This holds for bones out of plane too. The range of the PIP is cut where |w| turns, and where the DIP meets its own
-limit, into branches on which |w| is monotone; each is inverted by Newton's method inside a bracket.
+This holds for bones out of plane too. The range of the PIP is cut where |w| turns, and where the DIP meets
+its own limit, into branches on which |w| is monotone; each is inverted by Newton's method inside a bracket.
 
-Where no such pose is legal, least squares go on from the nearest of them inside the limits. There a free DIP finds
-its own angle, and a target out of reach the nearest pose.
-
-Kernels of a finger's chain: a rotor (box) and two flexion hinges, coupled or not. Angles are (4,): abduction, flexion,
-PIP, DIP (thumb: CMC abduction, CMC flexion, MCP, IP) [rad].
-
-Kernels of the pipeline's palm: back normal and finger targets.
-
-They give where the back faces, and where fingers are to bring their markers.
+Where no such pose is legal, damped least squares (Wampler 1986; Levenberg-Marquardt) go on from the nearest
+of them inside the limits. An angle at its limit that the gradient would push outside is left out of the step,
+J^T (J J^T + damping I)^-1 r: with more angles than equations the step of least change, which keeps a
+redundant finger near its seed. Where abduction narrows with flexion the region is no box. So the first
+unknown is not the abduction a but a / (share of the range that is left at this flexion), whose limits are
+constant.
 """
 
 from math import cos, inf, isfinite, pi, sin, sqrt
@@ -74,17 +60,10 @@ from master.fabrik.linear_algebra import (
 def least_squares(
     chain: ChainArrays, goal: Vector, tolerance_m: float, max_steps: int, angles: Float
 ) -> float:
-    """Improve a finger's angles until the target is hit or no legal step helps.
+    """Improve a finger's angles until the target is hit; return the distance [m].
 
-    Args:
-        chain: A rotor (box) and two flexion hinges; its coupling, when it has one, is obeyed.
-        goal: Target [m], root frame, finite.
-        tolerance_m: Residual that ends the search [m].
-        max_steps: Of the search, taken or refused.
-        angles: (4,) [rad]; in: start, clamped to the limits; out: legal.
-
-    Returns:
-        Distance left [m].
+    A rotor (box) and two flexion hinges; its coupling is obeyed. `goal` [m], root frame, finite; `max_steps`
+    of the search, taken or refused; `angles` (4,) [rad]; in: start, clamped to the limits; out: legal.
     """
     share, _ = narrowing(limits_of(chain, ROOT), angles[1])
     unknowns, trial = angles.copy(), np.empty(4)
@@ -223,20 +202,16 @@ def closed_form(
     angles: Float,
     initial_angles: Float,
 ) -> float:
-    """The legal pose that hits the target.
+    """The legal pose that hits the target; return the distance [m], or infinity.
 
     Args:
-        chain: Of the finger.
         edges: (B + 1,) ends of the branches of the PIP, rising [rad].
         ratio: DIP per PIP.
         goal: Target [m], root frame, finite.
-        near: (4,) angles of a moment ago [rad]: where several legal poses hit the target (straight finger, pole of
-            the abduction) the nearest is taken; NaN: the more bent one, then the less abducted.
+        warm_start: (4,) angles of a moment ago [rad]: where several legal poses hit the target (straight finger, pole
+            of the abduction) the nearest is taken; NaN: the more bent one, then the less abducted.
         angles: (4,) [rad]; out, where there is such a pose.
-        seeds: (3, 4) [rad]; out, legal poses from which to search on where there is none.
-
-    Returns:
-        Distance of the point to the target [m]; infinite: no such pose is legal.
+        initial_angles: (3, 4) [rad]; out, legal poses from which to search on where there is none.
     """
     local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     distance2, branches = dot(local, local), len(edges) - 1
@@ -309,7 +284,7 @@ def _invert(
 ) -> tuple[float, float]:
     """PIP [rad] of |w|^2 on the branch [low, high], and how far that is beyond it.
 
-    It starts with PIP linear in sqrt(|w|_far^2 - |w|^2), which it nearly is, also at the straight finger.
+    It starts linear in sqrt(|w|_far^2 - |w|^2), as the PIP nearly is, also at the straight finger.
     """
     d_low, d_high = distance2_of(chain, ratio, low)[0], distance2_of(chain, ratio, high)[0]
     far, bent = (low, high) if d_low >= d_high else (high, low)
@@ -347,7 +322,6 @@ def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int,
 
 @inner
 def _known(angles: Float) -> bool:
-    """Whether all of a finger's angles (4,) are known."""
     return isfinite(angles[0] + angles[1] + angles[2] + angles[3])
 
 
@@ -364,14 +338,12 @@ def _rank(angles: Float, warm_start: Float, branch: int) -> float:
 
 @inner
 def _copy(source: Float, out: Float) -> None:
-    """Write angles (4,)."""
     for i in range(4):
         out[i] = source[i]
 
 
 @inner
 def _copy_row(rows: Float, row: int, out: Float) -> None:
-    """Write angles (4,) from a row of (S, 4)."""
     for i in range(4):
         out[i] = rows[row, i]
 
@@ -421,13 +393,7 @@ def nearest_pose(
 ) -> float:
     """The legal pose nearest to the target, where none hits it in closed form.
 
-    Args:
-        chain, goal, near: As of `closed_form`.
-        seeds: (3, 4) [rad], of `closed_form`.
-        angles: (4,) [rad], out.
-
-    Returns:
-        Distance of the point to the target [m].
+    Arguments as of `closed_form`, `angles` written; returns the distance of the point to the target [m].
     """
     best, trial = inf, np.empty(4)
     local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
@@ -469,19 +435,13 @@ def _start(
 
 @kernel
 def back_normal_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
-    """Write the unit vector from a hand to the cameras that see its back.
+    """Write the unit vector from a hand to the cameras that see its back, if placed.
 
-    A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by
-    what each sees, add up to where it faces, as far as they constrain it.
+    A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras,
+    weighed by what each sees, add up to where it faces, as far as they constrain it.
 
-    Args:
-        points: (M, 3) [m] its markers, rig frame; NaN: not placed.
-        area_px2: (C, K) of those on its back as each camera sees them; NaN: not seen.
-        centres, focal_px: (C, 3) [m] and (C,) of the cameras.
-        out: (3,) written.
-
-    Returns:
-        Whether a marker is placed; else nothing is written.
+    `points` (M, 3) [m], rig frame; NaN: not placed; none: return False. `area_px2` (C, K) of those on the
+    back; NaN: not seen. `centres`, `focal_px`: (C, 3) [m] and (C,) of the cameras.
     """
     count = 0
     middle, back = np.zeros(3), np.empty(3)
@@ -522,14 +482,8 @@ def back_normal_of(points: Float, area_px2: Float, centres: Float, focal_px: Flo
 def targets_of(points: Float, cov: Float, T: Float, fitted: Float, fit_m2: float, out: Float) -> None:
     """Write where fingers are to bring their markers (M, 3) [m], palm frame.
 
-    Where they are measured, as far as that is surer than the fit.
-
-    Args:
-        points, cov: (M, 3) [m] and (M, 3, 3) [m^2] measured, rig frame; NaN: not seen.
-        T: (4, 4) palm.
-        fitted: (M, 3) [m] where the palm's fit has them, rig frame.
-        fit_m2: Variance of these.
-        out: Written; NaN where not seen.
+    Where they are measured (rig frame; NaN: not seen, as in `out`), as far as that is surer than where the
+    fit of the palm T has them: `fitted` (M, 3) [m], rig frame, of variance `fit_m2`.
     """
     gain, off, target = np.empty((3, 3)), np.empty(3), np.empty(3)
     for m in range(points.shape[0]):

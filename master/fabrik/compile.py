@@ -1,7 +1,4 @@
-"""Notice that kernels are being compiled.
-
-This takes two minutes on a version's first start.
-"""
+"""Notice that kernels are being compiled: two minutes on a version's first start."""
 
 import logging
 import threading

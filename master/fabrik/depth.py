@@ -1,7 +1,5 @@
 """Depth from the raw disparity of a parallel pair.
 
-The position follows from depth and centroid.
-
 Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectified. Three laws:
 
     ideal     D = f B / x, f = width / (2 tan(fov / 2))   pinhole, perfectly parallel cameras
@@ -81,10 +79,7 @@ class PowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class AffineDisparity:
-    """Affine disparity law x = a / D + x0.
-
-    a is focal length times baseline, x0 the disparity of an infinitely far point.
-    """
+    """Affine law x = a / D + x0: a is f B, x0 the disparity at infinity."""
 
     a_m_px: float
     x0_px: float
@@ -110,10 +105,7 @@ class AffineDisparity:
 def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDisparity:
     """The law of perfectly parallel pinhole cameras: affine with a = f B and x0 = 0.
 
-    Args:
-        baseline_m: Distance of the optical centres [m].
-        fov_rad: Horizontal field of view [rad] over the whole width.
-        width_px: Image width [px].
+    `baseline_m`: of the optical centres; `fov_rad`: horizontal, over the whole width.
 
     Raises:
         ValueError: Not a camera.
@@ -125,10 +117,6 @@ def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDispari
 
 def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw | AffineDisparity | None:
     """The law the rig file asks for; None when it asks for full stereo triangulation.
-
-    Args:
-        rig: The rig file.
-        cameras: Its cameras, in its order.
 
     Raises:
         CalibrationError: The named law has no numbers, or the rig is not one pair of parallel cameras.
@@ -159,9 +147,7 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw |
 
 
 def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
-    """Return how the rig's depth law contradicts its camera poses.
-
-    It is checked where both are used; empty: no contradiction.
+    """Return how the rig's depth law contradicts its camera poses; empty: not.
 
     Raises:
         CalibrationError: As `depth_law`.
@@ -181,8 +167,8 @@ def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
 def _crooked(left: CameraModel, right: CameraModel) -> str:
     """What keeps raw disparity from being a measure of depth; empty: nothing.
 
-    Beyond these bounds the disparity of one depth changes by more over the image than a law fitted on the axis and the
-    correction off it (`master.fabrik.triangulate`) take.
+    Beyond these bounds the disparity of one depth changes by more over the image than a law fitted on the
+    axis and the correction off it (`master.fabrik.triangulate`) take.
     """
     R = left.T_rig_camera[:3, :3].T
     rotation = R @ right.T_rig_camera[:3, :3]
@@ -209,10 +195,7 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
 
 
 def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
-    """Return the disparity (N,) [px] at depths (N,) [m] on the fitting axis.
-
-    A law is fitted there: in front of the midpoint between the first two cameras.
-    """
+    """Return disparities (N,) [px] at depths (N,) [m] before the cameras' midpoint."""
     left, right = cameras[:2]
     axis = left.T_rig_camera[:3, 2]
     middle = 0.5 * (right.centre - left.centre)
@@ -224,12 +207,7 @@ def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
 def law_residual(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
     """Return the largest relative error of the law on the axis, and its depth [m].
 
-    The error is the difference from the cameras' own geometry.
-
-    Args:
-        law: Of the first two cameras.
-        cameras: In the rig's order.
-        volume: Whose depths are asked; None: usual ones.
+    Against the geometry of the first two cameras; `volume`: whose depths are asked; None: usual ones.
     """
     left = cameras[0]
     low_m, high_m = _DEPTHS_M
@@ -245,17 +223,11 @@ def law_residual(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume |
 
 @dataclass(frozen=True, slots=True)
 class ErrorBudget:
-    """What spoils a depth [m], one standard cause each, at one distance.
+    """What spoils a depth [m], one standard cause each, at one distance."""
 
-    Attributes:
-        per_pixel_m: One whole pixel of disparity, D^2 / (f B) for the ideal law.
-        centroid_m: Both centroids' noise, sqrt(2) sigma |dD/dx|.
-        sync_m: Sideways motion between the two exposures, D v dt / B.
-    """
-
-    per_pixel_m: float
-    centroid_m: float
-    sync_m: float
+    per_pixel_m: float  # one whole pixel of disparity, D^2 / (f B) for the ideal law
+    centroid_m: float  # both centroids' noise, sqrt(2) sigma |dD/dx|
+    sync_m: float  # sideways motion between the two exposures, D v dt / B
 
 
 def error_budget(
@@ -264,9 +236,6 @@ def error_budget(
     """Depth errors to expect at `depth_m`, from the derivatives of the ideal law.
 
     Args:
-        law: Depth law of the rig.
-        depth_m: Distance [m].
-        baseline_m: Distance of the optical centres [m].
         sigma_px: Centroid noise of one camera, per axis [px].
         speed_m_s: Sideways speed of the marker [m/s].
         skew_s: Time between the two exposures that nobody corrects [s].
@@ -280,43 +249,32 @@ def error_budget(
 
 
 def tolerable_skew_s(share: float, baseline_m: float, speed_m_s: float) -> float:
-    """Return the exposure skew [s] that costs `share` of the depth.
-
-    It is the time between the two exposures at a sideways speed: share B / v, for any D.
-    """
+    """Return the exposure skew [s] that costs `share` of any depth: share B / v."""
     return share * baseline_m / speed_m_s
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResidual:
-    """Residual errors that a calibration is known to leave.
+    """Residual errors that a calibration is known to leave, by its provenance.
 
-    They are stated by its provenance.
-
-    Attributes:
-        rays_px: RMS reprojection error of the cameras together [px]: a bound on what lens and pose are wrong by at one
-            place. How much of it was the noise of the corners cannot be separated afterwards.
-        law: Relative error of the depth law, standard deviation.
+    `rays_px`: RMS reprojection error of the cameras together: a bound on what lens and pose are wrong by at
+    one place. How much of it was the noise of the corners cannot be separated afterwards.
     """
 
-    rays_px: float = 0.0
-    law: float = 0.0
+    rays_px: float = 0.0  # [px]
+    law: float = 0.0  # relative error of the depth law, standard deviation
 
     @classmethod
     def of(cls, rig: RigCalibration) -> "CalibrationResidual":
-        """Return the residuals that the rig's file states.
-
-        They are 0 where it states nothing, as for files typed in by hand.
-        """
+        """Return the residuals of the rig's file; 0: none stated, it was typed in."""
         rays = rig.provenance.get("T_rig_camera")
         law = None if rig.depth_model == "stereo" else rig.provenance.get(rig.depth_model)
         left = {} if law is None else law.residual
         mean_percent = left.get("leave_one_out_mean_percent", left.get("mean_percent", 0.0))
+        # of a mean of absolute errors that are normally distributed
         return cls(
             rays_px=0.0 if rays is None else rays.residual.get("rms_px", 0.0),
-            law=1e-2
-            * mean_percent
-            * sqrt(pi / 2),  # of a mean of absolute errors that are normally distributed
+            law=1e-2 * mean_percent * sqrt(pi / 2),
         )
 
 

@@ -1,35 +1,25 @@
 """FABRIK solves a chain of limited joints by passes back and forth.
 
-A chain of bones with limited joints, and its forward kinematics.
-
-Everything is in the chain's root frame, its first joint at the origin. Link k turns from its parent's frame by
-the fixed `rotation`, then by its joint's Q(angles), and its bone leads to joint k + 1:
+A chain is in its root frame, its first joint at the origin; kernels see it as `ChainArrays`, its angles as
+one array (n,). Link k turns from its parent's frame by the fixed `rotation`, then by its joint's Q(angles):
 
     O_k = O_{k-1} turn_k Q_k          p_{k+1} = p_k + O_k bone_k
 
-Kernels see it as `ChainArrays`, and its angles as one array (n,), joint after joint.
-
-Kernels of one iteration of FABRIK: aim, backward pass, forward pass.
-
-General solver for limited chains: FABRIK with the joint limits in both passes.
-
-Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011. One iteration:
+Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011, with the
+joint limits in both passes. One iteration:
 
     aim        turn the first joint so that the end lies towards the target
-    backward   put the end on the target and walk to the root: each bone keeps its length and points as it did,
-               as far as the joint between it and the bone behind it allows
+    backward   put the end on the target and walk to the root: each bone points as it did, as far as the joint
+               between it and the bone behind it allows
     forward    put the root back and walk to the end: each bone points to its place of the backward pass, as far
                as its own joint allows
 
 Aiming is ours: hinges hold the bones in one plane, and a backward pass that starts from a plane beside the
-target tilts it the wrong way. The forward pass ends legal, so every pose that leaves this file obeys the limits;
-joints keep full orientations, so bones need not be straight or planar. A coupled hinge follows its leader in the
-forward pass.
-
-FABRIK as published deadlocks on reachable targets: a limit flattens a finger and a straight limited chain cannot
-leave its line. Hence the seed (from the closed form, `master.fabrik.solver`, it starts on the target), and, when
-an attempt stalls, restarts from bent poses turned to the target. The best pose found is returned with its
-residual; nothing is claimed that is not so, and no finite target raises or gives NaN.
+target tilts it the wrong way. The forward pass ends legal; joints keep full orientations, so bones need not
+be straight or planar. A coupled hinge follows its leader there. FABRIK as published deadlocks on reachable
+targets: a limit flattens a finger and a straight limited chain cannot leave its line. Hence the seed
+(`master.fabrik.solver`), and, when an attempt stalls, restarts from bent poses turned to the target. No
+finite target raises or gives NaN.
 """
 
 from dataclasses import dataclass, field
@@ -94,17 +84,11 @@ _SEARCH_STARTS = (1.0, 0.5, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """One joint and the bone behind it.
+    """One joint and the bone behind it."""
 
-    Attributes:
-        rotation: Rest orientation in the parent's frame (`world` joints: in the root frame).
-        joint: What it allows.
-        bone: To the next joint, in the joint's own frame [m].
-    """
-
-    rotation: Matrix
+    rotation: Matrix  # rest orientation in the parent's frame (`world` joints: in the root frame)
     joint: Joint
-    bone: Vector
+    bone: Vector  # to the next joint, in the joint's own frame [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,13 +102,7 @@ class Coupling:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Links from the root to the end effector; two hinges may be coupled.
-
-    Attributes:
-        links: At least one.
-        coupling: None: every joint is free.
-        arrays: The same for kernels.
-    """
+    """Links from the root to the end effector; two hinges may be coupled."""
 
     links: tuple[Link, ...]
     coupling: Coupling | None = None
@@ -186,10 +164,7 @@ class Chain:
 
 
 def least_root_to_end(chain: Chain) -> float:
-    """Least |end - root| [m] inside the limits.
-
-    Pattern search over the joints behind the first, from several starts.
-    """
+    """Least |end - root| [m] inside the limits, by pattern search from three starts."""
     return min(_nearest_from(chain, share) for share in _SEARCH_STARTS)
 
 
@@ -268,10 +243,7 @@ def aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
 def backward_pass(
     chain: ChainArrays, positions: Float, orientations: Float, angles: Float, goal: Vector, places: Float
 ) -> None:
-    """Write places (N + 1, 3) [m] of the joints when the end is on the target.
-
-    Limits between neighbours are kept.
-    """
+    """Write places (N + 1, 3) [m] of the joints, the end on the target, in limits."""
     last = len(chain.joints) - 1
     place = goal
     put_vector(places, last + 1, place)
@@ -304,10 +276,7 @@ def _rotated_towards(orientation: Matrix, bone: Vector, wanted: Vector) -> Matri
 
 @kernel
 def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vector) -> Matrix:
-    """Orientation of link k whose bone points as wanted.
-
-    A joint with axes of the world turns it only as far as it allows.
-    """
+    """Orientation of link k, its bone as wanted; world axes: as far as allowed."""
     bone = vector_at(chain.links, k, BONE)
     if not chain.joints[k, WORLD]:
         return _rotated_towards(now, bone, wanted)
@@ -379,48 +348,28 @@ class Reach(Enum):
 
 
 class ChainResult(NamedTuple):
-    """One solved pose of N links; NaN where the target is not finite.
+    """One solved pose of N links; NaN where the target is not finite."""
 
-    Attributes:
-        positions: Joints, root first, and the end (N + 1, 3) [m].
-        orientations: Link frames (N, 3, 3) in the frame of the target.
-        angles: Of every joint [rad], legal.
-        residual_m: Distance of the end to the target.
-        iterations: Of all attempts.
-        reached: Residual within the tolerance.
-        reach: Verdict of the distance bounds.
-        degenerate: A bone has no length, or the target is at the root and gives no direction.
-    """
-
-    positions: Float
-    orientations: Float
-    angles: Pose
-    residual_m: float
-    iterations: int
-    reached: bool
-    reach: Reach
-    degenerate: bool
+    positions: Float  # joints, root first, and the end (N + 1, 3) [m]
+    orientations: Float  # link frames (N, 3, 3) in the frame of the target
+    angles: Pose  # of every joint [rad], legal
+    residual_m: float  # distance of the end to the target
+    iterations: int  # of all attempts
+    reached: bool  # residual within the tolerance
+    reach: Reach  # verdict of the distance bounds
+    degenerate: bool  # a bone has no length, or the target is at the root and gives no direction
 
 
 @dataclass(frozen=True, slots=True)
 class Fabrik:
-    """A chain prepared for many targets.
-
-    Attributes:
-        chain: Links, limits, coupling.
-        farthest_m: Sum of the bones.
-        nearest_m: Least distance of the end to the root that the limits allow (found by search).
-        tolerance_m: Residual that counts as reached.
-        max_iterations: Per attempt.
-        restarts: Attempts after a stall, at most 3; 0: FABRIK as published, with limits.
-    """
+    """A chain prepared for many targets."""
 
     chain: Chain
-    farthest_m: float
-    nearest_m: float
-    tolerance_m: float
-    max_iterations: int
-    restarts: int
+    farthest_m: float  # sum of the bones
+    nearest_m: float  # least distance of the end to the root that the limits allow (found by search)
+    tolerance_m: float  # residual that counts as reached
+    max_iterations: int  # per attempt
+    restarts: int  # attempts after a stall, at most 3; 0: FABRIK as published, with limits
 
     @classmethod
     def of(
@@ -446,16 +395,10 @@ class Fabrik:
         root: Vector = (0.0, 0.0, 0.0),
         frame: Matrix = IDENTITY,
     ) -> ChainResult:
-        """Bring the chain's end to the target.
+        """Bring the chain's end to the target; return the best legal pose found.
 
-        Args:
-            target: [m], in the frame the result shall be in. NaN: not seen.
-            seed: Angles to start from; None: the rest pose. Clamped to the limits.
-            root: Place of the first joint [m].
-            frame: Orientation of the chain's root frame.
-
-        Returns:
-            The best legal pose found; NaN poses for a target that is not finite.
+        `target` [m], in the frame the result shall be in; NaN: so is the pose. `initial`: angles to start
+        from, clamped; None: the rest pose. `root` [m], `frame`: of the first joint.
         """
         goal = rotate_back(frame, minus(target, root))
         reach = self._reach(goal)
@@ -499,15 +442,10 @@ class Fabrik:
 def solve_chain(
     chain: ChainArrays, goal: Vector, tolerance_m: float, max_iterations: int, restarts: int, angles: Float
 ) -> tuple[float, int]:
-    """Bring the chain's end to `goal` [m], root frame, finite.
+    """Bring the chain's end to `goal` [m]; return its distance [m], and iterations.
 
-    Args:
-        chain, goal, tolerance_m, max_iterations: As of `Fabrik`.
-        restarts: Attempts from bent poses as long as the target is not reached.
-        angles: (n,) [rad]; in: seed; out: the best legal pose found.
-
-    Returns:
-        Distance of the end to the goal [m]; iterations of all attempts.
+    `goal`: root frame, finite. `angles` (n,) [rad]; in: seed; out: the best legal pose found. `restarts`:
+    attempts from bent poses as long as the target is not reached.
     """
     clamp_angles(chain, angles)
     residual, iterations = _attempt(chain, goal, tolerance_m, max_iterations, angles)

@@ -1,34 +1,23 @@
 """Rays of cameras intersect in a marker, and decide which blob it is.
 
-Intersection of the rays of two or more cameras.
+Minimised is the reprojection error in pixels of the distorted images, weighted by the noise of each
+observation, from the linear solution (Hartley and Zisserman, "Multiple View Geometry", 12.2) by Gauss-Newton.
+A point is NaN where fewer than two cameras see it, where it lies behind one of them, or where its standard
+deviation exceeds half of its distance: its depth is then not determined. The squared error of rays of one
+point is chi-square distributed with 2 C - 3 degrees of freedom. Where the rays of three or more cameras do
+not meet, the camera without which they meet is an outlier, if no other subset fits nearly as well. Otherwise
+the marker is not placed: two cameras cannot show which of them is wrong. Of three in a row none is found
+where one is off along the epipolar line of another: each pair meets, elsewhere.
 
-It yields points with covariance, and outliers.
-
-Minimised is the reprojection error in pixels of the distorted images, weighted by the noise of each observation, from
-the linear solution (Hartley and Zisserman, "Multiple View Geometry", 12.2) by Gauss-Newton. A point is NaN where fewer
-than two cameras see it, where it lies behind one of them, or where its standard deviation exceeds half of its
-distance: its depth is then not determined.
-
-Rays of one point miss each other by noise alone: the squared error in standard deviations is chi-square distributed
-with 2 C - 3 degrees of freedom. Where the rays of three or more cameras do not meet, all subsets with one camera less
-are triangulated; the camera without which they meet is an outlier, if no other subset fits nearly as well. Otherwise
-the marker is not placed: two cameras cannot show which of them is wrong. Of three in a row none is found where one is
-off along the epipolar line of another: each pair meets, elsewhere.
-
-Associate: which of two places in an image is the marker.
-
-A slave that cannot exclude a second place of a marker's colour names both. Of all combinations of the two over the
-cameras the one of least cost is taken, in units of chi-square:
-
-    reprojection error of the rays (`master.fabrik.intersection`)
-    + distance from where the hand's other markers predict the marker
-    + distance from where the marker was, at most `past_most`
-    + `overrule` for every camera whose first choice is not followed: it knows size, shape and motion in its image
-
-A combination counts only where its rays meet before the cameras, no farther from the prediction than noise is once in a
-million; and one that overrules a camera only where it is no farther from the marker's past, either. The past may have
-been a mistake: it can overrule one camera, but not two that agree on a place. Where nothing is left, or where two
-combinations that overrule cameras fit alike at different places, the marker is dropped for this epoch.
+`associate`: a slave that cannot exclude a second place of a marker's colour names both. Of all combinations
+of the two over the cameras the one of least cost is taken, in units of chi-square: reprojection error of the
+rays, distance from where the hand's other markers predict the marker, distance from where it was, at most
+`past_most`, and `overrule` for every camera whose first choice is not followed: it knows size, shape and
+motion in its image. A combination counts only where its rays meet before the cameras, no farther from the
+prediction than noise is once in a million; and one that overrules a camera only where it is no farther from
+the marker's past, either. The past may have been a mistake: it can overrule one camera, but not two that
+agree on a place. Where nothing is left, or where two combinations that overrule cameras fit alike at
+different places, the marker is dropped for this epoch.
 """
 
 from dataclasses import dataclass
@@ -48,88 +37,52 @@ from master.fabrik.linear_algebra import inverse_3_plus
 class RaySettings(NamedTuple):
     """Numbers of triangulation by rays.
 
-    Attributes:
-        rig_px: Standard deviation per axis of what lens, mount and calibration leave at one marker, for the gate
-            alone: two sure cameras may miss each other by 6 px. Cheap lenses fit to about half a pixel, and a mount
-            gives way when touched.
-        false_alarm: Probability that noise alone exceeds the gate: 4.9 standard deviations for two cameras.
-        ambiguous: Least difference in chi-square that distinguishes one outlier from another: 1 in 100 by chance, one
-            degree of freedom.
-        common: Part of the variance of whole caps' centroids that is the same in all cameras. Rendered and detected:
-            0.7 of all together, 0.8 by medians, of single fingers 0.3 (little) to 0.8 (index).
-        common_px: Sigma above which a slave reports occlusion, or time adds its own; that part is not common.
+    `rig_px`: what lens, mount and calibration leave at one marker, for the gate alone: two sure cameras may
+    miss each other by 6 px. Cheap lenses fit to about half a pixel, and a mount gives way when touched.
+    `ambiguous`: 1 in 100 by chance, one degree of freedom. `common`: rendered and detected: 0.7 of all
+    together, 0.8 by medians, of single fingers 0.3 (little) to 0.8 (index).
     """
 
-    rig_px: float = 0.85
-    false_alarm: float = 1e-6
-    ambiguous: float = float(chdtri(1, 0.01))
-    common: float = 0.75
-    common_px: float = 0.1
+    rig_px: float = 0.85  # standard deviation per axis
+    false_alarm: float = 1e-6  # probability that noise alone exceeds the gate: 4.9 sigma for two cameras
+    ambiguous: float = float(chdtri(1, 0.01))  # least difference in chi-square of two outliers
+    common: float = 0.75  # part of the variance of whole caps' centroids that is the same in all cameras
+    common_px: float = 0.1  # above it a slave reports occlusion, or time adds its own: not common
 
 
 RAYS = RaySettings()
 
 
 class Triangulation(NamedTuple):
-    """Points of M markers, as seen.
+    """Points of M markers, as seen."""
 
-    Attributes:
-        points_m: (M, 3) rig frame; NaN: not determined.
-        cov_m2: (M, 3, 3).
-        residual_px: (M,) reprojection error, RMS over the cameras that see the marker.
-        chi_square: (M,) of the reprojection errors, with what the rig is allowed.
-        apart: (M,) two cameras or more see it, but their rays do not meet.
-    """
-
-    points_m: Float
-    cov_m2: Float
-    residual_px: Float
-    chi_square: Float
-    outliers: Bool
+    points_m: Float  # (M, 3) rig frame; NaN: not determined
+    cov_m2: Float  # (M, 3, 3)
+    residual_px: Float  # (M,) reprojection error, RMS over the cameras that see the marker
+    chi_square: Float  # (M,) of the reprojection errors, with what the rig is allowed
+    outliers: Bool  # (M,) two cameras or more see it, but their rays do not meet
 
 
 class Rays(NamedTuple):
-    """What C cameras see of one marker, and the point that follows.
+    """What C cameras see of one marker, and the point that follows."""
 
-    Attributes:
-        uv: (C, 2) [px] centroids; of a cap corrected.
-        xy: (C, 2) normalised image points of what is seen.
-        weight: (C,) [1/px^2]; 0: not seen.
-        variance: (C,) [px^2] of the centroids.
-        error: (C,) [px^2] squared reprojection errors.
-        point, cov: (3,) [m], (3, 3) [m^2] of the noise.
-        normal, rhs: (3, 3), (3,) normal equations.
-        seen, J: (2,) [px], (2, 3) [px/m] of one camera.
-    """
-
-    uv: Float
-    xy: Float
-    weight: Float
-    variance: Float
-    error: Float
-    point: Float
-    cov: Float
-    normal: Float
-    rhs: Float
-    seen: Float
-    J: Float
+    uv: Float  # (C, 2) [px] centroids; of a cap corrected
+    xy: Float  # (C, 2) normalised image points of what is seen
+    weight: Float  # (C,) [1/px^2]; 0: not seen
+    variance: Float  # (C,) [px^2] of the centroids
+    error: Float  # (C,) [px^2] squared reprojection errors
+    point: Float  # (3,) [m]
+    cov: Float  # (3, 3) [m^2] of the noise
+    normal: Float  # (3, 3) normal equations
+    rhs: Float  # (3,)
+    seen: Float  # (2,) [px] of one camera
+    J: Float  # (2, 3) [px/m]
 
     @classmethod
     def empty(cls, cameras: int) -> "Rays":
         """Room for a number of cameras."""
-        return cls(
-            np.empty((cameras, 2)),
-            np.empty((cameras, 2)),
-            np.empty(cameras),
-            np.empty(cameras),
-            np.empty(cameras),
-            np.empty(3),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty(3),
-            np.empty(2),
-            np.empty((2, 3)),
-        )
+        by_camera = (cameras, 2), (cameras, 2), cameras, cameras, cameras
+        return cls(*(np.empty(shape) for shape in (*by_camera, 3, (3, 3), (3, 3), 3, 2, (2, 3))))
 
 
 @inner
@@ -138,13 +91,7 @@ def observe(
 ) -> int:
     """Write what the cameras see of marker m; return how many do.
 
-    Args:
-        cameras: Of the rig.
-        observed: (C, M, 3 or more) u, v, sigma [px]; NaN: not seen.
-        rejected: (C, M) what does not count.
-        rays_px: Standard deviation that the calibration leaves.
-        m: The marker.
-        rays: Written.
+    `observed` (C, M, 3 or more): u, v, sigma [px]; NaN: not seen. `rejected` (C, M) does not count.
     """
     count = 0
     for c in range(observed.shape[0]):
@@ -197,10 +144,7 @@ def _clear(rays: Rays) -> None:
 
 @inner
 def linear(cameras: CameraArrays, rays: Rays) -> bool:
-    """Write the point by linear least squares; False where it is singular.
-
-    Of z xy = (R X + t)_xy, each row weighted.
-    """
+    """Write the point by least squares of z xy = (R X + t)_xy; False: singular."""
     _clear(rays)
     R, t = cameras.R, cameras.t
     for c in range(rays.weight.shape[0]):
@@ -221,12 +165,9 @@ def linear(cameras: CameraArrays, rays: Rays) -> bool:
 
 @inner
 def refine(cameras: CameraArrays, rays: Rays) -> bool:
-    """Write the point of least reprojection error, its covariance and errors.
+    """Write the point of least reprojection error from its start, cov and errors.
 
-    It starts from the point as it is.
-
-    Returns:
-        Whether the point is in front of the cameras and its depth is determined.
+    Returns whether the point is in front of the cameras and its depth is determined.
     """
     seen, J, cov, rhs = rays.seen, rays.J, rays.cov, rays.rhs
     steps = 8  # of Gauss-Newton; from the linear solution three are the rule
@@ -308,15 +249,10 @@ def intersect(
     """Triangulate M markers as they are seen.
 
     Args:
-        cameras: Of the rig.
-        rays_px: Standard deviation that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
-        observed: (C, M, 3) u, v, sigma [px].
-        rejected: (C, M) what does not count.
-        rays: Room.
+        observed: (C, M, 3) u, v, sigma [px]; `rejected` (C, M) does not count.
         points, cov: (M, 3) [m], (M, 3, 3) [m^2] written; NaN: not determined.
-        errors: (2, M) written: residual [px], chi-square.
-        apart: (M,) written.
+        errors, outliers: (2, M) residual [px], chi-square; (M,); written.
     """
     for m in range(observed.shape[1]):
         count = observe(cameras, observed, rejected, rays_px, m, rays)
@@ -345,11 +281,8 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate markers as they are seen, by the rays of all cameras.
 
-    Args:
-        cameras: Two or more.
-        uv: (C, M, 2) centroids [px], distorted images; NaN: not seen.
-        sigma_px: Standard deviation per axis: one number, or (C, M).
-        rays_px: Standard deviation per axis that the calibration leaves.
+    `uv` (C, M, 2) [px], distorted images; NaN: not seen. `sigma_px` per axis, one or (C, M); `rays_px`: what
+    the calibration leaves.
 
     Raises:
         ValueError: `uv` is not (C, M, 2) for these cameras, or they are fewer than two.
@@ -373,30 +306,19 @@ def triangulate(
 class GateSettings:
     """Numbers of the association.
 
-    Attributes:
-        overrule: Least gain in chi-square for each camera that is overruled: 1 in 100 by chance, one degree of freedom.
-        past_most: Largest cost of the distance from the past: more than one camera, less than two.
-        false_alarm: Probability that noise alone is farther from a prediction than the gate.
-        most_cameras: Cameras with an alternative that are combined, 32 combinations; those beyond are rejected.
-        same_m: [m] combinations whose points are nearer are one thing: a finger's width.
-        place_m: [m] standard deviation of a marker's place a moment ago.
-        speed_m_s: [m/s] standard deviation of a marker's speed.
-        forget_s: [s] age from which a past place is not used.
-        model_m: [m] standard deviation of a marker's place in a hand that its other markers show: fingers are predicted
-            by posture alone.
-        spread_m: [m] standard deviation of a marker's distance from the middle of a hand that is not solved.
+    `overrule`: 1 in 100 by chance, one degree of freedom. `past_most`: more than one camera, less than two.
     """
 
-    overrule: float = float(chdtri(1, 0.01))
-    past_most: float = 1.5 * float(chdtri(1, 0.01))
-    false_alarm: float = 1e-6
-    most_cameras: int = 5
-    same_m: float = 0.02
-    place_m: float = 0.01
-    speed_m_s: float = 1.0
-    forget_s: float = 0.5
-    model_m: float = 0.015
-    spread_m: float = 0.1
+    overrule: float = float(chdtri(1, 0.01))  # least gain in chi-square for each camera that is overruled
+    past_most: float = 1.5 * float(chdtri(1, 0.01))  # largest cost of the distance from the past
+    false_alarm: float = 1e-6  # probability that noise alone is farther from a prediction than the gate
+    most_cameras: int = 5  # with an alternative that are combined: 32 combinations; more are rejected
+    same_m: float = 0.02  # combinations whose points are nearer are one thing: a finger's width
+    place_m: float = 0.01  # standard deviation of a marker's place a moment ago
+    speed_m_s: float = 1.0  # standard deviation of a marker's speed
+    forget_s: float = 0.5  # age from which a past place is not used
+    model_m: float = 0.015  # standard deviation of a marker's place by its hand's others
+    spread_m: float = 0.1  # standard deviation of a marker's distance from the middle of an unsolved hand
 
 
 SETTINGS = GateSettings()
@@ -411,21 +333,13 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """One place for each marker.
+    """One place for each marker."""
 
-    Attributes:
-        uv: (C, M, 2) [px]; NaN: not seen, or dropped.
-        sigma_px: (C, M).
-        area_px2: (C, M); NaN where the second place is taken, whose area is not known.
-        taken: (M,) another combination than the cameras' first choices is taken.
-        dropped: (M,) nothing fits, or it is ambiguous.
-    """
-
-    uv: Float
-    sigma_px: Float
-    area_px2: Float
-    taken: Bool
-    dropped: Bool
+    uv: Float  # (C, M, 2) [px]; NaN: not seen, or dropped
+    sigma_px: Float  # (C, M)
+    area_px2: Float  # (C, M); NaN where the second place is taken, whose area is not known
+    taken: Bool  # (M,) another combination than the cameras' first choices is taken
+    dropped: Bool  # (M,) nothing fits, or it is ambiguous
 
 
 def among(others_m: Float, on_hand: Int, settings: GateSettings = SETTINGS) -> Prior:
@@ -449,13 +363,11 @@ def associate(
     """Choose for every marker that has an alternative; pass on the others.
 
     Args:
-        cameras: In the order of the observations' first axis.
         pixels: First places of one epoch (C, M, 2) [px], sigma (C, M) [px], area (C, M) [px^2]; NaN: not seen.
         alternatives: Second places (C, M, 2) [px] and sigma (C, M); NaN: none.
         hand: All markers as the hand's other markers predict them, those that have no alternative.
         past: Where each marker was last (M, 3) [m], and how long ago (M,) [s]; NaN: never.
         rays_px: Standard deviation per axis that the calibration leaves.
-        settings: Numbers.
     """
     first_uv, first_sigma, area = pixels
     alternative: Bool = np.isfinite(alternatives[0][..., 0])
@@ -493,15 +405,10 @@ def _best(
     rays_px: float,
     settings: GateSettings,
 ) -> int | None:
-    """Return which of K combinations is the marker; None: none, ambiguous.
+    """Return which of K combinations is the marker, 0: first choices; None: none.
 
-    0 is that of the first choices.
-
-    Args:
-        cameras, rays_px, settings: As of `associate`.
-        uv, sigma_px: (C, K, 2), (C, K) [px].
-        overruled: (K,) cameras whose first choice each does not follow.
-        priors: Of the one marker, by hand and past: (3,), (3, 3).
+    `uv`, `sigma_px` (C, K, 2), (C, K) [px]; `overruled` (K,) cameras whose first choice each does not follow;
+    `priors` of the one marker, by hand and past: (3,), (3, 3).
     """
     seen = np.flatnonzero(np.isfinite(uv[:, 0, 0]))
     if len(seen) == 1:
@@ -537,10 +444,7 @@ def rehearse(cameras: CameraArrays) -> None:
 
 @kernel
 def _seen_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> None:
-    """Write where camera `c` sees a point, and derivatives.
-
-    Functions that kernels call have no entry point from Python.
-    """
+    """Write where a camera sees a point: an entry from Python to what kernels call."""
     project(cameras, c, point, uv, J)
 
 

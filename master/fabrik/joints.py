@@ -1,32 +1,21 @@
 """Joints have limits, and a chain of them has forward kinematics.
 
-Kernels of a single joint: rotation, limits and the nearest legal angles.
-
-The definitions are in `master.fabrik.joints`. A joint's angles are a pair, of which a hinge uses the first.
-
-What a joint allows: hinge (1 degree of freedom) and rotor (2).
-
-The limits are on the direction of the bone behind a joint. It is asked in a frame: the orientation its bone has at
-rest, that is the parent's orientation times the rest turn (`local`), or one that stays with the chain's root
-(`world`: a global axis). In that frame
+What a joint allows: hinge (1 degree of freedom) and rotor (2). The limits are on the direction of the bone
+behind a joint. It is asked in a frame: the orientation its bone has at rest, that is the parent's orientation
+times the rest turn (`local`), or one that stays with the chain's root (`world`: a global axis). In that frame
 
     hinge   Q = R(axis, a)                                      a in [low, high]
     rotor   Q = R_y(sign a) rest R_x(-f)                        a abduction, f flexion
 
-and the bone vector b of the joint's own frame lies along Q b. Bones need not be perpendicular to the axes: the
-rest pose of a real hand is not planar. `fit` turns "I would like the bone to point there" into the nearest legal
-angles; a direction that is legal comes back unchanged.
+and the bone vector b of the joint's own frame lies along Q b. Bones need not be perpendicular to the axes:
+the rest pose of a real hand is not planar. `fit` turns "I would like the bone to point there" into the
+nearest legal angles; a direction that is legal comes back unchanged.
 
-The rotor has four half-angles. `box`: every flexion with every abduction. `ellipse`: the four quadrants of a cone,
-(a / A)^2 + (f / F)^2 <= 1 with the A and F of the quadrant (FABRIK's elliptic cone; Aristidou & Lasenby 2011).
-Both may lose abduction with flexion by the parabola of `common.hand.profiles`. A rotor has no third angle: the twist
-of its bone is what these two rotations make of it, and no solver can turn it further.
-
-What they do is compiled (`master.fabrik.joints`).
-
-Kernels of a chain of any length: its joints and its forward kinematics.
-
-A chain is a few arrays and its angles are one, so that there is one compiled solver for all chains.
+The rotor has four half-angles. `box`: every flexion with every abduction. `ellipse`: the four quadrants of a
+cone, (a / A)^2 + (f / F)^2 <= 1 with the A and F of the quadrant (FABRIK's elliptic cone; Aristidou & Lasenby
+2011). Both may lose abduction with flexion by the parabola of `common.hand.profiles`. A rotor has no third
+angle: the twist of its bone is what these two rotations make of it. A chain is a few arrays, so that one
+compiled solver serves all.
 """
 
 from dataclasses import dataclass
@@ -59,24 +48,16 @@ _spread_left = inner(spread_left)
 
 
 class Limits(NamedTuple):
-    """A joint for kernels.
+    """A joint for kernels, its angles a pair, of which a hinge uses the first."""
 
-    Attributes:
-        kind: HINGE, BOX or ELLIPSE.
-        low, high: Of the hinge's angle, or of the rotor's abduction [rad].
-        flexion_low, flexion_high: Of the rotor [rad].
-        spread_at_full_flexion, sign, rest: As of `Rotor`.
-        axis: As of `Hinge`.
-    """
-
-    kind: int
-    low: float
+    kind: int  # HINGE, BOX or ELLIPSE
+    low: float  # of the hinge's angle, or of the rotor's abduction [rad]
     high: float
-    flexion_low: float
+    flexion_low: float  # of the rotor [rad]
     flexion_high: float
-    spread_at_full_flexion: float
+    spread_at_full_flexion: float  # with `sign`, `rest` as of `Rotor`
     sign: float
-    axis: Vector
+    axis: Vector  # as of `Hinge`
     rest: Matrix
 
 
@@ -139,11 +120,7 @@ def _legalised(limits: Limits, pair: Pair, now: Pair) -> tuple[Pair, float, floa
     miss = max(abs(legal[0] - pair[0]), abs(legal[1] - pair[1]))
     rounding_rad = 1e-12
     # below: rounding, not a violation; then continuity decides
-    return (
-        legal,
-        miss if miss > rounding_rad else 0.0,
-        abs(legal[0] - now[0]) + abs(legal[1] - now[1]),
-    )
+    return (legal, miss if miss > rounding_rad else 0.0, abs(legal[0] - now[0]) + abs(legal[1] - now[1]))
 
 
 @inner
@@ -199,10 +176,7 @@ def swing_and_flex(bone: Vector, target: Vector, rest: Matrix, sign: float) -> t
     middle = atan2(odd, even)
     ratio = (target[1] - y_row[0] * bone[0]) / amplitude if amplitude > _TINY else 1.0
     half = acos(min(max(ratio, -1.0), 1.0))
-    return (
-        _swung(bone, target, rest, sign, middle + half),
-        _swung(bone, target, rest, sign, middle - half),
-    )
+    return (_swung(bone, target, rest, sign, middle + half), _swung(bone, target, rest, sign, middle - half))
 
 
 @inner
@@ -222,18 +196,12 @@ _FLEXION_AXIS: Vector = (-1.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Hinge:
-    """Turns about one axis.
+    """Turns about one axis; by default flexion about the joint's own +x (by -angle)."""
 
-    Attributes:
-        low_rad, high_rad: Range of the angle; flexion is positive with the default axis.
-        axis: Unit vector in the joint's frame; the default is flexion about the joint's own +x (by -angle).
-        frame: Whether the axis moves with the parent bone or stays with the chain's root.
-    """
-
-    low_rad: float
+    low_rad: float  # range of the angle; flexion is positive with the default axis
     high_rad: float
-    axis: Vector = _FLEXION_AXIS
-    frame: Literal["local", "world"] = "local"
+    axis: Vector = _FLEXION_AXIS  # unit vector in the joint's frame
+    frame: Literal["local", "world"] = "local"  # axis moves with the parent bone, or stays with the root
 
     def __post_init__(self) -> None:
         _check_span("hinge", self.low_rad, self.high_rad)
@@ -258,36 +226,25 @@ class Hinge:
     def fit(self, bone: Vector, direction: Vector, now: Angles) -> Angles:
         """Legal angle that brings Q bone nearest to `direction`, in the joint's frame.
 
-        Args:
-            bone: Bone vector in the joint's own frame [m].
-            direction: Wanted direction, any length; on the axis or zero: every angle is as good, `now` stays.
-            now: Present angle.
+        `bone` [m], in the joint's own frame; `direction` of any length; on the axis or zero: `now` stays.
         """
         return fit(self.limits, bone, direction, (now[0], 0.0))[:1]
 
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """Turns in two directions, with four half-angles.
+    """Two directions, four half-angles; `rest` lies between the two rotations.
 
-    Attributes:
-        abduction_rad: Low and high.
-        flexion_rad: Low and high.
-        shape: `box` or `ellipse` (see the module).
-        spread_at_full_flexion: Share of the abduction range left at the highest flexion; 1: no loss.
-        sign: +1 right hand, -1 left hand (abduction is positive towards the thumb).
-        rest: Rest orientation of the joint between the two rotations (fingers); the thumb has it in front, in
-            the chain's turn.
-        frame: As of `Hinge`.
+    The thumb has it in front, in the chain's turn.
     """
 
-    abduction_rad: Pair
-    flexion_rad: Pair
+    abduction_rad: Pair  # low and high
+    flexion_rad: Pair  # low and high
     shape: Literal["box", "ellipse"] = "box"
-    spread_at_full_flexion: float = 1.0
-    sign: float = 1.0
+    spread_at_full_flexion: float = 1.0  # share of the abduction range left at the highest flexion
+    sign: float = 1.0  # +1 right hand, -1 left hand (abduction is positive towards the thumb)
     rest: Matrix = IDENTITY
-    frame: Literal["local", "world"] = "local"
+    frame: Literal["local", "world"] = "local"  # as of `Hinge`
 
     def __post_init__(self) -> None:
         cone = self.shape == "ellipse"
@@ -343,9 +300,8 @@ def _check_span(what: str, low: float, high: float) -> None:
         raise ValueError(f"{what}: range {low} ... {high} rad is not within -pi ... pi, low first")
 
 
-ROOT = START = constant(
-    0
-)  # the first link; where the numbers of a row begin that is all one vector or matrix
+# the first link; where the numbers of a row begin that is all one vector or matrix
+ROOT = START = constant(0)
 KIND, WORLD, FIRST = map(constant, range(3))  # columns of `ChainArrays.joints`
 ROTATION, REST, BONE, AXIS, SPREAD, SIGN = map(constant, (0, 9, 18, 21, 24, 25))  # and of `ChainArrays.links`
 
@@ -353,21 +309,17 @@ ROTATION, REST, BONE, AXIS, SPREAD, SIGN = map(constant, (0, 9, 18, 21, 24, 25))
 class ChainArrays(NamedTuple):
     """A chain of N links with n angles, for kernels.
 
-    Attributes:
-        joints: (N, 3): kind as in `Limits`; 1 where the joint's frame stays with the chain's root, else 0; index of its
-            first angle (columns KIND, WORLD, FIRST).
-        spans: (n, 2) low and high of every angle [rad].
-        links: (N, 26), in the columns from TURN, REST, BONE [m], AXIS, SPREAD and SIGN, as of `Link`, `Rotor`, `Hinge`.
-        leader, follower: Links of the coupling; -1: none.
-        ratio: Of the coupling.
+    `joints` (N, 3): kind as in `Limits`; 1 where the joint's frame stays with the chain's root, else 0; index
+    of its first angle (columns KIND, WORLD, FIRST). `links` (N, 26): in the columns from TURN, REST, BONE
+    [m], AXIS, SPREAD and SIGN, as of `Link`, `Rotor`, `Hinge`.
     """
 
     joints: Int
-    spans: Float
+    spans: Float  # (n, 2) low and high of every angle [rad]
     links: Float
-    leader: int
+    leader: int  # links of the coupling, with `follower`; -1: none
     follower: int
-    ratio: float
+    ratio: float  # of the coupling
 
 
 @inner

@@ -1,11 +1,7 @@
 """Linear algebra of kernels: vectors, rotations and symmetric matrices.
 
-Kernels on single vectors (x, y, z) and rotations (three rows), as tuples.
-
-Tuples stay in registers where the code is compiled, and on one vector an array operation would cost ten times the
-arithmetic where it is not.
-
-Kernels for symmetric matrices, of one hand's size and small ones.
+Single vectors (x, y, z) and rotations (three rows) are tuples: they stay in registers where the code is
+compiled, and on one vector an array operation would cost ten times the arithmetic where it is not.
 """
 
 from math import cos, log, sin, sqrt
@@ -69,11 +65,7 @@ def rotate_back(m: Matrix, v: Vector) -> Vector:
     """Product m^T v."""
     a, b, c = m
     x, y, z = v
-    return (
-        a[0] * x + b[0] * y + c[0] * z,
-        a[1] * x + b[1] * y + c[1] * z,
-        a[2] * x + b[2] * y + c[2] * z,
-    )
+    return (a[0] * x + b[0] * y + c[0] * z, a[1] * x + b[1] * y + c[1] * z, a[2] * x + b[2] * y + c[2] * z)
 
 
 @kernel
@@ -146,10 +138,7 @@ def as_matrix(array: Float) -> Matrix:
 
 @inner
 def cholesky(A: Float, n: int, L: Float) -> bool:
-    """Write the factor L of A = L L' (n, n), lower triangle.
-
-    False: not positive definite.
-    """
+    """Write L of A = L L' (n, n), lower triangle; False: not positive definite."""
     for j in range(n):
         total = A[j, j]
         for k in range(j):
@@ -231,11 +220,9 @@ def inverse_3(A: Float, B: Float, out: Float) -> None:
 
 @inner
 def eigen(A: Float, n: int, values: Float, vectors: Float) -> None:
-    """Write eigenvalues (n,) and eigenvectors of a symmetric matrix.
+    """Write eigenvalues (n,) and eigenvectors, columns (n, n), of symmetric A.
 
-    The eigenvectors are columns (n, n). The matrix is destroyed.
-
-    Jacobi's cyclic rotations (Golub, Van Loan, "Matrix Computations", 8.5).
+    The matrix is destroyed. Jacobi's cyclic rotations (Golub, Van Loan, "Matrix Computations", 8.5).
     """
     for i in range(n):
         for j in range(n):
@@ -288,8 +275,8 @@ def inverse_3_plus(A: Float, extra: float, out: Float) -> None:
 def diagonalise(A: Float, V: Float) -> None:
     """Turn symmetric A (n, n) into its eigenvalues, V into its eigenvectors.
 
-    The eigenvalues come to stand on the diagonal of A, unsorted, the eigenvectors in the columns of V (cyclic Jacobi:
-    Golub, Van Loan, Matrix Computations, 8.5). Only the lower triangle of A is read. NaN stays NaN.
+    They come to stand on the diagonal of A, unsorted, and in the columns of V (cyclic Jacobi, as `eigen`).
+    Only the lower triangle of A is read. NaN stays NaN.
     """
     n = A.shape[0]
     for i in range(n):
@@ -335,10 +322,7 @@ def _rotate(A: Float, V: Float, p: int, q: int) -> None:
 
 @kernel
 def spread(A: Float) -> tuple[float, float]:
-    """Return the standard deviations of covariance A (3, 3), least and greatest.
-
-    Those along its axes; 0 for an eigenvalue below 0.
-    """
+    """Return least and greatest sigma of covariance A (3, 3); eigenvalues < 0 give 0."""
     D, V = A.copy(), np.empty((3, 3))
     diagonalise(D, V)
     a, b, c = D[0, 0], D[1, 1], D[2, 2]

@@ -1,47 +1,30 @@
 """The 1 € filter smooths signals by their speed and measured noise.
 
-The 1 € filter of many signals at once: of points, and of the solved hand.
+Casiez, Roussel, Vogel, "1 € Filter", CHI 2012. A low pass whose cut-off rises with speed. Per signal, with x^
+the filtered value and dt the time since the signal was last seen:
 
-Casiez, Roussel, Vogel, "1 € Filter", CHI 2012. A low pass whose cut-off rises with speed, so that a hand
-at rest does not tremble and a fast one does not lag. Per signal, with x^ the filtered value and dt the time
-since the signal was last seen:
-
-    dx   = (x - x^) / dt                                   against the previous *filtered* value
-    dx^ += a(d_cutoff) (dx - dx^)
+    dx^ += a(d_cutoff) ((x - x^) / dt - dx^)               against the previous *filtered* value
     x^  += a(min_cutoff + beta |dx^|) (x - x^)             a(f) = r / (r + 1),  r = 2 pi f dt
 
-Rules beside the paper's:
-- Not finite (NaN) = not observed: the output of that signal is NaN, its state is held, the others go on.
-- A signal that returns continues with the true dt since it was last seen, so that a stale state fades by
-  itself; after more than `restart_gap_s` it restarts from that value, as a new signal does.
-- A time that is not after the last one changes nothing: the last output is returned and `late` counts it.
+Beside the paper: NaN = not observed, the output is NaN and the state is held; a signal that returns continues
+with the true dt, after more than `restart_gap_s` it restarts; a time that is not after the last one changes
+nothing: the last output is returned and `late` counts it. Signals of one group have the cut-off of the
+fastest of them, so that errors that cancel, as those of place and rotation of one body do, stay together.
 
-**Groups.** Signals of one group have one cut-off, that of the fastest of them. Noise in the others of a group that
-moves is not seen, and errors that cancel, as those of place and rotation of one body do, stay together.
-
-**Noise.** A sample may come with the variance s^2 of its noise. Where s is above the allowed `jitter`, the sample is
-taken with no more than the larger of
+A sample may come with the variance s^2 of its noise. Where s is above `jitter`, it is taken with no more than
+the larger of
 
     at rest     a = 2 q / (1 + q),  q = (jitter / s)^2           which leaves `jitter` of the noise: s^2 a / (2 - a)
     in motion   a = 2 / (1 + sqrt(1 + 4 / u^2)),  u^2 = max((v dt / s)^2, ((x - x^) / s)^2 - 9)
 
-the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960). Here v
-is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s leaves
-s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by
-much, the innovation x - x^ those that begin or turn round. Of a group, what moves most counts.
+the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960).
+v is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s leaves s^2
+/ dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). Give variances with room: noise passes three standard
+deviations once in 370 samples, and what that lets in takes long to fade where s is many times `jitter`.
 
-Where the noise is small this is the paper's filter; a sample far less sure than its neighbours is ridden over. Give
-variances with room: noise passes three standard deviations once in 370 samples, and what that lets in takes long to
-fade where s is many times `jitter`.
-
-`PointFilter` filters 3D points along the axes of the view, for a point from two cameras is several times less sure
-along the sight than across it: one cut-off for both either trembles in depth or lags sideways.
-
-Measure the noise of moving signals by second differences of samples.
-
-With x the samples, steps of equal length, noise of standard deviation s that is new in every sample makes second
-differences of variance 6 s^2; of steps dt, k dt it is 2 (1 + k + k^2) s^2 where the first is scaled by k. Of noise that
-keeps a share p from sample to sample they show only 1 - 4/3 p + p^2 / 3.
+The noise is measured by second differences: of steps dt, k dt and noise s that is new in every sample their
+variance is 2 (1 + k + k^2) s^2 where the first is scaled by k. Of noise that keeps a share p from sample to
+sample they show only 1 - 4/3 p + p^2 / 3.
 """
 
 from collections.abc import Sequence
@@ -62,22 +45,13 @@ UNSEEN_NS = -(2**63)
 
 @dataclass(frozen=True, slots=True)
 class OneEuroParameters:
-    """Settings of the filter, the same for all its signals.
+    """Settings of the filter, the same for all its signals."""
 
-    Attributes:
-        min_cutoff_hz: Cut-off at rest; lower: less jitter.
-        beta: Cut-off per speed [Hz per (unit of the signal)/s]; higher: less lag.
-        d_cutoff_hz: Cut-off of the speed estimate.
-        restart_gap_s: A signal unseen for longer restarts from its next value.
-        jitter: Standard deviation that may be left of a signal's noise at rest [unit of the signal], where the noise
-            is known; infinite: however much is.
-    """
-
-    min_cutoff_hz: float = 1.0
-    beta: float = 0.1
-    d_cutoff_hz: float = 1.0
-    restart_gap_s: float = 0.5
-    jitter: float = inf
+    min_cutoff_hz: float = 1.0  # at rest; lower: less jitter
+    beta: float = 0.1  # cut-off per speed [Hz per (unit of the signal)/s]; higher: less lag
+    d_cutoff_hz: float = 1.0  # of the speed estimate
+    restart_gap_s: float = 0.5  # a signal unseen for longer restarts from its next value
+    jitter: float = inf  # noise that may be left at rest where it is known, standard deviation [unit]
 
     def __post_init__(self) -> None:
         for name in ("min_cutoff_hz", "d_cutoff_hz", "restart_gap_s"):
@@ -104,12 +78,7 @@ class OneEuro:
     """Push machine; holds each signal's filtered value, speed and last time."""
 
     def __init__(self, parameters: OneEuroParameters, groups: Sequence[int] | None = None) -> None:
-        """Set up.
-
-        Args:
-            parameters: Settings of all signals.
-            groups: Number of signals of each group; they come in this order. None: each signal is its own.
-        """
+        """Set up; `groups`: number of signals of each, in order; None: each is its own."""
         self.parameters = parameters
         self.late = 0
         self._groups = groups
@@ -121,30 +90,17 @@ class OneEuro:
         self._group: Int = np.empty(0, np.int64)
         self._fastest = np.empty((0, 2))
         none = self._x
-        self._step = bound(  # compiles it here, so that no sample waits for that
-            filter_step,
-            0,
-            none,
-            none,
-            self._settings,
-            self._group,
-            self._fastest,
-            none,
-            none,
-            self._seen_ns,
-            none,
-        )
+        state = self._fastest, none, none, self._seen_ns, none
+        # compiles it here, so that no sample waits for that
+        self._step = bound(filter_step, 0, none, none, self._settings, self._group, *state)
 
     def push(self, t_ns: int, values: Float, variance: Float | None = None) -> Float:
-        """Filter one sample of every signal.
+        """Filter one sample of every signal; NaN where the input is.
 
         Args:
             t_ns: Time of the sample [ns]; 0 is a time like any other.
             values: Any shape, the same at every push. NaN: not seen.
             variance: Variances of their noise that is new in each sample, same shape; NaN or None: not known.
-
-        Returns:
-            Filtered values, same shape; NaN where the input is.
 
         Raises:
             ValueError: The shape differs from the first push, or is not that of the groups or variances.
@@ -160,18 +116,8 @@ class OneEuro:
         if len(noise) != len(self._x):
             raise ValueError(f"1 € filter: {len(noise)} variances for {len(self._x)} signals")
         self._t_ns, self._last = t_ns, np.empty(len(signals))
-        self._step(
-            t_ns,
-            signals,
-            noise,
-            self._settings,
-            self._group,
-            self._fastest,
-            self._x,
-            self._speed,
-            self._seen_ns,
-            self._last,
-        )
+        state = self._fastest, self._x, self._speed, self._seen_ns, self._last
+        self._step(t_ns, signals, noise, self._settings, self._group, *state)
         return self._last.reshape(self._shape).copy()
 
     def _first(self, values: Float) -> None:
@@ -191,26 +137,20 @@ class OneEuro:
 class PointFilter:
     """Push machine for points in space, filtered along the axes of the view.
 
-    Holds the filter of their coordinates.
+    A point from two cameras is several times less sure along the sight than across it: one cut-off for both
+    either trembles in depth or lags sideways.
     """
 
     def __init__(self, parameters: OneEuroParameters, R_view_rig: Float) -> None:
-        """Set up.
+        """Set up, parameters in [m, s], `jitter` per axis.
 
-        Args:
-            parameters: Of the 1 € filter [m, s]; `jitter` is per axis.
-            R_view_rig: (3, 3) rows are the axes of the view in the rig frame, the last along the sight.
+        `R_view_rig` (3, 3): rows are the axes of the view in the rig frame, the last along the sight.
         """
         self._filter = OneEuro(parameters)
         self._R = R_view_rig
 
     def push(self, t_ns: int, points: Float, cov: Float) -> Float:
-        """Filter points (M, 3) [m], rig frame; NaN: not seen.
-
-        `cov`: (M, 3, 3) [m^2] covariances of their noise.
-
-        Times as in `OneEuro.push`.
-        """
+        """Filter points (M, 3) [m] of noise cov (M, 3, 3), rig frame, as `OneEuro.push`."""
         variance = np.vecdot(self._R @ cov, self._R)  # of each coordinate: the diagonal of R cov R'
         return self._filter.push(t_ns, points @ self._R.T, CARRY_NOTHING * variance) @ self._R
 
@@ -228,16 +168,10 @@ def filter_step(
     seen_ns: Int,
     out: Float,
 ) -> None:
-    """Filter one sample of N signals into `out`.
+    """Filter one sample of N signals into `out`, later than the last.
 
-    Args:
-        t_ns: Later than that of the last sample.
-        values, variance: (N,) as of `OneEuro.push`.
-        settings: (5,) min_cutoff_hz, beta, d_cutoff_hz, restart_gap_s, jitter squared: `OneEuroParameters.array`.
-        group: (N,) number of each signal's group.
-        fastest: (G, 2) scratch: speed of each group, and the largest u squared.
-        x, speed, seen_ns: (N,) state, changed.
-        out: (N,)
+    `settings` (5,) as of `OneEuroParameters.array`, `group` (N,), state `x`, `speed`, `seen_ns` (N,),
+    changed; `fastest` (G, 2) scratch: speed of each group, and the largest u squared.
     """
     min_cutoff, beta, d_cutoff, restart_gap, jitter_2 = settings
     fastest[:] = 0.0
@@ -274,10 +208,7 @@ def filter_step(
 
 @kernel
 def _gain_in_motion(u2: float) -> float:
-    """Gain of the steady Kalman filter of a random walk.
-
-    u2: variance of its step by that of the noise.
-    """
+    """Gain of the steady Kalman filter of a random walk; u2: step by noise variance."""
     return 2.0 / (1.0 + (1.0 + 4.0 / u2) ** 0.5) if u2 > 0.0 else 0.0
 
 
@@ -292,11 +223,7 @@ class NoiseEstimator:
     def push(self, t_ns: int, values: Float, largest: Float) -> Float:
         """Variances (n,) of the noise of one sample, as those before it show.
 
-        Args:
-            t_ns: Time of the sample [ns], after that of the last.
-            values: (n,) the signals.
-            largest: (n,) largest variances that their noise may have, for what is more is acceleration; NaN: not
-                known.
+        `largest` (n,): variances that their noise may have, for what is more is acceleration; NaN: not known.
         """
         if self._count[0] == 0:
             self._past = np.zeros((3, len(values)))
@@ -311,12 +238,8 @@ def measure(
 ) -> None:
     """Write the variances (n,) of the noise of one sample, and take it in.
 
-    Args:
-        t_ns, values, largest: As of `NoiseEstimator.push`.
-        count: (2,) how many samples came, and the time of the last [ns]; changed, as is all that follows.
-        dt_s: (1,) length of the last step.
-        past: (3, n) last sample and step, and variance that shows.
-        known: (n,) written.
+    State: `count` (2,) samples, time of the last [ns]; `dt_s` (1,) length of the last step; `past` (3, n)
+    last sample and step, and variance that shows.
     """
     passed_s = 1e-9 * (t_ns - count[1])
     ratio = passed_s / dt_s[0] if count[0] > 1 else 0.0

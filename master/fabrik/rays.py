@@ -1,7 +1,7 @@
 """Locate markers by the rays of all cameras, corrected for how caps look.
 
-What a camera sees of a cap is not its centroid; the difference follows from the direction in which the finger points,
-which is itself uncertain. So a point's covariance has these parts:
+What a camera sees of a cap is not its centroid; the difference follows from the direction in which the finger
+points, which is itself uncertain. So a point's covariance has these parts:
 
     centroids     noise, occlusion and time, each camera's own              gain diag(sigma^2) gain'
     common        part of the noise is the same in all cameras              moves the point, not its depth
@@ -10,10 +10,10 @@ which is itself uncertain. So a point's covariance has these parts:
     relief        of a flat marker: the back of a hand is not flat          0.4 mm
     calibration   its reprojection error                                    added to each centroid
 
-Tilt matters most along the line of sight: two cameras see a finger that points at one of them from different sides, so
-a degree of tilt moves the two centroids apart, and the distance with them. Cameras side by side see the same cap in the
-same light, so that its rim and its shading mislead them alike: most of a whole cap's error is one of place. What
-occludes a part of a cap, or comes of time, is each camera's own.
+Tilt matters most along the line of sight: two cameras see a finger that points at one of them from different
+sides, so a degree of tilt moves the two centroids apart, and the distance with them. Cameras side by side see
+the same cap in the same light, so that its rim and its shading mislead them alike: most of a whole cap's
+error is one of place.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,25 +53,15 @@ from master.fabrik.intersection import (
 
 
 class _Hand(NamedTuple):
-    """Directions of the K caps.
+    """Directions of the K caps."""
 
-    Attributes:
-        known: False: a cap may point anywhere where it is seen.
-        as_seen: What is seen of a marker is taken for its centroid, and the whole correction for uncertainty.
-        R: (K, 3, 3) rotations of the tip joints, rig frame.
-        tilt_rad2: (K, 3, 3) covariance of their directions.
-        rotation_rad2: Variance that their age adds.
-        at: (K, 3) [m] about where they are.
-        walked: (K,) by how much more their tilt may have grown to a fit that starts there; as a share of its variance.
-    """
-
-    known: bool
-    as_seen: bool
-    R: Float
-    tilt_rad2: Float
-    rotation_rad2: float
-    at: Float
-    process_noise: Float
+    known: bool  # False: a cap may point anywhere where it is seen
+    as_seen: bool  # what is seen is taken for the centroid, and the whole correction for uncertainty
+    R: Float  # (K, 3, 3) rotations of the tip joints, rig frame
+    tilt_rad2: Float  # (K, 3, 3) covariance of their directions
+    rotation_rad2: float  # variance that their age adds
+    at: Float  # (K, 3) [m] about where they are
+    process_noise: Float  # (K,) tilt growth to a fit that starts there, as a share of its variance
 
 
 @inner
@@ -87,12 +77,7 @@ def _covariance(
     cov: Float,
     own: Float,
 ) -> None:
-    """Write the covariance (3, 3) of a refined point.
-
-    It has all parts (see the module); the part of them that the rays do not show is written too.
-
-    `process_noise`: as of `_Hand`.
-    """
+    """Write the covariance (3, 3) of a refined point, and its part unseen by rays."""
     correction_jacobian_m, gain = views.correction_jacobian_m, views.gain
     step, both = views.step, views.both  # of the point by a common step; gain gain'
     for i in range(3):
@@ -135,18 +120,11 @@ def _covariance(
 
 @inner
 def _correct(
-    cameras: CameraArrays,
-    caps: CapTables,
-    hand: _Hand,
-    rays_px: float,
-    row: int,
-    rays: Rays,
-    views: Views,
+    cameras: CameraArrays, caps: CapTables, hand: _Hand, rays_px: float, row: int, rays: Rays, views: Views
 ) -> tuple[int, float]:
     """Take the caps' bias from the centroids and weigh them by what is hidden.
 
-    Returns:
-        Directions that the cap may have, and the variance [px^2] that all cameras have in common.
+    Returns directions that the cap may have, and the variance [px^2] that all cameras have in common.
     """
     count = TILTED if hand.known else ANY
     if row < 0:
@@ -187,8 +165,7 @@ def _place(
 ) -> tuple[int, bool, int, float]:
     """Triangulate marker m by the cameras that are not rejected.
 
-    Returns:
-        How many see it; whether its point is determined; and as `_correct`.
+    Returns how many see it; whether its point is determined; and as `_correct`.
     """
     seen = observe(cameras, observed, rejected, rays_px, m, rays)
     if seen < 2 or not linear(cameras, rays):
@@ -210,12 +187,7 @@ def _monocular(
     rays: Rays,
     views: Views,
 ) -> None:
-    """Take the cap's bias from the centroid of a single camera.
-
-    The cap's pose is that of the hand estimate.
-
-    Its uncertain tilt is that camera's own error.
-    """
+    """Take a cap's bias, by the hand, from a single camera; its tilt is own error."""
     row = caps.row[m]
     for i in range(3):
         rays.point[i] = hand.at[row, i]
@@ -257,15 +229,11 @@ def correct_centres(
     """Locate M markers with covariance.
 
     Args:
-        cameras, caps: Of the rig.
         rays_px: Standard deviation per axis that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
-        known, as_seen, R, tilt_rad2, rotation_rad2, at, walked: Directions of the caps, as of `_Hand`.
+        known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise: As of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
-        rays, views: Room.
-        points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
-        apart: (M,) written: two cameras or more see it, but their rays do not meet.
-        rejected: (C, M) written: outliers, without which they do.
+        points, cov, noise, outliers, rejected: Written as of `MarkerPositions`.
         uv, variance, own: Written, as of `RayPositions`.
     """
     hand = _Hand(known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise)
@@ -320,31 +288,22 @@ def correct_centres(
 class RayPositions(MarkerPositions):
     """Markers triangulated by rays, with the information of each ray.
 
-    Attributes:
-        uv: (C, M, 2) [px] centroids without the bias of the caps; NaN: not seen.
-        variance_px2: (C, M) per axis, of each camera's own errors; NaN: not seen, an outlier, or rays do not meet.
-        own_m2: (M, 3, 3) covariance of what is wrong with the markers themselves: what all cameras see alike, the tilt
-            and the radius of caps; as large as a fit that starts from the same hand must assume.
+    `own_m2`: covariance of what is wrong with the markers themselves: what all cameras see alike, the tilt
+    and the radius of caps; as large as a fit that starts from the same hand must assume.
     """
 
-    uv: Float
-    variance_px2: Float
-    own_m2: Float
+    uv: Float  # (C, M, 2) [px] centroids without the bias of the caps; NaN: not seen
+    variance_px2: Float  # (C, M) per axis, each camera's own; NaN: not seen, an outlier, or rays miss
+    own_m2: Float  # (M, 3, 3)
 
 
 class RayTriangulator:
-    """Triangulator of the markers of a rig by rays.
-
-    Holds room for its kernels, no state.
-    """
+    """Triangulator of the markers of a rig by rays; holds no state."""
 
     def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
         """Triangulate these markers with these cameras.
 
-        Args:
-            cameras: In the order of the observations' first axis.
-            caps: The markers.
-            rays_px: Standard deviation per axis that the calibration leaves.
+        `rays_px`: standard deviation per axis that the calibration leaves.
 
         Raises:
             ValueError: Fewer than two cameras.
@@ -382,39 +341,18 @@ class RayTriangulator:
             grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - rotation_rad2
             ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + rotation_rad2
             process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
-        points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
-        noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
-        rejected = np.empty((cameras, count), np.bool_)
-        seen, variance = np.empty((cameras, count, 2)), np.empty((cameras, count))
-        own = np.empty((count, 3, 3))
-        arguments = (
-            self._cameras,
-            self._caps,
-            self._rays_px,
-            self._limits,
-            hand is not None,
-            as_seen,
-            R,
-            tilt,
-            (CAPS.rotation_rad_s * age_s) ** 2,
-            np.ascontiguousarray(at),
-            np.ascontiguousarray(process_noise),
-            observed,
-            self._rays,
-            self._views,
-            points,
-            cov,
-            noise,
-            outliers,
-            rejected,
-            seen,
-            variance,
-            own,
-        )
+        places = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+        flags = np.empty(count, np.bool_), np.empty((cameras, count), np.bool_)
+        pixels = np.empty((cameras, count, 2)), np.empty((cameras, count)), np.empty((count, 3, 3))
+        out = *places, *flags, *pixels
+        rig = self._cameras, self._caps, self._rays_px, self._limits
+        directions = hand is not None, as_seen, R, tilt, (CAPS.rotation_rad_s * age_s) ** 2
+        about = np.ascontiguousarray(at), np.ascontiguousarray(process_noise)
+        arguments = *rig, *directions, *about, observed, self._rays, self._views, *out
         if self._correct_centres is None:
             self._correct_centres = bound(correct_centres, *arguments)
         self._correct_centres(*arguments)
-        return RayPositions(points, cov, noise, outliers, rejected, seen, variance, own)
+        return RayPositions(*out)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""

@@ -1,10 +1,7 @@
 """The card's solver turns centroids into a hand, finger by finger.
 
-A finger of a hand: its chain, its closed form, and FABRIK from there.
-
-The card: centroids, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
-
-Push machine without clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
+Centroids, disparity, depth, 1 €, palm, FABRIK per finger from its closed form: a hand. Push machine without
+clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
 """
 
 from collections.abc import Callable
@@ -52,35 +49,22 @@ _UNKNOWN = (_NAN,) * 4
 
 
 class FingerSolution(NamedTuple):
-    """Angles of one finger [rad] and how well they fit.
-
-    The thumb's are CMC abduction, CMC flexion, MCP and IP.
-
-    Attributes:
-        residual_m: Distance of the point to the target.
-        reached: Whether legal angles hit the target within 1 um.
-    """
+    """Angles of one finger [rad] (thumb: CMC, CMC, MCP, IP) and how well they fit."""
 
     abduction_rad: float
     flexion_rad: float
     pip_rad: float
     dip_rad: float
-    residual_m: float
-    reached: bool
+    residual_m: float  # distance of the point to the target
+    reached: bool  # whether legal angles hit the target within 1 um
 
 
 class FingerResult(NamedTuple):
-    """How FABRIK ended on one finger.
+    """How FABRIK ended on one finger."""
 
-    Attributes:
-        residual_m: Distance of the point to the target; NaN: not seen.
-        iterations: 0: the seed was on the target.
-        reached: Residual within the tolerance.
-    """
-
-    residual_m: float
-    iterations: int
-    reached: bool
+    residual_m: float  # distance of the point to the target; NaN: not seen
+    iterations: int  # 0: the seed was on the target
+    reached: bool  # residual within the tolerance
 
 
 NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
@@ -88,31 +72,21 @@ NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FingerSolver:
-    """Closed form of one finger of one hand, prepared; build once with `of`.
+    """Closed form of one finger of one hand, prepared; build once with `of`."""
 
-    Attributes:
-        chain: The finger's links and limits, root frame (the palm's axes, origin at the root joint).
-        root: MCP (thumb: CMC) in the palm frame [m].
-        ratio: DIP per PIP that makes the closed form exact.
-        edges: (B + 1,) ends of the branches of the PIP, rising [rad].
-        start: `start_of`, bound to the types of this finger.
-    """
-
-    chain: Chain
-    root: Vector
-    ratio: float
-    edges: Float
-    start: Callable[..., float]
+    chain: Chain  # the finger's links and limits, root frame (the palm's axes, origin at the root joint)
+    root: Vector  # MCP (thumb: CMC) in the palm frame [m]
+    ratio: float  # DIP per PIP that makes the closed form exact
+    edges: Float  # (B + 1,) ends of the branches of the PIP, rising [rad]
+    start: Callable[..., float]  # `start_of`, bound to the types of this finger
 
     @classmethod
     def of(
         cls, model: HandModel, finger: int, offset_m: Float, free_ratio: float | None = None
     ) -> "FingerSolver":
-        """Prepare one finger.
+        """Prepare one finger, 0 thumb ... 4 little.
 
         Args:
-            model: The hand.
-            finger: 0 thumb ... 4 little.
             offset_m: The observed point (3,) in the tip joint's frame [m]; zero: the tip joint.
             free_ratio: DIP (thumb: IP) per PIP (MCP) to prefer where the model leaves it free; None: the
                 ratio it tends to, else that of their highest angles, with which every distance is reached.
@@ -139,13 +113,9 @@ class FingerSolver:
     def solve(self, target: Vector, warm_start: Four | None = None) -> FingerSolution:
         """Angles that bring the point to `target`, or as near to it as the limits allow.
 
-        Args:
-            target: (x, y, z) of the point in the palm frame [m]. NaN: not seen.
-            near: Angles of a moment ago; where several legal poses hit the target (straight finger, pole of
-                the abduction) the nearest is taken, else the more bent one.
-
-        Returns:
-            Angles inside the limits; NaN where the target is not finite.
+        `target`: (x, y, z) in the palm frame [m]; NaN: not seen, so are the angles. `warm_start`: angles of a
+        moment ago; where several legal poses hit the target (straight finger, pole of the abduction) the
+        nearest is taken, else the more bent one.
         """
         goal = minus(target, self.root)
         if not isfinite(length(goal)):
@@ -163,19 +133,12 @@ class FingerSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finger:
-    """FABRIK for one finger of one hand, prepared. Holds no state between calls.
-
-    Attributes:
-        closed_form: The same finger.
-        tolerance_m: Residual that counts as reached.
-        max_iterations: Of FABRIK; the seed is the answer, and what it cannot reach iterations improve little.
-        bring: `bring_onto`, bound to the types of this finger.
-    """
+    """FABRIK for one finger of one hand, prepared. Holds no state between calls."""
 
     closed_form: FingerSolver
-    tolerance_m: float
-    max_iterations: int
-    bring: Callable[..., tuple[float, int]]
+    tolerance_m: float  # residual that counts as reached
+    max_iterations: int  # the seed is the answer, and what it cannot reach iterations improve little
+    bring: Callable[..., tuple[float, int]]  # `bring_onto`, bound to the types of this finger
 
     @classmethod
     def of(
@@ -206,25 +169,14 @@ class Finger:
     def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
         """Bring the finger's point to a target: FABRIK from the closed form.
 
-        Where the DIP is free (always the thumb's) the point does not fix all angles, and FABRIK starts from the given
-        ones; from the closed form only where they are NaN or do not lead to the target.
-
-        Args:
-            target_m: (3,) in the palm frame. NaN: not seen.
-            angles_rad: (4,) in place, contiguous; in: the angles of a moment ago, NaN: not known; out: the best legal
-                angles found, or as given where the target is not finite.
+        Where the DIP is free (always the thumb's) the point does not fix all angles, and FABRIK starts from
+        the given ones; from the closed form only where they are NaN or do not lead to the target. `target_m`
+        (3,), palm frame; NaN: not seen. `angles_rad` (4,) in place, contiguous; in: those of a moment ago,
+        NaN: not known; out: the best legal ones, or as given where the target is not finite.
         """
         solver, tolerance_m, most = self.closed_form, self.tolerance_m, self.max_iterations
-        residual, iterations = self.bring(
-            solver.chain.arrays,
-            solver.edges,
-            solver.ratio,
-            solver.root,
-            target_m,
-            tolerance_m,
-            most,
-            angles_rad,
-        )
+        prepared = solver.chain.arrays, solver.edges, solver.ratio, solver.root
+        residual, iterations = self.bring(*prepared, target_m, tolerance_m, most, angles_rad)
         return FingerResult(residual, iterations, residual <= tolerance_m)
 
 
@@ -232,17 +184,7 @@ class Finger:
 def start_of(
     chain: ChainArrays, edges: Float, ratio: float, goal: Vector, warm_start: Float, angles: Float
 ) -> float:
-    """Return the start pose of FABRIK.
-
-    It is the closed form, or the legal pose nearest to the target.
-
-    Args:
-        chain, edges, ratio, goal, near: As of `closed_form`.
-        angles: (4,) [rad], out.
-
-    Returns:
-        Distance of the point to the target [m].
-    """
+    """Write the start of FABRIK (4,): closed form, or nearest legal; return distance."""
     initial_angles = np.empty((3, 4))
     left = closed_form(chain, edges, ratio, goal, warm_start, angles, initial_angles)
     return left if left < inf else nearest_pose(chain, goal, warm_start, initial_angles, angles)
@@ -259,9 +201,9 @@ def bring_onto(
     max_iterations: int,
     angles: Float,
 ) -> tuple[float, int]:
-    """Bring a finger onto its target, as `Finger.solve`.
+    """Bring a finger onto its target; return the distance [m] and iterations.
 
-    Returns the distance that is left [m], NaN where nothing is seen, and the iterations.
+    NaN where nothing is seen.
     """
     goal = minus((target[0], target[1], target[2]), root)
     if not isfinite(length(goal)):
@@ -279,11 +221,8 @@ def bring_onto(
 def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: bool = True) -> Chain:
     """The chain from a finger's MCP (thumb: CMC) to a point fixed to its tip joint.
 
-    Args:
-        model: The hand.
-        finger: 0 thumb ... 4 little.
-        offset_m: End effector (3,) in the tip joint's frame [m]; zero: the tip joint itself.
-        coupled: Whether the DIP follows the PIP where the model keeps their ratio exactly (never for the thumb).
+    `offset_m` (3,): end effector in the tip joint's frame; zero: the joint itself. `coupled`: whether the DIP
+    follows the PIP where the model keeps their ratio exactly (never for the thumb).
     """
     limits = [(float(low), float(high)) for low, high in model.limits_rad[finger]]
     rest = as_matrix(model.rest_rotation[CHAINS[finger, 0]])
@@ -368,21 +307,17 @@ class FabrikSolver:
         once: Estimator,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
-        """Join the parts.
+        """Join the parts; cameras in the rig's order, markers in that of every array.
 
         Args:
-            cameras: In the rig's order.
-            model: The hand.
-            markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
-            sync: Brings cameras to one epoch.
             triangulate: Centroids to points by the rig's depth model.
             one_euro: Filter of the points; None: epochs are unrelated, nothing is filtered or remembered.
             palm: Fits the palm, with the angles that go best with it, from the hand's markers.
             once: The same without memory; fingers that are not seen may be anywhere natural.
             stage: Opens a timer by stage name.
         """
-        self._model, self.sync, self.triangulate = model, sync, triangulate
+        self.sync, self.triangulate = sync, triangulate
         self._one_euro, self._palm, self._once, self._stage = one_euro, palm, once, stage
         self.continuous = one_euro is not None  # epochs follow each other; else nothing is remembered
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
@@ -415,11 +350,8 @@ class FabrikSolver:
     ) -> HandEstimate:
         """Solve one epoch.
 
-        Args:
-            frames: What the cameras see of it.
-            near: A hand that is surer than this line's last one, for the side of the caps that the cameras see; this
-                line's then has its covariance to first order.
-            warm_start_age_s: How long ago that held [s].
+        `warm_start`: a hand of `warm_start_age_s` ago that is surer than this line's last one, for the side
+        of the caps that the cameras see; this line's then has its covariance to first order.
         """
         last, age_s = self._recent(frames.t_ns)
         seen_as, seen_age_s = (last, age_s) if warm_start is None else (warm_start, warm_start_age_s)
@@ -444,16 +376,10 @@ class FabrikSolver:
             return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
     def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
-        """Solve from points alone and remember nothing.
+        """Solve from points alone and remember nothing; None: they are too few.
 
-        A finger that is not seen may be anywhere natural.
-
-        Args:
-            points, cov: (M, 3) [m] and (M, 3, 3) [m^2] of all markers; NaN: not placed.
-            area_px2: (C, M) as the cameras see them.
-
-        Returns:
-            The hand; None: the points are too few.
+        A finger that is not seen may be anywhere natural. `points`, `cov` (M, 3) [m] and (M, 3, 3) [m^2] of
+        all markers; NaN: not placed. `area_px2` (C, M) as the cameras see them.
         """
         back_normal = self.towards(points[self.on_hand], area_px2)
         return self._once.push(Epoch(0, points, back_normal, cov_m2=cov)).solution
@@ -469,7 +395,6 @@ class FabrikSolver:
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         targets = np.empty_like(places)
         targets_of(places, cov[self.on_hand], _AWAY, places, _FIT_M2, targets)
-        self.sync.at(0)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """Return the last hand, if it is still informative, and its age [s]."""
@@ -479,10 +404,7 @@ class FabrikSolver:
         return self._last, age_s
 
     def towards(self, points: Float, area_px2: Float) -> Float:
-        """Return the unit vector (3,) to the cameras that see most of the back.
-
-        Of the hand's points (H, 3) [m], by the areas of all markers (C, M) [px^2].
-        """
+        """Return the unit vector (3,) from points (H, 3) to cameras that see the back."""
         out = self._ahead.copy()
         back_normal_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
@@ -511,10 +433,7 @@ class FabrikSolver:
         return replace(out, solution=hand, solved=solved)
 
     def _judge(self, out: HandEstimate, palm: Fitted, marker_chi2: Float, triangulated: Bool) -> None:
-        """Write the bits of a solved hand; `triangulated`: (H,) which markers are.
-
-        What they explain is tracked.
-        """
+        """Write the bits of a solved hand: tracked is what (H,) markers explain."""
         out.seen[self._finger_of[triangulated & self._on_finger]] = True
         inlier = out.seen.copy()
         wrong = marker_chi2 >= self._palm.settings.marker_gate

@@ -1,42 +1,28 @@
 """Frames of all cameras are brought to one epoch.
 
-Propagation of the markers of every camera to one epoch.
+An epoch is the centre row of a frame of the leading camera: the first of the rig that is not silent (others
+delivered a dozen frames since its last), nor slow (it delivers less than half of its frames, by what others
+deliver), nor behind (its last frame was a dozen periods older than the newest when it came). It is *complete*
+when every other camera has delivered a frame at or after it; `predict` waits only for those whose next frame
+is nearer to the epoch than their last, and carries the others forward, half a period at most. It is emitted
+when it is complete, or when the message time has passed its deadline. Message time is the newest capture time
+seen: no clock is read, so a replay synchronises exactly as the live run did. An epoch that still waited when
+all fell silent is *stale* and dropped.
 
-They are carried from the frames around the epoch to the epoch.
-
-A hand's way is known by what hands can do: about the epoch it is a Taylor series whose speed, acceleration, jerk and
-snap are random, with the sizes of real hands. Given up to four frames with their noise, the best linear estimate of the
-place and its variance follow (Gaussian process regression with an unknown constant: Rasmussen, Williams 2006, 2.7;
-"universal kriging"):
+Each marker has its own capture time, t_row0 + row_time v, and is carried from there to the epoch; a sideways
+error Dt v would turn into a depth error D v Dt / B, the largest of an unsynchronised rig. A hand's way is a
+Taylor series whose speed, acceleration, jerk and snap are random, with the sizes of real hands. Given up to
+four frames, the best linear estimate of the place and its variance follow (Gaussian process regression with
+an unknown constant: Rasmussen, Williams 2006, 2.7; "universal kriging"):
 
     S_ij = V^2 tt + A^2 (tt^2 / 2!^2 + w^2 tt^3 / 3!^2 + w^4 tt^4 / 4!^2) + sigma_i^2 [i = j],    tt = t_i t_j
     x = 1' S^-1 y / c,    var = 1 / c,    c = 1' S^-1 1                     (t: times from the epoch)
 
-Without noise this is the polynomial through the frames; a hand at rest is averaged, and a step into the future does
-not amplify its noise. How hard the hand moves (A) is not known, so every degree of vigour is tried, from a hand laid
-down to a brisk wave; each counts by its marginal likelihood, and where they disagree the variance grows. An error of
-the time adds in proportion to the marker's speed in the image.
-
-Where a slave named two places of a colour, a marker and its *alternative*, they may be swapped from one frame to the
-next, and a line from one thing to another is nowhere. The places of such a marker are first sorted into two tracks by
-nearness in the image. Which of the two is the marker is decided with the other cameras (`master.fabrik.intersection`).
-
-Synchronisation of the cameras.
-
-It determines which frames belong together, and the markers at one epoch.
-
-An epoch is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
-delivered a dozen frames since its last), nor slow (it delivers less than half of its frames, by what others deliver),
-nor behind (its last frame was a dozen periods older than the newest when it came). It is *complete* when every other
-camera has delivered a frame at or after it, so that tracks can be interpolated; `predict` waits only for those whose
-next frame is nearer to the epoch than their last, and carries the others forward, half a period at most. An epoch
-is emitted when it is complete, or when the message time has passed its deadline, with whatever there is. Message time
-is the newest capture time seen: no clock is read here, so a replay synchronises exactly as the live run did. An epoch
-that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and dropped.
-
-Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier than the back
-of the hand. `master.fabrik.sync` carries each to the epoch; a sideways error Dt v would turn into a depth error
-D v Dt / B, the largest of an unsynchronised rig.
+A is not known, so every degree of vigour is tried; each counts by its marginal likelihood, and where they
+disagree the variance grows. An error of the time adds in proportion to the marker's speed in the image. Of a
+marker and its *alternative*, which may be swapped from one frame to the next, the places are first sorted
+into two tracks by nearness; which is the marker is decided with the other cameras
+(`master.fabrik.intersection`).
 """
 
 from collections import deque
@@ -84,21 +70,17 @@ Reach = tuple[int, int, int, int]
 class TrackHistory(NamedTuple):
     """The last frames of C cameras; frame k is in slot k modulo HISTORY.
 
-    Attributes:
-        total: (C,) frames of each camera so far.
-        times_ns: (C, HISTORY, 3) when the centre row and row 0 were exposed, when the frame was handed to its slave.
-        t_sigma_ns: (C, HISTORY) standard deviation of the times, one error for all frames of a camera.
-        marks: (C, HISTORY, 6, M) u, v, u and v of the alternative, sigma [px], area [px^2]; NaN: not seen.
-        row_time_ns: (C,) from one row to the next.
-        scale_px_m: (C,) pixels that a metre across the line of sight takes where hands are.
+    `times_ns` (C, HISTORY, 3): when the centre row and row 0 were exposed, when the frame was handed to its
+    slave. `marks` (C, HISTORY, 6, M): u, v, u and v of the alternative, sigma [px], area [px^2]; NaN: not
+    seen.
     """
 
-    total: Int
+    total: Int  # (C,) frames of each camera so far
     times_ns: Int
-    t_sigma_ns: Float
+    t_sigma_ns: Float  # (C, HISTORY) of the times, one error for all frames of a camera
     marks: Float
-    row_time_ns: Float
-    scale_px_m: Float
+    row_time_ns: Float  # (C,) from one row to the next
+    scale_px_m: Float  # (C,) pixels of a metre across the line of sight where hands are
 
 
 @kernel
@@ -110,13 +92,9 @@ def propagate(
     What the nearest frame does not show is not seen.
 
     Args:
-        recent: Of each camera.
-        t_ns: The epoch.
         reach_ns: How far away each of the frames that are used may be, the nearest first; negative: not used.
-        uv: (2, C, M, 2) [px], markers and alternatives, written; NaN: not seen.
-        sigma: (2, C, M) [px] per axis, time error included, written.
-        area: (C, M) [px^2] of the nearest frame, written.
-        missing: (C,) written: the camera has no frame there.
+        uv, sigma: (2, C, M, 2), (2, C, M) [px], markers and alternatives, time error included; NaN: not seen.
+        area, missing: (C, M) [px^2] of the nearest frame; (C,) the camera has no frame there.
 
     Returns:
         When the last frame that was used was handed to its slave [ns] (none: the epoch), and whether there are
@@ -157,12 +135,12 @@ def propagate(
 
 @inner
 def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int) -> int:
-    """Write the slots of the frames around an epoch, nearest first.
+    """Write the slots of frames around an epoch, nearest first; return how many.
 
-    Returns how many. None at all where even the nearest is too far: a track carried over two frames into the unknown
-    is off by decimetres in depth, and the ray of a camera that does see is worth more. Of the frames after the epoch
-    the first alone counts (two where there is none before), as if the others had not yet come: what comes out does not
-    depend on how far a camera's messages ran ahead of another's.
+    None where even the nearest is too far: a track carried over two frames into the unknown is off by
+    decimetres in depth. Of the frames after the epoch the first alone counts (two where there is none
+    before), as if the others had not yet come: what comes out does not depend on how far a camera's messages
+    ran ahead of another's.
     """
     newest, oldest = history.total[c], max(history.total[c] - SETTINGS.history, 0)
     after = newest
@@ -187,11 +165,9 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
 
 @inner
 def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, track: Float) -> bool:
-    """Write the tracks of a marker and its alternative.
+    """Write the tracks of a marker and its alternative; return whether it has one.
 
-    Returns whether the marker has an alternative.
-
-    `track`: (OBSERVATIONS, 2, 4) u, v [px], time of the row from the epoch [s], sigma [px].
+    `track` (OBSERVATIONS, 2, 4): u, v [px], time of the row from the epoch [s], sigma [px].
     """
     alternative = False
     for k in range(n):
@@ -209,7 +185,7 @@ def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, t
 def _sort(track: Float, n: int, leap_px_s: float) -> None:
     """Give every place to the track that it continues; leaps are cut.
 
-    The slave's names are contradicted only where the places are so much nearer to the other track, which must exist.
+    The slave's names are contradicted only by places much nearer to the other track, which must exist.
     """
     for k in range(1, n):
         straight = crossed = 0.0
@@ -230,9 +206,9 @@ def _sort(track: Float, n: int, leap_px_s: float) -> None:
 
 @inner
 def _distance(track: Float, k: int, i: int, which: int, leap_px_s: float) -> float:
-    """Distance [px] of place `which` of frame k from track i before it.
+    """Distance [px] of place `which` of frame k from the place before in track i.
 
-    From its place nearest in time; infinite: that is a leap; NaN: there are no two places.
+    Infinite: that is a leap; NaN: there are no two places.
     """
     nearest, away_s = -1, inf
     for j in range(k):
@@ -254,7 +230,7 @@ def _variance(sigma_px: float) -> float:
 def _select(track: Float, n: int, i: int, scale: float, known: Float) -> int:
     """Write the places of track i that are no leap from the nearest; return how many.
 
-    `known`: (SIGHTINGS, 5) of each 1, u, v [px] from the nearest, time [s], variance of its new noise [px^2].
+    `known` (OBSERVATIONS, 5): 1, u, v [px] from the nearest, time [s], variance of its new noise [px^2].
     """
     count = 0
     for k in range(n):
@@ -297,17 +273,11 @@ def _mix(known: Float, n: int, scale: float, L: Float, z: Float, fit: Float, mix
 
 @inner
 def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z: Float, fit: Float) -> float:
-    """Fit one degree of vigour to n places; return its evidence.
+    """Fit one degree of vigour to n places; return its log marginal likelihood.
 
-    That is the logarithm of the marginal likelihood.
-
-    Args:
-        known: As of `_select`.
-        n: How many.
-        speed2, acceleration2: V^2 [px^2/s^2], A^2 [px^2/s^4].
-        L, z: Scratch (SIGHTINGS, SIGHTINGS), (SIGHTINGS, 4): Cholesky factor of S with the diagonal inverted, and
-            L^-1 (1, u, v, t).
-        fit: Written: 1, u, v, their variance, speed of u and of v, weights of the places.
+    `known` as of `_select`; V^2 [px^2/s^2], A^2 [px^2/s^4]; L, z: scratch, Cholesky factor of S with the
+    diagonal inverted, and L^-1 (1, u, v, t); fit: written: 1, u, v, their variance, speed of u and of v,
+    weights of the places.
     """
     det, c, u, v = 1.0, 0.0, 0.0, 0.0
     for i in range(n):
@@ -346,9 +316,8 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
             s -= L[k, i] * fit[6 + k]
         fit[6 + i] = s * L[i, i]
     evidence = 0.5  # so they also constrain the motion less than as many independent ones
-    return -evidence * (
-        log(det * c) + 0.5 * residual2
-    )  # two axes: twice the logarithm of the determinant's root
+    # two axes: twice the logarithm of the determinant's root
+    return -evidence * (log(det * c) + 0.5 * residual2)
 
 
 SILENT_FRAMES = 12
@@ -356,36 +325,20 @@ SILENT_FRAMES = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Every marker in every camera at one epoch.
+    """Every marker in every camera at one epoch."""
 
-    Attributes:
-        t_ns: The epoch, master's clock.
-        uv: (C, M, 2) [px], distorted image; NaN: that camera does not see that marker then.
-        sigma_px: (C, M) standard deviation per axis, time error included.
-        area: (C, M) [px^2] of the nearest frame.
-        ready_t_ns: When the last contributing frame was handed to its slave.
-        missing: (C,) cameras that had no frame in time.
-        alt_uv, alt_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
-    """
-
-    t_ns: int
-    uv: Float
-    sigma_px: Float
-    area: Float
-    ready_t_ns: int
-    missing: Bool
-    alt_uv: Float | None = None
+    t_ns: int  # the epoch, master's clock
+    uv: Float  # (C, M, 2) [px], distorted image; NaN: that camera does not see that marker then
+    sigma_px: Float  # (C, M) standard deviation per axis, time error included
+    area: Float  # (C, M) [px^2] of the nearest frame
+    ready_t_ns: int  # when the last contributing frame was handed to its slave
+    missing: Bool  # (C,) cameras that had no frame in time
+    alt_uv: Float | None = None  # as `uv`, of the second places that slaves named; None: none at all
     alt_sigma_px: Float | None = None
 
 
 class FrameSync:
-    """Synchroniser of camera frames into epochs.
-
-    Push machine. Holds the last few frames of each camera and the epochs not yet emitted.
-
-    Attributes:
-        outdated: Epochs that were dropped because they waited for as long as nothing came at all.
-    """
+    """Push machine: frames to epochs; `stale`: dropped, they waited while none came."""
 
     def __init__(
         self,
@@ -399,7 +352,6 @@ class FrameSync:
         """Take the cameras in the rig's order; the first that delivers leads.
 
         Args:
-            cameras: Camera name -> model.
             frame_rate_hz: Nominal rates; the slowest sets deadline and largest bridgeable gap.
             markers: How many each message has.
             policy: Wait for the other cameras' next frames and interpolate, or for those alone that are nearer to the
@@ -440,9 +392,7 @@ class FrameSync:
         self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
-        """Take one camera's detections and return the finished epochs.
-
-        These are the epochs that became complete or due, oldest first.
+        """Take one camera's detections; return epochs complete or due, oldest first.
 
         Raises:
             ValueError: The camera or the number of markers is not of this rig (ingest lets no such message pass).
@@ -510,10 +460,7 @@ class FrameSync:
         return self._frames - (came[-1] if came else 0) >= self._patience
 
     def _slow(self, c: int) -> bool:
-        """Whether a camera delivers too little to lead.
-
-        By what others deliver and the rates of the files.
-        """
+        """Whether a camera delivers too little to lead, by others and the files' rates."""
         at = self._came[c]
         slow_frames = 4  # times as many frames of others as the files state, between so many of its own
         return len(at) >= slow_frames and at[-1] - at[0] > self._slow_frames[c] * (len(at) - 1)
@@ -533,10 +480,7 @@ class FrameSync:
         return out
 
     def _complete(self, t_ns: int) -> bool:
-        """Whether no camera is waited for.
-
-        One that was when last asked mostly still is, and is asked first.
-        """
+        """Whether no camera is waited for; the one last waited for is asked first."""
         for _ in self._came:
             if self._awaits(self._awaited, t_ns):
                 return False
@@ -552,10 +496,7 @@ class FrameSync:
         return newest + self._slack_ns[c] < t_ns and not self._silent(c)
 
     def _lonely(self, t_ns: int) -> bool:
-        """Check whether a camera that is not silent had no frame for an epoch.
-
-        From half a period before it to a while after.
-        """
+        """Whether a camera, not silent, had no frame from half a period before an epoch."""
         return any(
             not self._silent(c) and not any(-self._half_ns[c] <= s - t_ns <= self._stale_ns for s in centres)
             for c, centres in enumerate(self._history.times_ns[:, :, 0].tolist())

@@ -1,21 +1,19 @@
 """Triangulate centroids: disparity, D = k x^z, X, Y, Z, covariance.
 
-Kalbfleisch measures x = u_left - u_right on the images as they are, not rectified, and fits D = k x^z with a target on
-the axis, before the middle between the lenses (section VI). There the law contains how the cameras are misaligned.
-Away from the axis lens, roll and yaw change the disparity of the same depth: of the shipped desk rig, whose right
-camera is rolled by 0.3 degrees, by 0.8 px at the edge of the volume, or 8 mm. By the rig's own geometry that change is
+Kalbfleisch measures x = u_left - u_right on the images as they are, not rectified, and fits D = k x^z with a
+target on the axis, before the middle between the lenses (section VI). Away from the axis lens, roll and yaw
+change the disparity of the same depth: of the shipped desk rig, whose right camera is rolled by 0.3 degrees,
+by 0.8 px at the edge of the volume, or 8 mm. By the rig's own geometry that change is
 
     x(u, v, D) - x(axis, D) = a(u, v) + b(u, v) / D
 
-to a hundredth of a pixel, so a and b are tabulated over the left image and their values are taken from the disparity
-before the law is asked. On the axis, and for parallel cameras without distortion, it is 0. In the same way the row at
-which the right camera must see the marker is tabulated: a marker whose rows disagree is two things, and dropped.
+to a hundredth of a pixel, so a and b are tabulated over the left image and their values are taken from the
+disparity before the law is asked. So is the row at which the right camera must see the marker: a marker whose
+rows disagree is two things, and dropped. The centroid of a finger tip is up to half a radius off that of its
+cap (`master.fabrik.caps`).
 
-A camera sees the side of a painted finger tip that faces it, so the centroid is up to half a radius off that of the
-cap; by how much follows from the direction in which the finger pointed a moment ago (`master.fabrik.caps`).
-
-Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigma_u / f, and what the law's fit left;
-and by how far the point moves where the finger points elsewhere within one standard deviation.
+Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigma_u / f, and what the law's
+fit left; and by how far the point moves where the finger points elsewhere within one standard deviation.
 """
 
 from math import sqrt
@@ -37,34 +35,23 @@ _ONE = constant(1)  # direction
 class DisparityTables(NamedTuple):
     """A pair of cameras and its law as flat arrays.
 
-    Attributes:
-        power: Whether D = k x^z; else D = k / (x - z).
-        k, z: Of the law.
-        law_error: Relative standard deviation of the law.
-        row_sigma_px: Standard deviation of the difference of rows that the geometry leaves.
-        row_limit: Most of its chi square.
-        cell_px: (2,) width and height of a cell.
-        table: (GRID + 1, GRID + 1, 6) at each corner (row, column): a, b of the disparity off the axis, a, b of the
-            difference of rows, and x, y of the undistorted ray.
-        R, centre: (3, 3), (3,) the left camera in the rig.
-        camera_R: (2, 3, 3) rotations rig -> camera, for what each sees of a cap.
-        centres: (2, 3) [m].
-        focal_px: (2,).
+    `table` (GRID + 1, GRID + 1, 6) at each corner (row, column): a, b of the disparity off the axis, a, b of
+    the difference of rows, and x, y of the undistorted ray.
     """
 
-    power: bool
+    power: bool  # whether D = k x^z; else D = k / (x - z)
     k: float
     z: float
-    law_error: float
-    row_sigma_px: float
-    row_limit: float
-    cell_px: Float
+    law_error: float  # relative standard deviation of the law
+    row_sigma_px: float  # standard deviation of the difference of rows that the geometry leaves
+    row_limit: float  # most of its chi square
+    cell_px: Float  # (2,) width and height of a cell
     table: Float
-    R: Float
-    centre: Float
-    camera_R: Float
-    centres: Float
-    focal_px: Float
+    R: Float  # (3, 3) the left camera in the rig
+    centre: Float  # (3,) [m]
+    camera_R: Float  # (2, 3, 3) rotations rig -> camera, for what each sees of a cap
+    centres: Float  # (2, 3) [m]
+    focal_px: Float  # (2,)
 
 
 def disparity_tables(
@@ -74,10 +61,7 @@ def disparity_tables(
     row_sigma_px: float,
     row_limit: float,
 ) -> DisparityTables:
-    """Tabulate the geometry of the first two cameras over the left image.
-
-    Arguments as of `DisparityTables`.
-    """
+    """Tabulate the first two cameras over the left image; as of `DisparityTables`."""
     left, right = cameras[:2]
     grid = 48  # cells of the table along each side of the image
     u = np.linspace(0.0, left.width_px, grid + 1)
@@ -139,11 +123,8 @@ def place_centroids(
 ) -> tuple[float, float]:
     """Return the depth [m] and how far the rows disagree [px]; write the point.
 
-    Args:
-        tables: The pair.
-        u, v: Centroid in the left image [px].
-        right_u, right_v: In the right one.
-        ray, point: Written: (3,) of depth 1, and (3,) [m], rig frame; not where the depth is NaN.
+    `u`, `v` [px] in the left image; `ray` (3,) of depth 1 and `point` (3,) [m], rig frame, are not written
+    where the depth is NaN.
     """
     across, down = u / tables.cell_px[0], v / tables.cell_px[1]
     if not np.isfinite(across + down + right_u + right_v):
@@ -174,14 +155,10 @@ def place_centroids(
 def cap_bias(
     tables: DisparityTables, caps: CapTables, row: int, ahead: Float, point: Float, bias: Float, shown: Float
 ) -> None:
-    """Write by how much each camera sees a cap's centroid off its own.
+    """Write by how much each camera sees a cap's centroid off its own (2, 2) [px].
 
-    Args:
-        tables, caps: The pair and the markers.
-        row: The marker's in `caps.appearances`.
-        ahead: (3,) unit vector in which the finger points, rig frame.
-        point: (3,) [m] about where the cap is, rig frame.
-        bias, shown: Written: (2, 2) [px], and the area that it shows (2,) [m^2].
+    Of the cap in `row` of `caps.appearances` at about `point` (3,) [m], which points `ahead` (3,), rig frame;
+    `shown` (2,) [m^2]: the area that it shows.
     """
     back, shift = np.empty(3), np.empty(3)
     here, there = np.empty(3), np.empty(3)
@@ -205,10 +182,7 @@ def cap_bias(
 
 @inner
 def _across(ahead: Float, tilt: Float, out: Float) -> None:
-    """Write two directions (2, 3) across `ahead`, as long as it is unsure [rad].
-
-    `tilt`: (3, 3) [rad^2] covariance.
-    """
+    """Write two directions (2, 3) across `ahead`, as long as tilt (3, 3) [rad^2]."""
     least = 0
     for k in range(1, 3):
         if abs(ahead[k]) < abs(ahead[least]):
@@ -245,15 +219,12 @@ def triangulate(
     """Triangulate M markers with covariance.
 
     Args:
-        tables, caps: The pair and the markers.
-        uv: (2, M, 2) centroids [px]; NaN: not seen.
-        sigma_px, area_px2: (2, M).
-        ahead: (M, 3) unit vectors in which the fingers point, rig frame; NaN: not known, what is seen is taken.
-        tilt: (M, 3, 3) [rad^2] covariance of these.
-        points: (M, 3) [m], written; NaN: a camera does not see the marker, there is no such
-            disparity, or its standard deviation exceeds half of its depth.
+        uv, sigma_px, area_px2: (2, M, 2) centroids [px], (2, M); NaN: not seen.
+        ahead, tilt: (M, 3) in which the fingers point, rig frame, (M, 3, 3) [rad^2]; NaN: what is seen is taken.
+        points: (M, 3) [m], written; NaN: a camera does not see the marker, there is no such disparity, or its
+            standard deviation exceeds half of its depth.
         cov, noise: (M, 3, 3) [m^2] covariance and its noise part, written; NaN where the point is.
-        apart: (M,) written: the rows disagree.
+        outliers: (M,) written: the rows disagree.
     """
     ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     bias, shown, tilted = np.empty((2, 2)), np.empty(2), np.empty((2, 3))
@@ -354,10 +325,7 @@ def triangulate(
 
 
 class Triangulate(Protocol):
-    """Triangulator of the M markers of an epoch by the depth model of a rig.
-
-    By its law, or by the rays of all cameras.
-    """
+    """Triangulator of the M markers of an epoch, by a rig's law or by all rays."""
 
     def __call__(
         self,
@@ -369,14 +337,11 @@ class Triangulate(Protocol):
         *,
         as_seen: bool = False,
     ) -> MarkerPositions:
-        """Triangulate.
+        """Triangulate centroids uv (C, M, 2) [px]; NaN: not seen.
 
-        Args:
-            uv: (C, M, 2) centroids [px]; NaN: not seen.
-            sigma_px, area_px2: (C, M).
-            hand: A hand of `age_s` [s] ago, which determines what side of each cap is seen; None: any that shows it.
-            age_s: Its age.
-            as_seen: There is no estimate of a hand: what is seen of a marker is taken for its centroid.
+        `hand`, `age_s`: a hand of a moment ago, which determines what side of each cap is seen; None: any
+        that shows it. `as_seen`: there is no estimate of a hand: what is seen of a marker is taken for its
+        centroid.
         """
         ...
 
@@ -385,7 +350,6 @@ class DepthTriangulator:
     """Triangulates the markers of a rig by its depth law. Holds no state."""
 
     def __init__(self, tables: DisparityTables, caps: CapTables) -> None:
-        """Triangulate these markers with this pair."""
         self._tables, self._caps = tables, caps
 
     def __call__(

@@ -1,53 +1,27 @@
 """Pinch, pointing and thumb taps are actions that a hand performs.
 
-A gesture that lasts: its start time and its messages.
+Pinch: begins when the gap between the skins of thumb and finger falls below one threshold and ends above another,
+wider one. It is one finger's: the others are well away from the thumb, or they are at least farther, and then the
+pads face each other as far as that is known (the thumb over a fist lies on the backs of the fingers) and not all
+others are curled in. What decides is how sure the gap is, along the way from skin to skin. A gap that is not known
+neither begins nor ends a pinch: one that has begun goes on at the last known gap, its confidence falling, until
+`lost_s` are over.
 
-The messages are those of its beginning, its course and its end.
+Pointing: index finger extended, the three after it flexed. The ray goes from the knuckle through the tip and begins
+at the tip. Both ends are what a hand is fitted to best, and they are far apart: the same millimetre turns this line
+by a third of what it turns the last bone, whose direction is prior more than measurement (the DIP follows the PIP). A
+ray that may be off by more than a few degrees is withheld: before one pair of cameras, a palm that faces them is
+known by its fingertips alone, and knuckles stand anywhere within some centimetres. It must be sure twice in a row
+when the pointing begins; one that is not for a moment later stays as it was. Nothing is smoothed: the markers are
+already.
 
-Pinches of the thumb and one finger, pad to pad.
-
-They have the distance of the skins and how firmly the fingers close.
-
-A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the others
-are well away from the thumb, or they are at least farther, and then the pads face each other as far as that is known
-(the thumb over a fist lies on the backs of the fingers) and not all others are curled in. Where the others are away
-no bend is asked for: the tips determine it, which are measured however the palm lies.
-
-What decides is how sure the gap is, along the way from skin to skin; a thumb whose depth is doubtful may still be known
-to meet a finger beside it. A gap that is not known neither begins nor ends a pinch: one that has begun goes on at the
-gap that was known last, its confidence falling, until `lost_s` are over.
-
-Pointing: index finger extended, the three after it flexed, and the ray.
-
-The ray goes on where the index finger points.
-
-The ray goes from the knuckle through the tip and begins at the tip. Both ends are what a hand is fitted to best, the
-tip by its own marker and the knuckle by the palm, and they are as far apart as anything that points: the same
-millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is prior more than
-measurement (the DIP follows the PIP). It begins at the tip because there is no hand beyond it.
-
-How sure the ray is follows from what is known of both ends across it. One that may be off by more than a few degrees
-is withheld: before one pair of cameras, a palm that faces them is known by its fingertips alone, and knuckles stand
-anywhere within some centimetres. It must be sure twice in a row when the pointing begins; one that is not for a
-moment later stays as it was last.
-
-Nothing is smoothed here: the markers are already, by the 1 EUR filter with a cut-off that rises with speed, and a
-hand at rest is held still by the hand's own filter. A second filter would only add its lag.
-
-Taps of the thumb on the keys of a hand.
-
-The thumb's tip touches a segment of a finger and leaves it again.
-
-The four fingers side by side are a keypad, held so that the index finger lies on top and the tips at the left: the rows
-are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch is the thumb's that comes from
-well away and leaves again; it is reported when it goes, so that a hand that closes, pinches or rests its thumb reports
-no key. The finger is that of least gap between skins, the segment is given by the planes that halve the bends of
-the finger, which the thumb's tip passes half a segment, a centimetre, from the middle of any key.
-
-Both are judged over the whole touch, from when the thumb is down until it has gone, each epoch by how sure the
-thumb's tip is in it: a finger that it touches hides part of its cap, so that it is known worst while it is down, and
-best as it leaves. Fingers too alike in their gaps decide nothing, nor do gaps that are not known, nor a finger
-whose tip is seen while its bones may be anywhere, as those of a palm that one pair of cameras looks into.
+Tap: the thumb's tip touches a segment of a finger and leaves it again. Four fingers side by side are a keypad: the
+rows are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch comes from well away and is
+reported when it goes, so that a hand that closes, pinches or rests its thumb reports no key. The finger is that of
+least gap between skins, the segment is given by the planes that halve the bends of the finger. Both are judged over
+the whole touch, each epoch by how sure the thumb's tip is in it: a finger that it touches hides part of its cap.
+Fingers too alike in their gaps decide nothing, nor do gaps that are not known, nor a finger whose tip is seen while
+its bones may be anywhere, as those of a palm that one pair of cameras looks into.
 """
 
 from dataclasses import dataclass
@@ -70,13 +44,7 @@ _NOWHERE.flags.writeable = False
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldGesture:
-    """One that has begun.
-
-    Attributes:
-        hand: Name of the hand profile.
-        kind, name: As of `Gesture`.
-        began_t_ns: When it began [ns].
-    """
+    """A gesture that has begun; hand, kind and name as of `Gesture`, its begin [ns]."""
 
     hand: str
     kind: GestureKind
@@ -113,20 +81,14 @@ class HeldGesture:
 
 
 def below(value: float, limit: float, sigma: float) -> float:
-    """Return the probability that a measured quantity is below the limit.
-
-    It was measured as `value` with a standard deviation; 0.5 if unknown.
-    """
+    """Probability that a quantity measured as `value` is below the limit."""
     if not isfinite(sigma):
         return 0.5
     return 0.5 * (1.0 + erf((limit - value) / (max(sigma, 1e-6) * sqrt(2.0))))
 
 
 class PinchMonitor:
-    """Detector of pinches.
-
-    Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was.
-    """
+    """Detector of pinches; holds the begun one, its last known gap and time."""
 
     def __init__(self, settings: PinchSettings) -> None:
         self._settings = settings
@@ -140,10 +102,7 @@ class PinchMonitor:
         return self._pinch is not None
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
-        """Return the messages at the epoch of the features.
-
-        A pinch begins only where it may.
-        """
+        """Return the messages at an epoch; a pinch begins only where it may."""
         if self._pinch is None:
             finger = self._begins(seen, touch) if may_begin else None
             if finger is None:
@@ -211,11 +170,7 @@ _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
 class PointMonitor:
-    """Detector of pointing.
-
-    Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
-    sure.
-    """
+    """Detector of pointing; holds the begun one, and since when its shape is there."""
 
     def __init__(self, settings: PointSettings) -> None:
         self._settings = settings
@@ -230,10 +185,7 @@ class PointMonitor:
         return self._point is not None
 
     def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
-        """Return the messages at the epoch of the features.
-
-        Pointing begins only where it may.
-        """
+        """Return the messages at an epoch; pointing begins only where it may."""
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
         held = 1.5  # the standard deviation of a ray that is reported already may be larger by this
@@ -265,10 +217,7 @@ class PointMonitor:
         )
 
     def _over(self, t_ns: int) -> bool:
-        """Check whether the shape has been lost for long.
-
-        The time counts from the first call.
-        """
+        """Whether the shape has been lost for long, counted from the first call."""
         if self._since_ns is None:
             self._since_ns = t_ns
         return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
@@ -278,10 +227,7 @@ class PointMonitor:
         return [message]
 
     def _shape(self, seen: HandFeatures) -> bool:
-        """Check whether the index finger is extended and the others are flexed.
-
-        It is checked as far as these are known.
-        """
+        """Whether the index finger is extended and the others flexed, as far as known."""
         own, going = self._settings, self.active
         slack = own.slack_rad if going else 0.0
         sigma: list[float] = seen.sigma_m.tolist()
@@ -317,9 +263,9 @@ def _bends(seen: HandFeatures) -> list[float]:
 
 @kernel
 def _ray_sigma_rad(joints: Float, cov: Float) -> float:
-    """Return the standard deviation [rad] of the ray, about its worst axis.
+    """Standard deviation [rad] of the ray, about its worst axis.
 
-    Arguments as of `HandFeatures`. What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
+    What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
     """
     x, y, z = (
         joints[_TIP, 0] - joints[_KNUCKLE, 0],
@@ -340,21 +286,14 @@ def _ray_sigma_rad(joints: Float, cov: Float) -> float:
     return spread(both)[1] / length
 
 
+# Name of the key on each segment, from the knuckle on, of index ... little.
 KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
-"""Name of the key on each segment, from the knuckle on, of index ... little."""
 
 _NEVER_NS = -(2**61)
 
 
 class _Epoch(NamedTuple):
-    """The thumb at one epoch of a touch.
-
-    Attributes:
-        gap_m: (4,) to index ... little.
-        sigma_m: Of the least of them.
-        thumb_sigma_m: Of the thumb's tip.
-        joints_m: (26, 3), rig frame.
-    """
+    """The thumb at one epoch of a touch: gaps (4,), sigmas [m], joints (26, 3) [m]."""
 
     gap_m: list[float]
     sigma_m: float
@@ -364,11 +303,7 @@ class _Epoch(NamedTuple):
 
 @dataclass(slots=True)
 class _Touch:
-    """A touch in progress.
-
-    Holds since when, the flexion of the fingers before, the least gap, and all epochs of the touch, of which there
-    are no more than `longest_s` has.
-    """
+    """A touch in progress: begin, flexion before, least gap, epochs (of `longest_s`)."""
 
     began_ns: int
     bend_rad: float
@@ -377,10 +312,7 @@ class _Touch:
 
 
 class ThumbTapMonitor:
-    """Detector of thumb taps.
-
-    Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and the last tap.
-    """
+    """Detector of thumb taps; holds the touch, the last clear epoch, the last tap."""
 
     def __init__(self, settings: TapSettings) -> None:
         self._settings = settings
@@ -394,10 +326,7 @@ class ThumbTapMonitor:
         return self._touch is not None
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
-        """Return the messages at the epoch of the features.
-
-        A touch begins only where it may.
-        """
+        """Return the messages at an epoch; a touch begins only where it may."""
         own = self._settings
         keys: list[list[float]] = touch.key_gap_m.tolist()
         gaps = [min(one) for one in keys]
@@ -449,10 +378,7 @@ class ThumbTapMonitor:
         return apart and (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s and is_pad(seen, own)
 
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
-        """Return the tap of a touch that is over.
-
-        It is nothing where two fingers may have been touched.
-        """
+        """The tap of a touch that is over; none where two fingers may have been touched."""
         least = [min(one.gap_m) for one in gone.epochs]
         down_m = 0.001  # a thumb whose gap is larger than the least by less is down
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + down_m)
@@ -499,9 +425,7 @@ def _worst_m(seen: HandFeatures, joint: int) -> float:
 
 
 def _beyond_m(joints_m: Float, finger: int) -> Float:
-    """How far (N, 2) [m] the thumb's tip is beyond PIP and DIP of a finger.
-
-    Beyond the planes that halve its bends there.
+    """How far (N, 2) [m] the thumb's tip is beyond the planes that halve PIP and DIP.
 
     Of hands (N, 26, 3) [m] and a finger 0 ... 3.
     """

@@ -1,11 +1,4 @@
-"""`phalanx gestures` teaches poses and reads gestures of recorded hands.
-
-Gestures of a recorded hand.
-
-They are all gestures of its poses, and each from its begin to its end.
-
-`phalanx gestures`: poses of a settings file, and gestures of recorded hands.
-"""
+"""`phalanx gestures` teaches poses and reads gestures of recorded hands."""
 
 from argparse import Namespace
 from collections.abc import Iterable
@@ -76,10 +69,7 @@ def spans_of(gestures: Iterable[Gesture]) -> list[Spoken]:
 
 
 def lines_of(gesture: Gesture) -> str:
-    """Return a message as a line of JSON.
-
-    Arrays are lists, missing values are null.
-    """
+    """Return a message as a line of JSON: arrays are lists, missing values null."""
     fields = {name: getattr(gesture, name) for name in gesture.__struct_fields__}
     plain = {
         name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()
@@ -250,10 +240,7 @@ def _settings_path(options: Namespace) -> Path:
 
 
 def _settings(path: Path) -> GestureSettings:
-    """Read the settings file, or return the defaults where there is none yet.
-
-    A new file is named as the path states.
-    """
+    """Read the settings file; where there is none the defaults, named as the path is."""
     if path.exists():
         return load(path, GestureSettings)
     return msgspec.structs.replace(default_gestures(), name=path.stem)

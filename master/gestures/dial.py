@@ -1,32 +1,20 @@
 """A dial gesture is a grip about something round, and its rotation.
 
-Recent width and rotation of a grip.
-
-It is kept so that a grip that loosens rotates nothing.
+Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
+also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the
+grip's beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. The rotation
+goes on over as many grips as it takes. The axis begins as that of the tips' circle; a turn constrains its own axis
+the better the farther it goes, and what is known of it is the mean of both (`_rotate`).
 
 Fingers that let go of a knob go apart, and not alike: taken for a turn it is some degrees. They are quick, so that a
 grip that is suddenly wider than it was is loosening, or the epoch is a bad one; a grip that slowly gets wider, as the
-picture of a hand that turns does, is not. While it loosens the angle goes on as it went, ever less: a hand that rests
-before it lets go stands still, and a bad epoch in a quick turn is led over.
-
-A dial gesture: a grip about something round, and its rotation angle.
-
-The rotation goes on over as many grips as it takes.
-
-Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
-also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
-beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. A hand that lets go
-opens first: from when it begins to (`history`) the dial stands where it was, and goes on from there when it is gripped
-again.
+picture of a hand that turns does, is not. While it loosens (`GripHistory`) the angle goes on as it went, ever less: a
+hand that rests before it lets go stands still, and a bad epoch in a quick turn is led over.
 
 Tips that stand still to each other are a grip where most epochs of the hold have its shape: which way the palm lies
-decides some of that, and cameras that see no more than fingertips are uncertain of it from epoch to epoch.
-
-The axis begins as that of the tips' circle; a turn constrains its own axis the better the farther it goes, and
-what is known of it is the mean of both (`_rotate`).
-
-Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
-the world of the IMU that turns.
+decides some of that, and cameras that see no more than fingertips are uncertain of it from epoch to epoch. Where all
+that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in the world
+of the IMU that turns.
 """
 
 from collections import deque
@@ -43,16 +31,10 @@ from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_betw
 
 
 class GripHistory:
-    """Recent history of a grip.
-
-    Push machine. Holds width [m] and angle [rad] of the last tenth of a second, and since when the grip loosens.
-    """
+    """Width [m] and angle [rad] of a grip of late, and since when it loosens."""
 
     def __init__(self, quick_m: float) -> None:
-        """Set the change of width at which a grip counts as loosening [m].
-
-        A grip that is wider, or narrower, by so much than it recently was is loosening.
-        """
+        """`quick_m`: a grip that is wider or narrower by so much than it was loosens [m]."""
         self._quick_m = quick_m
         self._late: deque[tuple[int, float, float]] = deque()
         self._since_ns: int | None = None
@@ -63,11 +45,9 @@ class GripHistory:
         return self._since_ns is not None
 
     def sound(self, t_ns: int, wide_m: float, most_m: float) -> bool:
-        """Check whether the fingers rotate the knob at an epoch.
+        """Whether fingers that are `wide_m` wider than when they closed rotate the knob.
 
-        At the epoch they are wider by `wide_m` than when they closed.
-
-        `most_m`: a grip that is wider than that is loose, however long it has been so.
+        A grip that is wider than `most_m` is loose, however long it has been so.
         """
         if not self._late:
             good = abs(wide_m) <= most_m
@@ -92,9 +72,9 @@ class GripHistory:
             self._late.popleft()
 
     def ahead_rad(self, t_ns: int) -> float | None:
-        """Extrapolate the angle to an epoch after the last sound one.
+        """Extrapolate the angle to an epoch after the last sound one; None: no such.
 
-        The epochs at which nothing had begun to loosen yet are used; None: there was none.
+        Only epochs at which nothing had begun to loosen yet are used.
         """
         if not self._late:
             return None
@@ -126,7 +106,6 @@ class _Grip:
         tips: As they were when it closed.
         circle_axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
-        history: How it has gone of late.
         farthest_rad: Of its largest turn so far.
         axis: (3,) of the knob, by both.
     """
@@ -140,10 +119,7 @@ class _Grip:
 
 
 class DialMonitor:
-    """Detector of dial gestures.
-
-    Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one.
-    """
+    """Detector of dial gestures; holds the dial, its grip, its angle, a grip to be."""
 
     def __init__(self, settings: DialSettings) -> None:
         self._settings = settings
@@ -166,7 +142,6 @@ class DialMonitor:
         """Return the messages at the epoch of the features.
 
         Args:
-            seen: The hand.
             across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
             wrist_device_only: All that sees the hand is worn on its arm: the rig frame goes with it.

@@ -1,20 +1,13 @@
 """Features of a hand: bends, tips, pads, and where the thumb touches.
 
-Extract features of a hand: bends, tips and pads of the fingers.
-
-And how well they are known.
-
-All of it is geometry of the solved joints, not of the profile's angles: those are zero in the rest pose of a profile,
-and rest poses differ from hand to hand. A bend is the signed angle between two bones about the hinge between them,
-that of the MCP between the palm's plane and the first bone; positive is towards the palm, for both hands alike.
+All of it, and how well it is known, is geometry of the solved joints, not of the profile's angles: those are zero in
+the rest pose of a profile, and rest poses differ from hand to hand. A bend is the signed angle between two bones
+about the hinge between them, that of the MCP between the palm's plane and the first bone; positive is towards the
+palm, for both hands alike.
 
 A painted cap's centroid is measured to a fraction of a millimetre, however the palm lies. The tip's joint is inferred
 from it by way of the hand, and is some millimetres off where the palm is known from the tips alone. So caps are
-features of their own.
-
-Position of the thumb relative to the fingers, skin to skin.
-
-It includes which sides face each other; pinches and taps are defined by it.
+features of their own. Pinches and taps are defined by `ThumbTouch`, skin to skin.
 """
 
 from collections.abc import Callable
@@ -48,11 +41,11 @@ class HandFeatures(NamedTuple):
         seen: (5,) a sensor observes the finger now: its tip, or a wrist device its laser line, and not ambiguously.
         sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
         shape_sigma_m: (5,) the same without what the wrist's place has of it, which moves the whole hand.
-        bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line; of the
-            thumb the first is how far its metacarpal stands out of the palm's plane, then MCP and IP.
+        bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line;
+            of the thumb the first is how far its metacarpal stands out of the palm's plane, then MCP and IP.
         curl: (5,) 0 straight ... 1 curled.
-        caps_m: (5, 3) centroids of the tips' painted caps [m], rig frame: measured where seen, else where the hand has
-            them; of a finger without a cap its tip.
+        caps_m: (5, 3) centroids of the tips' painted caps [m], rig frame: measured where seen, else where the
+            hand has them; of a finger without a cap its tip.
         tips_m: (5, 3) middle of the tip's round end [m], rig frame.
         pads_m: (5, 3) middle of the pad's skin [m], rig frame.
         radius_m: (5,) of the round end [m].
@@ -105,7 +98,7 @@ class _Hand(NamedTuple):
 
 
 class FeatureExtractor:
-    """From poses of one hand to its features. Holds the profile."""
+    """From poses of one hand to its features."""
 
     def __init__(self, model: HandModel) -> None:
         likely = model.forward(np.eye(4), _LIKELY_RAD)
@@ -127,8 +120,8 @@ class FeatureExtractor:
     def of(self, pose: HandPose) -> HandFeatures | None:
         """Features of a pose; None where it has no hand.
 
-        A finger of which the pose has nothing is not known, its variance is infinite, and it stands where fingers that
-        hide are likely to be.
+        A finger of which the pose has nothing is not known, its variance is infinite, and it stands where
+        fingers that hide are likely to be.
         """
         if not pose.valid[WRIST]:
             return None
@@ -179,10 +172,7 @@ class FeatureExtractor:
 
 
 def _plain(array: Any) -> Any:
-    """Return the array contiguous and read-only, as kernels are compiled for.
-
-    Those of messages nearly always are.
-    """
+    """The array contiguous and read-only, as kernels are compiled for."""
     if array.flags.c_contiguous:
         return array
     out = np.ascontiguousarray(array)
@@ -255,10 +245,7 @@ def _measure(
 def _joints(
     position: Float, wxyz: Float, hand: _Hand, joints: Float, rotation: Float, lacking: Bool, T: Float
 ) -> None:
-    """Write joints, rotations and the palm's transform.
-
-    Also which joints the pose lacks; these are written as likely.
-    """
+    """Write joints, rotations, palm, and joints that lack: these stand as likely."""
     for j in range(26):
         w, x, y, z = wxyz[j, 0], wxyz[j, 1], wxyz[j, 2], wxyz[j, 3]
         lacking[j] = isnan(position[j, 0] + position[j, 1] + position[j, 2] + w + x + y + z)
@@ -312,10 +299,7 @@ def _bends(f: int, joints: Float, rotation: Float, T: Float, bend: Float) -> Non
 
 @kernel
 def _take_seen(markers: Float, caps: Float) -> None:
-    """Put each cap where its marker is.
-
-    That is the nearest one to it, if the cap is the nearest to the marker as well.
-    """
+    """Put each cap on its marker: the nearest one, if the cap is its nearest as well."""
     own = np.empty(5, np.int64)
     for f in range(5):
         own[f], least = -1, inf
@@ -432,10 +416,7 @@ def _on(joints: Float, a: int, b: int, share: float) -> Vector:
 
 @inner
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
-    """Return where along two segments their skins are nearest.
-
-    As `common.hand.skin`.
-    """
+    """Where along two segments their skins are nearest, as `common.hand.skin`."""
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))
     uu, vv, uv, au, bv, square = (
@@ -460,10 +441,7 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
 
 @kernel
 def _direction_sigma_rad(f: int, joints: Float, cov: Float) -> float:
-    """Return the standard deviation [rad] of the direction of a last bone.
-
-    That of its ends, over its length.
-    """
+    """Standard deviation [rad] of a last bone's direction: its ends' over its length."""
     a, b, ends = CHAINS[f, 2], CHAINS[f, 3], np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -475,10 +453,10 @@ def _direction_sigma_rad(f: int, joints: Float, cov: Float) -> float:
 def _sigma_m(
     cov: Float, thumb: int, tip: int, on_a: float, a: int, b: int, on_b: float, way: Vector
 ) -> float:
-    """Return the standard deviation [m] of a gap.
+    """Standard deviation [m] of a gap, along the way from skin to skin.
 
-    Of both skins along the way from one to the other, each as its bone has it there, between what its two joints have.
-    What both err alike by, the palm's uncertainty, counts twice: it is small beside the rest where tips are seen.
+    Each skin is as sure as its bone there, between its two joints. What both err alike by, the palm's
+    uncertainty, counts twice: it is small beside the rest where tips are seen.
     """
     total = 0.0
     for i in range(3):
@@ -491,9 +469,7 @@ def _sigma_m(
 
 @inner
 def _palmar(f: int, s: int, joints: Float, pads: Float) -> Vector:
-    """Return the unit vector out of the palmar side of a segment, rig frame.
-
-    It is across the segment, in the plane of its bend.
+    """Unit vector out of a segment's palmar side, in its bend's plane, rig frame.
 
     The pad gives it for the last one; the others are turned back by the bends between.
     """

@@ -1,7 +1,7 @@
 """Find a grip about a knob: the circle of the tips, and how they turned.
 
 The thumb's tip and those of the fingers lie about one circle, in one plane, pads inwards, the thumb across from the
-fingers. Nothing here remembers anything.
+fingers. Stateless.
 """
 
 from math import acos, atan2, cos, hypot, inf, isfinite, nan, sqrt
@@ -23,8 +23,7 @@ class Tips(NamedTuple):
     """Tips of thumb ... little: the caps' middles in a frame still in the room.
 
     Attributes:
-        place_m: (5, 3) [m].
-        sigma_m: (5,) [m], how sure each is.
+        place_m, sigma_m: (5, 3), (5,) [m].
         known: (5,) whether a tip is known at all.
         palmar: (3,) unit vector out of the palm.
         T_still_rig: (3, 3) from the rig frame to that frame.
@@ -38,10 +37,7 @@ class Tips(NamedTuple):
 
     @classmethod
     def of(cls, seen: HandFeatures, sigma_most_m: float, *, wrist_device_only: bool) -> "Tips":
-        """Those of a hand.
-
-        `wrist_device_only`: all that sees it is worn on its arm, and the rig frame goes with it.
-        """
+        """Those of a hand; `wrist_device_only`: the rig frame goes with the arm."""
         rotation = _EYE
         if wrist_device_only and not np.isnan(seen.palm_world_wxyz).any():
             rotation = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
@@ -49,10 +45,7 @@ class Tips(NamedTuple):
         return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, rotation @ seen.palmar, rotation)
 
     def axis(self) -> Float | None:
-        """Axis (3,) of the circle of the known tips, out of the palm.
-
-        None: they are fewer than three.
-        """
+        """Axis (3,) of the known tips' circle, out of the palm; None: fewer than three."""
         if self.known.sum() < 3:
             return None
         centre, axis = np.empty(3), np.empty(3)
@@ -100,10 +93,7 @@ def _about(
     low: float,
     high: float,
 ) -> bool:
-    """Return whether tips are about a knob.
-
-    Pads (5, 3) are from the tip's middle; the rest as of `Tips` and the settings.
-    """
+    """Whether tips are about a knob; pads (5, 3) are from the tip's middle."""
     centre, axis = np.empty(3), np.empty(3)
     radius = _circle(place, known, palmar, centre, axis)
     if axis[0] * palmar[0] + axis[1] * palmar[1] + axis[2] * palmar[2] < aslant or not low <= radius <= high:
@@ -135,12 +125,10 @@ def _about(
 
 @kernel
 def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float) -> float:
-    """Return the radius of the circle of known places (5, 3).
+    """Radius of the circle of known places (5, 3); write its centre, its palmar axis.
 
-    Write its centre, and its axis out of the palm.
-
-    The circle of least algebraic error (Kasa, 1976) in the plane of least squares. Along the principal axes of the
-    places about their mean, its normal equations fall apart.
+    The circle of least algebraic error (Kasa, 1976) in the plane of least squares. Along the principal axes
+    of the places about their mean, its normal equations fall apart.
     """
     count = 0
     for i in range(3):
@@ -185,7 +173,7 @@ def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float
 
 @inner
 def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
-    """Return how far a place is from the centre along way k."""
+    """How far a place is from the centre along way k."""
     total = 0.0
     for i in range(3):
         total += (place[f, i] - centre[i]) * ways[i, k]
@@ -193,10 +181,7 @@ def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
 
 
 def rotation_between(now: Tips, then: Tips) -> Float:
-    """Rotation vector (3,) [rad] of the tips as one since `then`.
-
-    Surer ones count more.
-    """
+    """Rotation vector (3,) [rad] of the tips as one since `then`, by their variances."""
     return _rotation_between(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
 
 
@@ -241,12 +226,7 @@ def _rotation_between(place: Float, sigma: Float, before: Float, sigma_before: F
 
 @kernel
 def axis_of(prior: Float, weight: float, rotation: Float) -> Float:
-    """Return the axis (3,) of most weight of a unit vector and a turn.
-
-    The turn is a rotation vector (3,).
-
-    It is the first axis of the sum of both, as a tensor.
-    """
+    """Axis (3,) of most weight of a unit vector and a turn (3,), summed as tensors."""
     both, ways = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -263,11 +243,9 @@ def axis_of(prior: Float, weight: float, rotation: Float) -> Float:
 
 
 def widened_m(tips: Tips, then: Tips) -> float:
-    """By how much the grip is wider than `then` [m].
+    """By how much the grip is wider than `then` [m]; NaN: thumb or fingers not known.
 
     Half of what the thumb's tip has gone from those of the fingers.
-
-    NaN: the thumb or the fingers are not known.
     """
     return _widened(tips.place_m, tips.known, then.place_m, then.known)
 
@@ -291,9 +269,7 @@ def _widened(place: Float, known: Bool, before: Float, known_before: Bool) -> fl
 
 
 def spread_m(tips: Tips, then: Tips) -> float:
-    """The greatest change of a tip's distance from the middle since `then` [m].
-
-    The middle is that of the known tips.
+    """Greatest change [m] since `then` of a known tip's distance from their middle.
 
     inf: fewer than three are known.
     """

@@ -1,50 +1,30 @@
-"""Recognise held poses of the hand, with hysteresis.
+"""Recognise held poses of the hand, with hysteresis, and select its action.
 
-The pose of a hand is recognised by quantities that distinguish poses.
+The quantities (`common.calibration.gesture_settings.Quantity`) distinguish poses. A tip that is off by s turns the
+finger's last two bones about the PIP, so that a bend is off by s over their length; that is the lever of all bends
+here. What is measured of the thumb's tip is off as the tip is, gaps as both tips are. The part of a tip's covariance
+that the palm's place has as well moves all tips alike, and is excluded.
 
-Quantities of one hand that distinguish the poses, with uncertainties.
-
-The quantities are `common.calibration.gesture_settings.Quantity`.
-
-A tip that is off by s turns the finger's last two bones about the PIP, so that a bend is off by s over their length;
-that is the lever of all bends here. What is measured of the thumb's tip is off as the tip is, gaps as both tips are.
-Places are in the palm and gaps between tips, so that only what the hand's shape leaves unsure counts: the part of a
-tip's covariance that the palm's place has as well moves all of them alike, and is excluded.
-
-Recognition of the pose in which the hand is held.
-
-The poses are the six of the Digits study, and those of templates.
-
-Every pose defines which quantities are to lie in which range (`common.calibration.gesture_settings`). It fits by
+Every pose defines which quantities are to lie in which range. It fits by
 
     s = exp(-1/2 sum z^2),   z = distance to the range / sqrt(border^2 + sigma^2)
 
-with sigma the standard deviation of the quantity itself: a hidden finger is neutral. That alone would make a
-hand of which little is known fit everything, so a pose is accepted as far as it stands out of the others,
+with sigma the standard deviation of the quantity itself: a hidden finger is neutral. That alone would make a hand of
+which little is known fit everything, so a pose is accepted as far as it stands out of the others,
 
     confidence = s . w s / (sum of all w s)
 
-with w its weight (1 but for a special case of another pose), and only where most of its quantities are known. None is
-an answer: a hand that fits nothing has no pose.
+with w its weight (1 but for a special case of another pose), and only where most of its quantities are known. A hand
+that fits nothing has no pose. A hand that goes from one pose to another may pass through a third, so a pose begins
+where the fingers are nearly at rest, or once it has lasted a while; the end of a natural movement is slow, so that
+this costs no time.
 
-A hand that goes from one pose to another may pass through a third. So a pose begins where the fingers are nearly at
-rest, or once it has lasted a while; the end of a natural movement is slow, so that this costs no time.
-
-The recogniser finds the pose and the action of a hand.
-
-Selection of the action that a hand performs.
-
-The hand's shape when the action begins decides, and until it ends there is no other.
+The hand's shape when an action begins decides which it is, and until it ends there is no other:
 
     thumb and one finger meet, that finger bent out of the row      pinch
     the thumb meets a finger of four that lie side by side          tap
     all tips about a circle, thumb across                           dial
     index finger stretched, the others bent                         point
-
-So a thumb on the index finger's tip is the key 1 over a row of fingers that are bent alike, and a pinch where the
-finger has come to meet the thumb; and a finger that is stretched while a dial turns points at nothing.
-
-Gesture recognition, pose by pose: held poses and actions of a hand.
 """
 
 from collections import deque
@@ -76,14 +56,7 @@ _ALL = 21
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """All quantities of a hand at one epoch.
-
-    They are in the order of `QUANTITIES` and in the units of their names.
-
-    Attributes:
-        value: (Q,).
-        sigma: (Q,) standard deviation; inf: not known.
-    """
+    """Quantities (Q,) of a hand at one epoch, as `QUANTITIES`; sigma inf: not known."""
 
     value: Float
     sigma: Float
@@ -176,10 +149,11 @@ def _length(joints: Float, a: int, b: int) -> float:
 
 @inner
 def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
-    """Return how far a finger is taken for hidden, 0..1, and its sigma [deg].
+    """How far a finger is taken for hidden, 0..1, and its sigma [deg].
 
-    A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies behind the
-    hand or before the palm. That an unseen finger hides is fused with its prior, as one more observation.
+    A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies
+    behind the hand or before the palm. That an unseen finger hides is fused with its prior, as one more
+    observation.
     """
     if not isfinite(sigma):
         return (0.0, 0.0) if seen else (1.0, _HIDDEN_SIGMA_DEG)
@@ -189,9 +163,7 @@ def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
 
 @inner
 def _heading(f: int, joints: Float, T: Float, side: float) -> float:
-    """Return where a finger's first bone heads [deg] in the palm's plane.
-
-    To the thumb is positive.
+    """Heading [deg] of a finger's first bone in the palm's plane, thumb positive.
 
     Fingers that stand up from that plane have no heading in it: their angle fades with what is left.
     """
@@ -204,10 +176,7 @@ def _heading(f: int, joints: Float, T: Float, side: float) -> float:
 
 
 def known_bends(features: HandFeatures) -> tuple[list[float], list[bool]]:
-    """Return the flexions (4,) [deg] of index ... little and which are known.
-
-    A flexion is MCP and PIP together.
-    """
+    """Return MCP + PIP flexion (4,) [deg] of index ... little, and which are known."""
     bends: list[list[float]] = features.bend_rad.tolist()
     return [degrees(mcp + pip) for mcp, pip, _ in bends[1:]], features.known.tolist()[1:]
 
@@ -276,19 +245,11 @@ class PoseTable:
                 own.asked[at], own.low[at], own.high[at], own.soft[at] = True, span.low, span.high, span.soft
 
     def residuals(self, quantities: Quantities) -> Float:
-        """Return the distance to each pose's ranges (P, Q), in standard deviations.
-
-        It is 0 inside, and where a pose has no range.
-        """
+        """Distance to each pose's ranges (P, Q) in sigmas; 0 inside, and without a range."""
         return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
 
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
-        """How well each pose fits.
-
-        Args:
-            quantities: Of the hand.
-            known: (5,) which fingers are.
-        """
+        """How well each pose fits; `known` (5,) is which fingers are."""
         return self._fit(quantities, known)[0]
 
     def _fit(self, quantities: Quantities, known: Bool) -> tuple[Fit, Float]:
@@ -312,10 +273,7 @@ def _fit(
     confidence: Float,
     enough: Bool,
 ) -> int:
-    """Return the best pose; write the fields of `Fit`, and residuals (P, Q).
-
-    The residuals are zero before.
-    """
+    """Return the best pose; write fields of `Fit`, and residuals (P, Q), 0 before."""
     poses, count = table.low.shape
     total = 0.0
     for p in range(poses):
@@ -349,21 +307,16 @@ def _fit(
 
 
 class FingerSpeed:
-    """How fast the fingers bend. The state it holds is the bends of the last frames."""
+    """How fast the fingers bend; holds the bends of the last frames."""
 
     def __init__(self) -> None:
         self._past: deque[tuple[int, list[float], list[bool]]] = deque()
 
     def push(self, t_ns: int, bend_deg: list[float], known: list[bool]) -> float:
-        """Return the speed of the fingers [deg/s].
+        """Return the RMS speed of the fingers [deg/s]; inf: no frame gives it.
 
-        It is the root mean square over the fingers known then and now, or over all where none is; inf where no frame
-        gives it.
-
-        Args:
-            t_ns: The epoch [ns].
-            bend_deg: (4,) bends of index ... little, MCP and PIP together.
-            known: (4,) which of them are.
+        It is over the fingers known then and now, or over all where none is; `bend_deg` (4,) are MCP and PIP
+        together.
         """
         memory_s = 0.15  # older frames do not measure how fast a finger is now
         while self._past and t_ns - self._past[0][0] > 1e9 * memory_s:
@@ -384,8 +337,7 @@ class FingerSpeed:
 class PoseRecogniser:
     """From the features of a hand to the pose it is held in: begin, update, end.
 
-    The state it holds is the pose that is held, since when which pose would be the one, since when the held one is not,
-    when it was last known, and the speed of the fingers.
+    Holds that pose, when it was last known, since when another would be it, and the speed of the fingers.
     """
 
     def __init__(self, settings: GestureSettings) -> None:
@@ -421,10 +373,7 @@ class PoseRecogniser:
         return [] if self._held is None else self._unsure(hand, t_ns, self._hold.lost_s)
 
     def _beginning(self, features: HandFeatures, fit: Fit, speed: float, known: int) -> int | None:
-        """Return the pose that would be held now, regardless of the current one.
-
-        It is confident, for long enough, by a hand that rests.
-        """
+        """The pose that would be held now: confident long enough, of a hand at rest."""
         best, t_ns = fit.best, features.t_ns
         # Of both kinds of sensors none may see a tip just now and fingers be known all the same.
         there = features.seen.any() or features.known.any()
@@ -494,7 +443,7 @@ class PoseRecogniser:
 
 
 class ActionMonitor:
-    """Push machine. Holds the four watches, of which one at most is active."""
+    """The four detectors of actions, of which one at most is active."""
 
     def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
         """Of a hand whose joints have the radii (26,) [m]."""
@@ -529,7 +478,7 @@ class ActionMonitor:
 
 
 class GestureRecogniser:
-    """Push machine of one hand. Holds what has begun and not ended."""
+    """Poses and actions of one hand; holds what has begun and not ended."""
 
     def __init__(self, settings: GestureSettings, model: HandModel) -> None:
         self._features, self._poses = FeatureExtractor(model), PoseRecogniser(settings)
@@ -546,12 +495,7 @@ class GestureRecogniser:
         rehearse(seen)
 
     def push(self, pose: HandPose) -> list[Gesture]:
-        """Return the messages about a pose of that hand.
-
-        They are in the order of capture; usually nothing or one message.
-
-        Of a pose without a hand only what has lasted too long without one ends.
-        """
+        """Return messages of a pose, usually none or one; without a hand only ends."""
         seen = self._features.of(pose)
         if seen is None:
             return self._poses.lose(pose.hand, pose.t_ns) + self._actions.lost(pose.t_ns)

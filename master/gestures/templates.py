@@ -1,21 +1,13 @@
 """A person shows a few examples, and a pose template is learnt.
 
-Pose template from a few examples.
-
-It has ranges about what was shown, and is refused where it cannot be distinguished from another.
-
 An example is a hold of some frames; of each quantity it has the median. Over the examples a quantity has a mean and a
-spread, which nobody repeats better than `FLOOR` another day; few examples widen it as Student's t does (the factor that
-holds 86 % of new ones, n - 1 degrees of freedom). The range is the mean and that much either way, the border is as wide
-again.
+spread, which nobody repeats better than `_FLOOR` another day; few examples widen it as Student's t does (the factor
+that holds 86 % of new ones, n - 1 degrees of freedom). The range is the mean and that much either way, the border is
+as wide again.
 
 Only what was known in every example is asked, and of redundant quantities only one. A pose is refused where an
 existing one fits the examples: it would be called by both names. Where it is meant as a special case of that one, it
 has a greater weight, and so is preferred where both fit.
-
-Interactive recording of a pose template with a person.
-
-For each example there is a countdown, a hold that must be still, and then the hand moves.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -90,13 +82,7 @@ class Example:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTemplate:
-    """A pose that was learnt.
-
-    Attributes:
-        shape: What is asked of it.
-        said: Lines for the user: what it is recognised by, and what distinguishes it from the other poses.
-        residual: For the provenance.
-    """
+    """A pose that was learnt, lines about it for the user, residuals for provenance."""
 
     shape: PoseShape
     stated: tuple[str, ...]
@@ -106,17 +92,16 @@ class PoseTemplate:
 def learn(
     name: str, examples: Sequence[Example], settings: GestureSettings, within: str | None = None
 ) -> PoseTemplate:
-    """The pose that the examples show.
+    """Return the pose that the examples show.
 
     Args:
         name: Of the pose; one of that name is replaced.
-        examples: FEWEST to MOST.
         settings: The poses that there are.
         within: The pose that this one is a special case of.
 
     Raises:
-        FitError: Too few or too different examples, too little is known of the hand, or it is too like another pose.
-            The text states which and why.
+        FitError: Too few or too different examples, too little is known of the hand, or it is too like
+            another pose. The text states which and why.
     """
     most = 10  # examples
     if not FEWEST <= len(examples) <= most:
@@ -177,13 +162,7 @@ def _refuse_alike(
     others: Mapping[str, PoseShape],
     within: str | None,
 ) -> None:
-    """Refuse examples that another pose fits.
-
-    A template pose whose middle fits this one is refused too.
-
-    Raises:
-        FitError: Naming the pose, and what comes nearest to distinguishing them.
-    """
+    """Refuse examples that another pose fits, or whose shape fits its middle."""
     for other, of in others.items():
         if other == within:
             continue
@@ -204,10 +183,7 @@ def _refuse_alike(
 
 
 def _middle(shape: PoseShape) -> Example | None:
-    """Return the middle of a template pose, all of whose ranges have two sides.
-
-    None: it is a wider pose.
-    """
+    """Middle of a template pose; None: a range has one side, the pose is wider."""
     value, sigma = np.zeros(len(QUANTITIES)), np.full(len(QUANTITIES), np.inf)
     for quantity, span in shape.ranges.items():
         if span.high - span.low > 4.0 * span.soft:
@@ -228,10 +204,7 @@ def _residuals(shape: PoseShape, example: Example) -> Float:
 
 
 def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> str:
-    """Return what distinguishes the examples from another pose.
-
-    The most distinctive quantity comes first.
-    """
+    """What distinguishes the examples from another pose, most distinctive first."""
     residuals = np.median([_residuals(shape, example) for example in examples], axis=0)
     value = np.median([example.quantities.value for example in examples], axis=0)
     parts: list[str] = []
@@ -248,10 +221,7 @@ def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> st
 
 
 def _agreement(name: str, examples: Sequence[Example]) -> float:
-    """Return the worst leave-one-out fit of an example.
-
-    Each example is compared with the template that the others alone would give; 1 of three, which are too few for it.
-    """
+    """Worst leave-one-out fit of an example; of three, too few for it, to the whole."""
     if len(examples) <= FEWEST:
         return min(_scores(_shape(name, examples, 1.0), examples))
     out: list[float] = []
@@ -281,11 +251,7 @@ def template_session(
 
     Args:
         receive: The next pose of the hand, waiting at most so long [s].
-        model: The hand.
-        name: Of the pose.
-        count: How many examples.
-        clock: For the countdown.
-        say: Called with one line at a time.
+        notify: Called with one line at a time.
 
     Raises:
         FitError: No hand was seen, or it did not keep still, three times.
@@ -321,10 +287,7 @@ def template_session(
 
 
 def held(poses: list[HandPose], model: HandModel) -> list[HandFeatures]:
-    """Return the features of poses that have a hand.
-
-    They are in order of time, each epoch once.
-    """
+    """Features of poses that have a hand, in order of time, each epoch once."""
     extractor, out = FeatureExtractor(model), list[HandFeatures]()
     for pose in poses:
         features = extractor.of(pose)

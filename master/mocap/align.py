@@ -1,21 +1,15 @@
 """Alignment finds the frame and the clock of a motion capture in ours.
 
-Time offset between two clocks, by the speeds of the same points.
-
-No rotation and no shift changes a speed.
-
-Normalised cross-correlation, samples that are missing masked (Padfield, "Masked object registration in the Fourier
-domain", IEEE Trans. Image Process. 21, 2012).
-
-Alignment of a motion capture's frame and clock to ours.
-
-The offset of the clocks is found first by speeds (`speed_match.py`). Then turn R, shift s and offset
-d together by Gauss-Newton with the weights of Geman & McClure, from the rigid fit of Kabsch (1976):
+The offset of the clocks is found first by the speeds of the same points, which no rotation and no shift changes:
+normalised cross-correlation with missing samples masked (Padfield, "Masked object registration in the Fourier
+domain", IEEE Trans. Image Process. 21, 2012). Then turn R, shift s and offset d together by Gauss-Newton with the
+weights of Geman & McClure, from the rigid fit of Kabsch (1976):
 
     p_ours(t) = R p_theirs(t - d) + s
 
 Their sigma is estimated by the jackknife over consecutive parts (Efron & Tibshirani, 1993, chapter 11), as errors
-last from frame to frame. What is fitted hides what is constant: an error of where our frame lies, and a delay of ours.
+last from frame to frame. What is fitted hides what is constant: an error of where our frame lies, and a delay of
+ours.
 """
 
 from dataclasses import dataclass
@@ -28,13 +22,12 @@ from common.errors import FitError
 from common.geometry.transforms import fit_rigid, rigid, rotation_vector_to_matrix
 from master.mocap.bvh_file import Track, known
 
-HALF_NS = 20_000_000
-"""Half of the time over which a speed is a difference."""
+HALF_NS = 20_000_000  # half of the time over which a speed is a difference
 _STEP_NS = 10_000_000
 
 
 def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
-    """Return our time less theirs [ns] and the correlation of speeds.
+    """Return our time less theirs [ns], the correlation of speeds, an alternative.
 
     The third value is how much later an alternative offset is [s], NaN: none.
 
@@ -72,10 +65,7 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
 
 
 def _speeds(track: Track) -> tuple[Float, int]:
-    """Return the mean speed of the points (K,) [m/s] and the first time [ns].
-
-    Steps are 10 ms; NaN: not known.
-    """
+    """Mean speed of the points (K,) [m/s] every 10 ms, NaN: not known; first [ns]."""
     count = int((track.t_ns[-1] - track.t_ns[0]) // _STEP_NS) + 1 if len(track.t_ns) else 0
     most_steps = 400_000  # 67 minutes
     if count > most_steps:
@@ -93,10 +83,7 @@ def _speeds(track: Track) -> tuple[Float, int]:
 
 
 def _masked_correlation(a: Float, b: Float, together: float) -> Float:
-    """Return the correlation of `a` and shifted `b` for each lag.
-
-    Lags are those of `scipy.signal.correlate`; -1: too little shared.
-    """
+    """Correlation of `a` and shifted `b`, lags of `signal.correlate`; -1: too few."""
     known_a, known_b = np.isfinite(a).astype(np.float64), np.isfinite(b).astype(np.float64)
     a = np.where(known_a > 0.0, a - np.nanmean(a), 0.0)
     b = np.where(known_b > 0.0, b - np.nanmean(b), 0.0)
@@ -158,8 +145,7 @@ def align(ours: Track, theirs: Track) -> Alignment:
     rows = _rows(ours)
     target = ours.position_m[rows]
     start = [_registered(theirs.at(ours.t_ns[rows] - offset_ns), target, mirror) for mirror in (False, True)]
-    # of the residual
-    mirrored = start[1][1] < 0.5 * start[0][1]
+    mirrored = start[1][1] < 0.5 * start[0][1]  # median residual
     flip = np.diag([1.0, 1.0, -1.0]) if mirrored else np.eye(3)
     T = start[1][0] if mirrored else start[0][0]
     fit = _Fit.of(ours, Track(theirs.t_ns, theirs.position_m @ flip), rows, T @ _four(flip), float(offset_ns))
@@ -183,13 +169,7 @@ def _rows(ours: Track) -> Int:
 
 
 def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, float]:
-    """Return the rigid motion (4, 4) between two sets of points (N, J, 3).
-
-    The registration is robust; the median distance left [m] is returned too.
-
-    Raises:
-        FitError: Too few points, or all on a line.
-    """
+    """Robust rigid motion (4, 4) from points (N, J, 3) to others, median rest [m]."""
     if mirror:
         source = source * [1.0, 1.0, -1.0]
     both = known(source) & known(target)
@@ -211,11 +191,7 @@ def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, floa
 
 
 def _check_spread(points: Float) -> None:
-    """Refuse points (N, 3) that lie on a line.
-
-    Raises:
-        FitError: They do.
-    """
+    """Raise FitError where points (N, 3) lie on a line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
     least_spread_m = 0.005  # across the line that points lie along: less does not determine a rotation
     if spread < least_spread_m * np.sqrt(len(points)):
@@ -237,10 +213,7 @@ def _four(linear: Float) -> Float:
 
 @dataclass(slots=True)
 class _Fit:
-    """Joint fit of rotation, translation and time offset.
-
-    Holds the normal equations of each part of the time.
-    """
+    """Joint fit of R, s and d; holds the normal equations of each part of the time."""
 
     T: Float
     offset_ns: float
@@ -274,7 +247,7 @@ class _Fit:
     def _normal(
         self, found: Float, target: Float, speed: Float, both: Bool, part: Int, middle: Float
     ) -> None:
-        """Write the normal equations for each part of the time.
+        """Write the normal equations of each part of the time.
 
         Unknowns are (rotation [rad] about the middle, shift [m], offset [s]).
         """
@@ -297,10 +270,7 @@ class _Fit:
             self.gradient[k] = a.T @ off[own].reshape(-1)
 
     def sigma(self) -> Float:
-        """Return the jackknife standard deviations (7,).
-
-        They are of rotation [rad], shift [m] and offset [s]: what leaving out one part changes.
-        """
+        """Jackknife standard deviations (7,) of rotation [rad], shift [m], offset [s]."""
         A, g = self.normal.sum(axis=0), self.gradient.sum(axis=0)
         without = [_solved(A - self.normal[k], g - self.gradient[k]) for k in range(_PARTS)]
         spread = np.array(without) - np.mean(without, axis=0)
@@ -308,8 +278,5 @@ class _Fit:
 
 
 def _solved(normal: Float, gradient: Float) -> Float:
-    """Return the step (7,) of normal equations.
-
-    What nothing constrains (the offset of a hand that rests) stays as it is.
-    """
+    """Step (7,) of normal equations; what nothing constrains (d at rest) stays."""
     return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ gradient, np.float64)

@@ -1,27 +1,17 @@
 """Read and write hands as joint rotations of BVH.
 
-Joint motion and tracks hold what a motion-capture file contains.
-
-Contents of a motion-capture file.
-
-Joints and markers of one hand over time, in metres.
-
 Readers of single formats give a `PointTable`, every point of the file in the file's own names and unit; `read_motion`
-(master/mocap/read.py) makes a `JointMotion` of it.
+(master/mocap/read.py) makes a `JointMotion` of it, joints and markers of one hand in metres. A `Track` is points that
+two programs both report, resampled.
 
-Points over time that two programs both report.
+BVH is a tree of joints with offsets, and the rotations of every frame:
 
-They are resampled, and their speeds computed.
+    R_joint = R_parent . product of its rotation channels, in their order      p_joint = p_parent + R_parent .
+    offset
 
-Reader of BVH files.
-
-A tree of joints with offsets, and the rotations of every frame, become positions of all joints.
-
-    R_joint = R_parent . product of its rotation channels, in their order      p_joint = p_parent + R_parent . offset
-
-(Meredith & Maddock, "Motion capture file formats explained", 2001). Position channels of a joint hold its whole offset,
-as Blender and most readers take them. The end of a chain is the point `PARENT_end`; one that lies on its parent is
-none. BVH has no unit, and no word for what was not seen.
+(Meredith & Maddock, "Motion capture file formats explained", 2001). Position channels of a joint hold its whole
+offset, as Blender and most readers take them. The end of a chain is the point `PARENT_end`; one that lies on its
+parent is none. BVH has no unit, and no word for what was not seen.
 """
 
 from dataclasses import dataclass, field
@@ -85,10 +75,7 @@ class JointMotion:
         return len(self.t_ns)
 
     def of(self, name: str) -> Float:
-        """Return the positions (T, 3) [m] of a joint or marker.
-
-        NaN throughout where the file has none of it.
-        """
+        """Positions (T, 3) [m] of a joint or marker; NaN throughout where there is none."""
         if name not in self.names:
             return np.full((len(self), 3), np.nan)
         return self.position_m[:, self.names.index(name)]
@@ -121,9 +108,6 @@ def checked_times(t_s: Float, where: str) -> Int:
     return t_ns
 
 
-"""Between two frames that are farther apart nothing is known: 25 ms, or 1.5 frames of a slow file, at most 100 ms."""
-
-
 def known(position_m: Float) -> Bool:
     """Whether points (..., 3) are known, (...)."""
     return np.asarray(np.isfinite(position_m).all(axis=-1), np.bool_)
@@ -131,30 +115,23 @@ def known(position_m: Float) -> Bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Positions of J named points at T times.
-
-    Attributes:
-        t_ns: (T,) [ns], rising.
-        position_m: (T, J, 3) [m]; NaN: not known.
-    """
+    """Positions (T, J, 3) [m] of named points at T rising times [ns]; NaN: not known."""
 
     t_ns: Int
     position_m: Float
 
     @property
     def gap_ns(self) -> int:
-        """Frames that are farther apart have nothing between them."""
+        """Frames farther apart have nothing between them: 1.5 frames, 25 to 100 ms."""
         typical = float(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0.0
-        # gap ns
         most_gap_ns, gap_frames = 100_000_000, 1.5
         return int(min(max(25_000_000, gap_frames * typical), most_gap_ns))
 
     def at(self, t_ns: Int) -> Float:
-        """Interpolate positions (N, J, 3) [m] at times (N,).
+        """Interpolate positions (N, J, 3) [m] at times (N,), linearly.
 
-        Between two frames the interpolation is linear.
-
-        NaN before the first frame, after the last, in a gap, and where one of the two frames does not know the point.
+        NaN before the first frame, after the last, in a gap, and where one of the two frames does not know
+        the point.
         """
         if len(self.t_ns) < 2:
             return np.full((len(t_ns), *self.position_m.shape[1:]), np.nan)

@@ -1,7 +1,4 @@
-"""Reader of the labelled points of a C3D file (c3d.org), by py-c3d.
-
-This is the only file that depends on that library.
-"""
+"""Reader of the labelled points of a C3D file (c3d.org), by py-c3d."""
 
 import struct
 import warnings

@@ -1,17 +1,11 @@
 """Comparison measures poses against a motion capture and reports it.
 
-Comparison of poses with a motion capture of the same hand.
+It yields errors, coverage of stated regions and false TRACKED, and how the two were aligned.
 
-It yields errors, coverage of stated regions, false TRACKED.
-
-Angles are those between bones, from the joints of both alike, so that nobody's definition of zero matters: PIP and DIP
-between the two bones at the joint, MCP between the proximal bone and the metacarpal (the line from the wrist, where the
-file has no metacarpal joint); of a thumb the MCP and IP. A TRACKED joint is *false* where it is off by 15 mm, or the
-PIP of its finger by 20 degrees (a thumb's MCP), as in `bench/oracle_score.py`.
-
-Report of a comparison for a person and for a program.
-
-It states how the two were aligned, and the metrics.
+Angles are those between bones, from the joints of both alike, so that nobody's definition of zero matters: PIP and
+DIP between the two bones at the joint, MCP between the proximal bone and the metacarpal (the line from the wrist,
+where the file has no metacarpal joint); of a thumb the MCP and IP. A TRACKED joint is *false* where it is off by 15
+mm, or the PIP of its finger by 20 degrees (a thumb's MCP), as in `bench/oracle_score.py`.
 """
 
 from collections.abc import Mapping
@@ -27,7 +21,6 @@ from master.mocap.align import Alignment
 from master.mocap.bvh_file import JointMotion, Track, known
 from master.outputs.poses import Poses
 
-"""Quantiles of a chi-square of 3 degrees of freedom."""
 CLASSES = ("wrist", "palm", "metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
 _ANGLES = ("mcp", "pip", "dip")
 _OF_FINGER = np.zeros((26, 5), np.bool_)
@@ -37,19 +30,18 @@ for _finger, _joints in enumerate(FINGER_JOINTS):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """Poses against truth at T epochs.
-
-    They are the epochs of the poses that lie in the time of the truth.
+    """Poses against truth at the T epochs of the poses in the time of the truth.
 
     Attributes:
         off_m: (T, 26, 3) [m], rig frame; NaN where the truth is not known or the joint is not valid.
         known: (T, 26) whether there is a truth.
         tracked: (T, 26).
-        chi2: (T, 26) of the error under the stated covariance; NaN: no error, or no covariance (outside any region).
+        chi2: (T, 26) of the error under the stated covariance; NaN: no error, or no covariance (outside any
+            region).
         angle_deg: (T, 5, 3) error of MCP, PIP, DIP (thumb: NaN, MCP, IP); NaN: not known.
         marker_mm: (T, M) error of markers; NaN: not known.
-        marker_names: (M,)
-        own_frame_m: (T, 26, 3) `off_m` in the joint's axes, where a joint centre that is placed elsewhere is constant.
+        own_frame_m: (T, 26, 3) `off_m` in the joint's axes, where a joint centre that is placed elsewhere is
+            constant.
     """
 
     off_m: Float
@@ -83,13 +75,9 @@ def joint_track(motion: JointMotion) -> Track:
 def compare(
     poses: Poses, motion: JointMotion, alignment: Alignment, marker_names: tuple[str, ...]
 ) -> Compared:
-    """Hold poses against a motion.
+    """Hold the poses of one hand against the true motion.
 
-    Args:
-        poses: Of one hand.
-        motion: The truth.
-        alignment: From its frame and clock to ours.
-        marker_names: Of the poses; empty: not known.
+    The alignment is from its frame and clock to ours; marker names are those of the poses, none: not known.
     """
     truth = alignment.moved(joint_track(motion))
     inside = (poses.t_ns >= truth.t_ns[0]) & (poses.t_ns <= truth.t_ns[-1])
@@ -119,10 +107,7 @@ def compare(
 
 
 def _chi2(off_m: Float, cov_m2: Float) -> Float:
-    """Return the squared Mahalanobis length (T, 26) of errors.
-
-    It is infinite where there is an error and no covariance.
-    """
+    """Squared Mahalanobis length (T, 26) of errors; inf: an error without covariance."""
     stated = np.asarray(known(cov_m2).all(axis=2), np.bool_)
     floor_m2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
     cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + floor_m2 * np.eye(3)
@@ -144,10 +129,7 @@ def _angle_errors(found: Float, exact: Float) -> Float:
 
 
 def _angles(joints: Float, bases: Bool) -> Float:
-    """Return the angles (T, 5, 3) [deg] between bones of joints (T, 26, 3).
-
-    `bases` (26,): metacarpals of fingers to be used.
-    """
+    """Angles (T, 5, 3) [deg] between bones of (T, 26, 3); `bases` (26,): metacarpals."""
     out = np.full((len(joints), 5, 3), np.nan)
     for finger, (first, *chain) in enumerate(FINGER_JOINTS):
         base = first if finger == 0 or bases[first] else WRIST
@@ -164,10 +146,7 @@ def _between(first: Float, second: Float) -> Float:
 
 
 def figures(compared: Compared) -> dict[str, object]:
-    """Return all metrics by name.
-
-    They are of the whole hand, by class of joint, by finger, by angle; None: nothing to average.
-    """
+    """All metrics by name: hand, classes of joint, fingers, angles; None: no data."""
     every = np.ones(26, np.bool_)
     fingers = {name: _finger_figures(compared, f) for f, name in enumerate(FINGERS)}
     classes = {kind: _figures(compared, _of_class(kind)) for kind in CLASSES}
@@ -207,7 +186,7 @@ def _figures(compared: Compared, joints: Bool) -> dict[str, float | None]:
     chi2 = np.where(scored, chi2, np.nan)
     of_tracked = np.where(tracked, chi2, np.nan)
     constant = compared.own_frame_m[:, joints]
-    chi2_95, chi2_50 = 7.814727903, 2.365973884
+    chi2_95, chi2_50 = 7.814727903, 2.365973884  # quantiles of a chi-square of 3 degrees of freedom
     return {
         "joint_mm": _mean(mm),
         "joint_mm_p95": _percentile(mm, 95.0),
@@ -312,10 +291,7 @@ def table_lines(figures: Mapping[str, object]) -> list[str]:
 
 
 def alignment_json(alignment: Alignment | None) -> dict[str, object]:
-    """Return the alignment for programs.
-
-    None: frame and clock were stated to be ours.
-    """
+    """The alignment for programs; None: frame and clock were stated to be ours."""
     if alignment is None:
         return {"aligned": True}
     alternative = alignment.alternative_s

@@ -1,25 +1,17 @@
 """The CSV reader takes tables of programs and of optical systems.
 
-Cells of text tables, and numbers of cells.
+A plain table has one line of names and one line a frame. Columns are `NAME_x`, `NAME_y`, `NAME_z`, in any order, with
+a unit behind them or not (`wrist_x_mm`), and a time: `t_ns`, `t_ms`, `t_s`, `time`, `seconds`, ... Our own tables
+(`phalanx export --to csv`) are of that form. Empty or not a number is: not seen.
 
-Reader of the tables that optical systems export.
-
-OptiTrack Motive (.csv), Vicon Nexus (.csv) and Qualisys (.tsv).
-
-    Motive    `Format Version`, its key and value pairs in the first line; rows Name, (Rotation, Position), X Y Z
-    Vicon     `Trajectories`, the frames a second, a row of names over `Frame, Sub Frame, X, Y, Z`, a row of units
-    Qualisys  rows of key and values (`FREQUENCY`, `MARKER_NAMES`) before the frames
+    Motive    `Format Version`, its key and value pairs in the first line; rows Name, (Rotation, Position), X
+    Y Z
+    Vicon     `Trajectories`, the frames a second, a row of names over `Frame, Sub Frame, X, Y, Z`, a row of
+    units
+    Qualisys  (.tsv) rows of key and values (`FREQUENCY`, `MARKER_NAMES`) before the frames
 
 Positions of rigid bodies, bones and markers are taken, turns are not. Qualisys writes 0 0 0 for a marker that is not
 seen; the others leave it empty.
-
-Reader of motion capture in text tables.
-
-It takes a plain table with named columns, or what optical systems export.
-
-A plain table has one line of names and one line a frame. Columns are `NAME_x`, `NAME_y`, `NAME_z`, in any order, with a
-unit behind them or not (`wrist_x_mm`), and a time: `t_ns`, `t_ms`, `t_s`, `time`, `seconds`, ... Our own tables
-(`phalanx export --to csv`) are of that form. Empty or not a number is: not seen.
 """
 
 import csv
@@ -37,7 +29,7 @@ from master.mocap.bvh_file import MAX_BYTES, PointTable, Unit
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The cells of a table, separated by commas, semicolons or tabs.
+    """Return the cells of a table, separated by commas, semicolons or tabs.
 
     Raises:
         RecordingError: It cannot be read, is too large or no text.
@@ -56,9 +48,7 @@ def read_rows(path: Path) -> list[list[str]]:
 
 
 def numbers(rows: list[list[str]], first_line: int, columns: list[int], path: Path) -> Float:
-    """Return the cells of some columns as numbers (T, C).
-
-    Empty cells and those that a row does not have are NaN.
+    """Return columns of cells as numbers (T, C); empty and lacking cells are NaN.
 
     Raises:
         RecordingError: A cell is no number; with its line and column.
@@ -99,12 +89,9 @@ _HEAD_ROWS = 40
 
 
 def read_optical(rows: list[list[str]], path: Path, rate_hz: float | None) -> PointTable | None:
-    """The points of an export; None where the table is none of an optical system.
+    """Return the points of an export; None: the table is none of an optical system.
 
-    Args:
-        rows: Cells.
-        path: The file, for errors.
-        rate_hz: Of the frames, where the table does not state it.
+    `rate_hz` is that of the frames, where the table does not state it.
 
     Raises:
         RecordingError: It breaks off, or a cell is no number.
@@ -197,10 +184,7 @@ def _table(
     unit: Unit | None,
     time_column: int | None,
 ) -> PointTable:
-    """Return the points by their columns.
-
-    `t_s` is the column of time as it stands, or the row's number.
-    """
+    """Points by their columns; `t_s` is the column of time, or the row's number."""
     if not columns:
         raise RecordingError(f"{path}: has no positions of anything")
     times = [] if time_column is None else [time_column]
@@ -216,11 +200,7 @@ _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 
 
 
 def read_csv(path: Path, rate_hz: float | None) -> PointTable:
-    """Read a table.
-
-    Args:
-        path: The file.
-        rate_hz: Of its frames, where it has no times.
+    """Read a table; `rate_hz` is that of its frames, where it has no times.
 
     Raises:
         RecordingError: It cannot be read, or is of no form that is known; with file and line.
@@ -231,10 +211,7 @@ def read_csv(path: Path, rate_hz: float | None) -> PointTable:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Columns of a plain table.
-
-    Point -> its three columns, the column of time and its unit, the unit of length.
-    """
+    """Point -> its three columns, column of time and its unit, unit of length."""
 
     points: dict[str, list[int]]
     time: int | None

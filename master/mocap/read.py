@@ -1,18 +1,12 @@
 """The reader finds our joints in a motion-capture file by their names.
 
-Mapping of motion-capture names to our joints.
+`mixamorig:RightHandIndex1` is the right index's MCP. A name is cut into words at separators, digits and capitals. One
+word names the finger, one the joint: MCP, PIP and DIP, or the bone that begins there, as in WebXR. Where joints of a
+finger are numbered, their number determines which is which: 1 2 3 (and 4, or an end) are MCP, PIP, DIP (and tip), 0 1
+2 3 begin with the metacarpal; of a thumb 1 2 3 are CMC, MCP, IP; `RightInHandIndex` is a metacarpal. A thumb whose
+joints are called like a finger's (proximal, intermediate, distal) begins at its CMC.
 
-`mixamorig:RightHandIndex1` is the right index's MCP.
-
-A name is cut into words at separators, digits and capitals. One word names the finger, one the joint: MCP, PIP and DIP,
-or the bone that begins there, as in WebXR. Where joints of a finger are numbered, their number determines which is
-which: 1 2 3 (and 4, or an end) are MCP, PIP, DIP (and tip), 0 1 2 3 begin with the metacarpal; of a thumb 1 2 3 are
-CMC, MCP, IP; `RightInHandIndex` is a metacarpal. A thumb whose joints are called like a finger's (proximal,
-intermediate, distal) begins at its CMC.
-
-Reader of motion capture of a hand.
-
-The format is found by the file's name, joints by their names, length by unit or hand size.
+The format is found by the file's name, length by its unit or the size of the hand.
 """
 
 import re
@@ -69,11 +63,9 @@ class _Finger:
 def match_names(
     names: Iterable[str], ends: frozenset[str] = frozenset()
 ) -> dict[Side | None, dict[str, list[str]]]:
-    """Side -> point of ours -> the names that mean it.
+    """Return side -> point of ours -> the names that mean it.
 
-    Args:
-        names: Of the file.
-        ends: Those that are end sites: a tip, where the finger has no joint there.
+    `ends` are the end sites: a tip, where the finger has no joint there.
     """
     found: dict[Side | None, dict[str, list[str]]] = {}
     fingers: dict[tuple[Side | None, int], _Finger] = {}
@@ -103,7 +95,9 @@ def match_names(
             if joint is not None:
                 found.setdefault(side, {}).setdefault(joint, []).extend(meant)
     for points in found.values():
-        _prefer_wrist(points)
+        hand = points.pop("hand", None)
+        if hand is not None and "wrist" not in points:  # a hand's own joint is its wrist
+            points["wrist"] = hand
     unsided = found.get(None, {})
     if any(_is_finger(point) for point in unsided):
         # The fingers name no side, so `hand_left` and `back_right` are markers to the left and right of something.
@@ -140,10 +134,7 @@ def _finger_of(words: list[str]) -> int | None:
 
 
 def _point_of(words: list[str]) -> str | None:
-    """Return the point of the wrist, palm or back of the hand that the words name.
-
-    `hand` alone is the joint at which a hand begins.
-    """
+    """Point of wrist, palm or back that words name; `hand` is where it begins."""
     if "wrist" in words and "forearm" not in words:
         return "wrist"
     plain = [word for word in words if word not in ("of", "the", "marker")]
@@ -155,13 +146,6 @@ def _point_of(words: list[str]) -> str | None:
     if core[:1] == ["back"] and core[1:] in ([], ["2"], ["3"]):
         return "".join(core)
     return None
-
-
-def _prefer_wrist(points: dict[str, list[str]]) -> None:
-    """A hand's own joint is its wrist, where none is called so."""
-    hand = points.pop("hand", None)
-    if hand is not None and "wrist" not in points:
-        points["wrist"] = hand
 
 
 def _parts(one: _Finger, thumb: bool, ends: frozenset[str]) -> dict[int, list[str]]:
@@ -182,16 +166,10 @@ def _parts(one: _Finger, thumb: bool, ends: frozenset[str]) -> dict[int, list[st
         part = last - step
         if part > _BASE or (part == _BASE and not thumb):
             out.setdefault(part, []).extend(one.numbered[number])
-    if thumb and numbers:
+    if thumb and (numbers or (_PIP in out and _BASE not in out)):
         # Counted from the end as a finger's, a thumb's MCP is a CMC: it has one joint less.
-        out = {_of_thumb(part): names for part, names in out.items()}
-    elif thumb and _PIP in out and _BASE not in out:
-        out = {_of_thumb(part): names for part, names in out.items()}
+        out = {{_MCP: _BASE, _PIP: _MCP}.get(part, part): names for part, names in out.items()}
     return out
-
-
-def _of_thumb(part: int) -> int:
-    return {_MCP: _BASE, _PIP: _MCP}.get(part, part)
 
 
 def _joint(finger: int, part: int) -> str | None:
@@ -205,12 +183,7 @@ def _joint(finger: int, part: int) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class MatchedNames:
-    """The points of one hand.
-
-    Attributes:
-        side: That the names state, or that was asked for; None: neither.
-        names: Point of ours -> name in the file.
-    """
+    """The points of one hand: ours -> name in the file; side stated or asked for."""
 
     side: Side | None
     names: Mapping[str, str]
@@ -223,11 +196,10 @@ def choose_names(
     given: Mapping[str, str | None],
     side: Side | None,
 ) -> MatchedNames:
-    """Which name of a file is which point of one hand.
+    """Find which name of a file is which point of one hand.
 
     Args:
-        names: Of the file.
-        ends: Those that are end sites.
+        ends: Those of the names that are end sites.
         where: The file, for errors.
         given: Point of ours -> name that a person gives it; None: it has none.
         side: That is wanted; None: that which is there.
@@ -270,8 +242,8 @@ def shown(names: Iterable[str]) -> str:
     return (", ".join(listed[:_SHOWN]) or "nothing") + more
 
 
+# From the wrist to the middle knuckle: 0.44 to 0.5 of a hand's length (Buchholz et al., 1992), children included.
 _PALM_M = (0.05, 0.125)
-"""From the wrist to the middle knuckle: 0.44 to 0.5 of a hand's length (Buchholz et al., 1992), children included."""
 _FORMS = "a .csv, .tsv or .txt table, a .bvh or a .c3d"
 
 
@@ -301,7 +273,7 @@ def read_motion(path: Path, reading: Reading | None = None) -> JointMotion:
     """
     reading = reading or Reading()
     table = _table(path, reading.rate_hz)
-    given = _given(reading.joints)
+    given = {} if reading.joints is None else read_json(reading.joints, dict[str, str | None])
     matched = choose_names(table.names, table.ends, str(path), given, reading.side)
     if not matched.names:
         raise RecordingError(
@@ -341,9 +313,7 @@ def require(motion: JointMotion, needed: tuple[str, ...], what: str) -> None:
 
 
 def unit_by_size(names: tuple[str, ...], position: Float, path: Path) -> tuple[Unit, float]:
-    """Return the length unit in which positions (T, J, 3) have the size of a hand.
-
-    Also returns the distance from wrist to middle knuckle in metres.
+    """Unit in which positions (T, J, 3) have a hand's size, and wrist to knuckle [m].
 
     Raises:
         RecordingError: There is no wrist or middle knuckle, or no unit makes a hand of it.
@@ -372,7 +342,3 @@ def _table(path: Path, rate_hz: float | None) -> PointTable:
     if suffix in (".csv", ".tsv", ".txt"):
         return read_csv(path, rate_hz)
     raise RecordingError(f"{path}: motion capture is read from {_FORMS}")
-
-
-def _given(joints: Path | None) -> dict[str, str | None]:
-    return {} if joints is None else read_json(joints, dict[str, str | None])

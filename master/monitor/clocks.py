@@ -1,21 +1,10 @@
 """Clock monitor reports the residual time offset between the cameras.
 
-Residual time offset between cameras.
-
-It is measured from the tracks themselves while they run.
-
-A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by exposure and
-transfer, 8 to 10 ms; nothing that travels with the frame shows it. The tracks do (`master.monitor.timing_fit`).
-
-`ResidualTiming` takes every message and compares a second at once, some frames later, one step of the work with each
-message: most cost no more than being kept, a few in a second a fraction of a millisecond. What it finds is corrected
-nowhere by itself: it is reported, and `phalanx calibrate time` writes it into the rig.
-
-Timing report of a running master.
-
-It covers the clocks of the slaves, the phases of the cameras and wrong time stamps.
-
-Metrics for `Health`, and lines for a person. Nothing here corrects anything.
+A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by
+exposure and transfer, 8 to 10 ms; nothing that travels with the frame shows it. The tracks do
+(`master.monitor.timing_fit`). A second of frames is compared at once, one step of the work with each message.
+Nothing is corrected here: `Health` gets metrics (clocks of the slaves, phases, residual offsets), a person
+gets lines, and `phalanx calibrate time` writes the rig.
 """
 
 from collections import deque
@@ -37,10 +26,7 @@ _DONE = object()
 
 
 class ResidualTiming:
-    """Estimator of the residual time offset between cameras.
-
-    Push machine. Holds the last second of every camera's frames, and the sums of the newest 60 moving blocks.
-    """
+    """Estimator of the residual time offset between cameras; push machine."""
 
     def __init__(
         self,
@@ -48,16 +34,14 @@ class ResidualTiming:
         frame_rate_hz: Mapping[str, float],
         *,
         kept_blocks: int = KEPT_BLOCKS,
-        # a hand moves below 10 Hz: more frames add no information
         rate_hz: float = 30.0,
     ) -> None:
         """Take the cameras in the rig's order; the first one is the reference.
 
         Args:
-            cameras: Camera name -> model.
-            frame_rate_hz: Camera name -> nominal rate.
+            frame_rate_hz: Nominal rates.
             kept_blocks: How many seconds of motion count.
-            rate_hz: About how many frames of a second are compared at most.
+            rate_hz: About how many frames of a second are compared at most: a hand moves below 10 Hz.
         """
         self._models = tuple(cameras.values())
         self._index = {name: c for c, name in enumerate(cameras)}
@@ -79,10 +63,7 @@ class ResidualTiming:
         self._reference: tuple[int, Track] | None = None
 
     def push(self, message: MarkerDetections) -> None:
-        """Take one camera's detections, on the master's clock.
-
-        Those of other cameras are passed over.
-        """
+        """Take one camera's detections, on the master's clock; ignore other cameras."""
         c = self._index.get(message.camera)
         if c is None:
             return
@@ -115,10 +96,7 @@ class ResidualTiming:
                 pass
 
     def offset_of(self, camera: str) -> TimeOffset | None:
-        """Return the time offset of a camera from the last half minute of motion.
-
-        None: not enough, or the reference itself.
-        """
+        """Offset of a camera from the last half minute of motion; None: too little."""
         c = self._index[camera]
         blocks = self._blocks[c].copy()
         return fit_offset(np.stack(blocks)) if c and blocks else None
@@ -165,10 +143,7 @@ class ResidualTiming:
             self._blocks[c].append(sums)
 
     def _track(self, c: int, begin_ns: int) -> Track:
-        """Return the frames of a camera about a block.
-
-        Times [s] are since the block's begin. A marker with an alternative counts as not seen.
-        """
+        """Frames about a block, times [s] from its begin; ambiguous markers: not seen."""
         model, margin = self._models[c], self._margin_ns
         low, high = begin_ns - margin, begin_ns + BLOCK_NS + margin
         frames = [frame for frame in self._frames[c] if low <= frame.t_ns < high]
@@ -204,16 +179,10 @@ class ClockMonitor:
     """Push machine in the loop that monitors clocks and camera timing.
 
     `follow`, `look` and `metrics` belong to the thread that reports, once a second.
-
-    Holds the machines for phases and residual offsets, what the latter found last, and for how long a camera has
-    been suspect. Cameras that watch two hands are measured once.
     """
 
     def __init__(self, setups: Sequence[RigSetup]) -> None:
-        """Watch the cameras of all hands.
-
-        Strobe cycles of a wrist device have no other cameras to be in step with.
-        """
+        """Watch the marker cameras of all hands, and the clocks of all senders."""
         self._senders = tuple(
             dict.fromkeys(name for setup in setups for name in (*setup.camera_names, *setup.imus))
         )
@@ -229,19 +198,13 @@ class ClockMonitor:
                 machines.push(message)
 
     def follow(self, setups: Sequence[RigSetup]) -> None:
-        """Continue with new calibration files of the same cameras.
-
-        What was measured with the old files is forgotten.
-        """
+        """Continue with new files of the same cameras; forget what the old ones gave."""
         for number, k in enumerate(self._which):
             if setups[k] is not self._now[number].setup:
                 self._now[number] = _Machines(setups[k])
 
     def look(self) -> list[str]:
-        """Measure again and return the messages that a person should see.
-
-        They report a wrong time stamp, or a lock that came or went.
-        """
+        """Measure again; return lines on wrong stamps, and locks that came or went."""
         measured = {name: now.residual.offset_of(name) for now in self._now for name in now.others}
         self._found = {name: offset for name, offset in measured.items() if offset is not None}
         lines = [line for now in self._now for line in now.phases.look()]
@@ -258,10 +221,7 @@ class ClockMonitor:
         return lines
 
     def metrics(self, clock_of: Callable[[str], ClockEstimate | None]) -> dict[str, float]:
-        """Return the timing metrics, keyed `<sender>.<quantity>`.
-
-        The quantities are clock_*, and for a marker camera phase_* and residual_*; unknown ones are omitted.
-        """
+        """Known metrics <sender>.clock_*, and of a marker camera phase_* and residual_*."""
         out: dict[str, float] = {}
         for name in self._senders:
             clock = clock_of(name)
@@ -277,9 +237,7 @@ class ClockMonitor:
             out |= _named(name, phase_us=phase.phase_us, phase_spread_us=phase.spread_us)
         for name, offset in self._found.items():
             out |= _named(
-                name,
-                residual_offset_us=1e-3 * offset.offset_ns,
-                residual_sigma_us=1e-3 * offset.sigma_ns,
+                name, residual_offset_us=1e-3 * offset.offset_ns, residual_sigma_us=1e-3 * offset.sigma_ns
             )
         return out
 
@@ -298,10 +256,7 @@ def _that_cover(setups: Sequence[RigSetup]) -> list[int]:
 
 
 def warning(camera: str, offset: TimeOffset) -> str:
-    """Return the warning about a camera whose time stamps are wrong.
-
-    It is addressed to a person.
-    """
+    """Return the warning about a camera whose time stamps are wrong."""
     late, sigma = 1e-6 * offset.offset_ns, 1e-6 * offset.sigma_ns
     return (
         f"camera {camera}: its frames are {abs(late):.1f} ms (sigma {sigma:.1f}) {'later' if late > 0 else 'earlier'}"
@@ -311,10 +266,7 @@ def warning(camera: str, offset: TimeOffset) -> str:
 
 
 def _named(sender: str, **quantities: float) -> dict[str, float]:
-    """Return the metrics of a camera or IMU under their full names.
-
-    A name too long is cut to the length limit by shortening the sender's part.
-    """
+    """Metrics under their full names, cut in the sender's part where too long."""
     name = 64  # characters of a name in `Health`
     return {
         f"{sender[: name - 1 - len(quantity)]}.{quantity}": round(value, 3)

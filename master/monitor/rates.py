@@ -1,18 +1,9 @@
 """Rates and exposure phases show when the cameras take their frames.
 
-Camera frame rates and frame arrival rates.
-
-How fast the cameras run, and how many of their frames arrive: two rates that are easily confused.
-
-A camera's rate is that of its frame counter over its capture times, whether or not somebody had time for the frames
-in between; the rate of arrival counts the frames that were searched, sent and received.
-
-Exposure phases between the cameras.
-
-Whether a lock between them holds, as the master observes it.
-
-The phase of a camera is how much later than the leading camera's frame its own was taken, modulo the period. Cameras
-that run free drift through all phases, some period in minutes; locked ones stay where they are.
+A camera's rate is that of its frame counter over its capture times, whether or not somebody had time for the
+frames in between; the rate of arrival counts the frames that were searched, sent and received. The phase of a
+camera is how much later than the leading camera's frame its own was taken, modulo the period: cameras that
+run free drift through all phases, some period in minutes; locked ones stay where they are.
 """
 
 from collections import deque
@@ -26,10 +17,7 @@ from common.messages import Detections, MarkerDetections
 
 @dataclass(slots=True)
 class _Span:
-    """Frame count of one camera.
-
-    Its last frame, and the sums between the frames of one process of its slave.
-    """
+    """Last frame of one camera, and sums between frames of one slave process."""
 
     session: int
     seq: int
@@ -40,19 +28,13 @@ class _Span:
 
 
 class CameraRates:
-    """Estimator of the frame rates of all cameras.
-
-    Push machine. Holds for each camera the last frame, and frames, arrivals and time since the first.
-    """
+    """Estimator of the frame rates of all cameras; push machine."""
 
     def __init__(self) -> None:
         self._spans: dict[str, _Span] = {}
 
     def push(self, message: Detections) -> None:
-        """Count one frame.
-
-        A frame older than the last is not counted, and nothing between two processes of a slave.
-        """
+        """Count one frame, unless it is older than the last or of another process."""
         known = self._spans.get(message.camera)
         if known is None:
             self._spans[message.camera] = _Span(message.session, message.seq, message.t_ns)
@@ -84,34 +66,19 @@ def _hz(frames: int, span_ns: int) -> float:
     return round(frames * 1e9 / span_ns, 2)
 
 
-"""A third of the 1.5 ms that cost 2 % of depth at 1 m/s; libcamera's own synchronisation stays within some 10 us."""
-
-
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Phase of one camera.
+    """Phase of one camera."""
 
-    Attributes:
-        phase_us: Later than the leading camera's frame [us], within half a period.
-        spread_us: Standard deviation [us] over the last frames.
-    """
-
-    phase_us: float
-    spread_us: float
+    phase_us: float  # later than the leading camera's frame [us], within half a period
+    spread_us: float  # standard deviation [us] over the last frames
 
 
 class CameraPhases:
-    """Monitor of the exposure phases of the cameras.
-
-    Push machine. Holds the leading camera's last time, the last 64 phases of the others, and which cameras are in
-    step.
-    """
+    """Monitor of the exposure phases of the cameras; push machine."""
 
     def __init__(self, frame_rate_hz: Mapping[str, float]) -> None:
-        """Take the cameras in the rig's order, with their nominal rates.
-
-        The first one leads.
-        """
+        """Take the cameras in the rig's order, the leading one first, with nominal rates."""
         self._leader = next(iter(frame_rate_hz))
         self._period_ns = 1e9 / frame_rate_hz[self._leader]
         self._lead_ns: int | None = None
@@ -130,10 +97,7 @@ class CameraPhases:
             fractions.append((message.t_ns - self._lead_ns) / self._period_ns)
 
     def phases(self) -> dict[str, Phase]:
-        """Return the phase of every non-leading camera with enough frames.
-
-        The phase is the mean direction on a circle.
-        """
+        """Phase (mean direction on a circle) of each other camera with enough frames."""
         found: dict[str, Phase] = {}
         for name, fractions in self._fractions.items():
             kept = np.array(fractions.copy())
@@ -150,6 +114,7 @@ class CameraPhases:
         """Called once a second: a line for each camera that fell in step, or out of it."""
         lines: list[str] = []
         for name, phase in self.phases().items():
+            # a third of the 1.5 ms that cost 2 % of depth at 1 m/s; libcamera's own synchronisation: some 10 us
             in_step_us = 500.0
             near = abs(phase.phase_us) <= in_step_us and phase.spread_us <= in_step_us
             self._near[name] = self._near[name] + 1 if near else 0

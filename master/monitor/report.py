@@ -1,18 +1,9 @@
 """Reporter publishes the status of a live master.
 
-Live check of the camera extrinsics while the master runs.
-
-It reports a camera whose rays miss those of the others: the camera was knocked, or is not the one of its file.
-
-Status of a live master.
-
-It has the master's health on the bus, answers to requests there, and a line for each change.
-
-Notify the service manager that the live loop goes round.
-
-A loop that hangs is ended by the watchdog, and started again.
-
-The loop itself gives the sign, when it asks for the next message, never a thread that would live on while it hangs.
+Its health on the bus, answers to requests there, and a line for each change. A camera whose rays miss those
+of the others is reported. The loop itself, when it asks for the next message, shows the service manager that
+it goes round, never a thread that would live on while it hangs: then the watchdog ends the process, and it is
+started again.
 """
 
 import secrets
@@ -37,10 +28,7 @@ from master.run.tuning import LivePipeline, RigTuning
 
 
 class ExtrinsicsMonitor:
-    """Monitor of cameras whose rays are rejected.
-
-    Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was rejected.
-    """
+    """Monitor of cameras whose rays are rejected; belongs to the thread that reports."""
 
     def __init__(self, cameras: tuple[str, ...]) -> None:
         """Watch the cameras of a rig."""
@@ -49,13 +37,7 @@ class ExtrinsicsMonitor:
         self._poses = 0
 
     def look(self, counts: Mapping[str, int]) -> list[str]:
-        """Return a line for each camera that has been rejected for a while.
-
-        Called once a second. The camera was rejected from most poses; it is reported once, until the condition ends.
-
-        Args:
-            counts: Of the pipeline since its start.
-        """
+        """Return a line, once, for each camera that most poses rejected for 5 looks."""
         lines: list[str] = []
         poses = counts.get("poses", 0) - self._poses
         self._poses += poses
@@ -75,12 +57,7 @@ class ExtrinsicsMonitor:
 
 
 class Reporter:
-    """Status reporter of the master.
-
-    It reports on the bus, to whoever asks there, and prints a line for each change.
-
-    Holds the id of this run, and what it reports on.
-    """
+    """Status reporter of the master."""
 
     def __init__(
         self,
@@ -98,7 +75,7 @@ class Reporter:
         stop: threading.Event,
         notify: Callable[[str], None],
     ) -> None:
-        """Be there on the bus from now on; `work` belongs to a thread."""
+        """Announce the master on the bus; `work` belongs to a thread."""
         self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
         self._ingest, self._dispatcher, self._figures = ingest, dispatcher, figures
@@ -109,10 +86,7 @@ class Reporter:
         bus.serve(MASTER, self.answer)
 
     def health(self) -> Health:
-        """Return the current health report.
-
-        Of what never happened only `received` is reported, to keep it short.
-        """
+        """Return the health; of what never happened only `received`, to keep it short."""
         events = self._ingest.counts | self._bus.counts
         happened = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
@@ -125,8 +99,8 @@ class Reporter:
     def answer(self, command: Command) -> Health:
         """Execute a command and return the health.
 
-        "report" returns the status, "reload" uses the files as they are now, "filter" sets another 1 € filter for one
-        rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
+        "report" returns the status, "reload" uses the files as they are now, "filter" sets another 1 € filter
+        for one rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
 
         Raises:
             CalibrationError: The files cannot be used; the old ones still are.
@@ -142,10 +116,7 @@ class Reporter:
         return self.health()
 
     def work(self) -> None:
-        """Publish health on the bus and the rate once a second until the stop.
-
-        Prints a line whenever something changes.
-        """
+        """Publish the health and print rate and changes once a second until the stop."""
         connected: frozenset[str] | None = None
         started = False
         poses = 0
@@ -174,10 +145,7 @@ class Reporter:
             poses = self._figures.poses
 
     def _looked(self) -> list[str]:
-        """Lines of what the monitors of this second found.
-
-        What senders send may make one fail, but not the report.
-        """
+        """Lines of the monitors; what senders send may fail one, but not the report."""
         try:
             if self._tuning is not None:
                 self._tuning.look()
@@ -207,10 +175,7 @@ def marker_line(name: str, counts: MarkerCounts) -> str:
 
 
 def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
-    """Return the line for the user when a sender comes or goes.
-
-    It states who is there, and which cameras are waited for.
-    """
+    """Return the line on who is there, and which cameras are waited for."""
     here = ", ".join(name for name in cameras if name in connected) or "none yet"
     absent = ", ".join(name for name in cameras if name not in connected)
     line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
@@ -221,10 +186,7 @@ def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: 
 
 
 def unplaced_line(name: str, tracker: str) -> str:
-    """Return the line about a tracker whose poses are not placed in the rig.
-
-    Its poses mean nothing there.
-    """
+    """Return the line about a tracker that is not registered to the rig."""
     return (
         f"object {name}: its tracker {tracker} is not registered to the rig, its poses are not used:"
         f" `phalanx calibrate tracker {name}`"
@@ -232,24 +194,12 @@ def unplaced_line(name: str, tracker: str) -> str:
 
 
 class MonitoredLoop(Generic[SeenT]):
-    """A source of messages that shows the manager each time it is asked.
-
-    Holds when the next sign is due.
-    """
+    """A source of messages that shows the manager each time it is asked."""
 
     def __init__(
-        self,
-        source: Source[SeenT],
-        manager: ServiceManager,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        self, source: Source[SeenT], manager: ServiceManager, now_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        """Report that the loop is ready: it begins now.
-
-        Args:
-            source: Where messages come from.
-            manager: Who started this process.
-            now_ns: The time [ns].
-        """
+        """Report that the loop is ready: it begins now."""
         self._source, self._manager, self._now_ns = source, manager, now_ns
         notifies = 4  # in a period of the watchdog
         self._every_ns = manager.watchdog_us * 1000 // notifies

@@ -1,45 +1,39 @@
 """Fit finds the time offset of two cameras from the evidence of their tracks.
 
-Time-offset evidence from the tracks of one pair of cameras.
-
-A frame of the second camera that was really taken `d` later than its stamp shows every marker where it was `d`
-later: x(t) = x_true(t) + d v, with v its velocity in that image. Two things that are constant in truth then change in
-step with the velocity:
+A frame of the second camera that was really taken `d` later than its stamp shows every marker where it was
+`d` later: x(t) = x_true(t) + d v, with v its velocity in that image. Two things that are constant in truth
+then change in step with the velocity:
 
 - **the epipolar residual** of each marker, which should be what lens and mount make it: e = e0 + d (n . v), with n the
   normal of the epipolar line. It sees motion across the baseline.
 - **the distance between two markers**, which should stay what the hand makes it. Along the baseline a wrong time is a
   wrong depth D v d / B, which no epipolar line contradicts; but a hand that is taken for 10 % farther away is taken for
-  10 % larger, too:  l = l0 + d (dl/dx . v), in first order. A hand that really circles changes its depth and keeps its
-  size, and one that turns keeps it as well: rigid motion of any kind leaves all distances alone, so no assumption
-  about the hand's path is made.
+  10 % larger, too:  l = l0 + d (dl/dx . v), in first order. Rigid motion of any kind leaves all distances alone, so no
+  assumption about the hand's path is made; fingers change distances, but not in step with the hand's velocity.
 
-Fingers do change distances, but not in step with the velocity of the hand; what that leaves is for the statistics
-(`master.monitor.timing_fit`).
-
-Velocity is measured and noisy, from the same frames as the position. So each equation also gets an *instrument*
-(Durbin, "Errors in variables", 1954): the velocity that the first camera saw, from frames other than the one compared.
-It knows the motion and shares no noise with either side, so noise neither imitates an offset nor hides one.
-
-From evidence to the offset between two cameras, and how well it is known.
+Velocity is measured and noisy, from the same frames as the position. So each equation also gets an
+*instrument* (Durbin, "Errors in variables", 1954): the velocity that the first camera saw, from frames other
+than the one compared. It knows the motion and shares no noise with either side, so noise neither imitates an
+offset nor hides one.
 
 Time is cut into blocks, and each item of each block (a *unit*: one marker's residual, or one distance, for a
-second) keeps its own constant: its sums are taken about its own means, so whatever changes slowly, lens errors across
-the image or another posture of the fingers, is no evidence. A unit then gives `s_ze = d s_zg` with the covariances of
-instrument z, value e and rate g, and all together
+second) keeps its own constant: its sums are taken about its own means, so whatever changes slowly, lens
+errors across the image or another posture of the fingers, is no evidence. With the covariances of instrument
+z, value e and rate g
 
-    d = sum w s_ze / sum w s_zg
+    s_ze = d s_zg  for a unit,      d = sum w s_ze / sum w s_zg  for all together
 
-Weights are 1 / (the unit's residual variance), refitted some times from the median: a unit in which a camera took
-another thing for the marker, or in which fingers moved, has a large residual and counts for little (Huber, "Robust
-Statistics", 1981, 7.8).
+Weights are 1 / (the unit's residual variance), refitted some times from the median: a unit in which a camera
+took another thing for the marker, or in which fingers moved, counts for little (Huber, "Robust Statistics",
+1981, 7.8).
 
-Errors of neighbouring frames are anything but independent, so the uncertainty is how much batches of frames disagree:
-from tenths of a block to two blocks, and the length that disagrees most counts (Flyvbjerg & Petersen, "Error estimates
-on averages of correlated data", 1989), with the jackknife's correction for leverage (Bell & McCaffrey, "Bias reduction
-in standard errors", 2002). It is widened by Student's distribution for how many batches carry the evidence: outside
-"3 sigma" lies as much as of a normal distribution. Added is what a calibration that is off by what it may be would
-imitate where depth changes in step with velocity.
+Errors of neighbouring frames are anything but independent, so the uncertainty is how much batches of frames
+disagree: from tenths of a block to two blocks, and the length that disagrees most counts (Flyvbjerg &
+Petersen, "Error estimates on averages of correlated data", 1989), with the jackknife's correction for
+leverage (Bell & McCaffrey, "Bias reduction in standard errors", 2002). It is widened by Student's
+distribution for how many batches carry the evidence: outside "3 sigma" lies as much as of a normal
+distribution. Added is what a calibration that is off by what it may be would imitate where depth changes in
+step with velocity.
 """
 
 from dataclasses import dataclass
@@ -57,52 +51,34 @@ from master.fabrik.intersection import RAYS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Frames of one camera.
+    """Frames of one camera."""
 
-    Attributes:
-        t_s: When each marker's row was exposed (T, M) [s], by the stamps.
-        xy: Normalised image points (T, M, 2), undistorted; NaN: not seen.
-    """
-
-    t_s: Float
-    xy: Float
+    t_s: Float  # when each marker's row was exposed (T, M) [s], by the stamps
+    xy: Float  # normalised image points (T, M, 2), undistorted; NaN: not seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Equations `value = constant + offset * rate` (T, I).
+    """Equations `value = constant + offset * rate` (T, I); NaN: nothing seen.
 
-    There is one constant per item; NaN: nothing seen.
-
-    Items are the M epipolar residuals [px], then distances between markers [m].
-
-    Attributes:
-        value: What should be constant.
-        rate: How it changes with the offset [per s].
-        instrument: The rate as the first camera predicts it.
-        doubt: What a pixel of wrong calibration along the epipolar line would make of `value`.
-        place: Where the marker was in the first camera's image, of a distance the middle of the two, (T, I, 2).
+    Items, each with a constant, are the M epipolar residuals [px], then distances between markers [m].
     """
 
     value: Float
-    rate: Float
-    instrument: Float
-    pixel_effect: Float
+    rate: Float  # how the value changes with the offset [per s]
+    instrument: Float  # the rate as the first camera predicts it
+    pixel_effect: Float  # what a pixel of wrong calibration along the epipolar line would make of `value`
+    # where the marker was in the first camera's image, of a distance the middle of the two, (T, I, 2)
     place: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPair:
-    """A reference camera and another one.
+    """A reference camera and another one."""
 
-    Attributes:
-        rotation, translation: From the reference camera's frame to the other's (3, 3), (3,) [m].
-        focal_px: Of the other camera.
-    """
-
-    rotation: Float
-    translation: Float
-    focal_px: float
+    rotation: Float  # (3, 3) from the reference camera's frame to the other's
+    translation: Float  # (3,) [m] likewise
+    focal_px: float  # of the other camera
 
     @classmethod
     def of(cls, reference: CameraModel, other: CameraModel) -> "CameraPair":
@@ -111,14 +87,10 @@ class CameraPair:
         return cls(T[:3, :3], T[:3, 3], float(other.matrix[0, 0]))
 
     def evidence(self, reference: Track, other: Track, rows: Int, gap_s: float) -> Evidence:
-        """Compare the frames `rows` (K,) of the reference with the other's track.
-
-        Both are in the order of time.
+        """Compare frames of the reference with the other's track, both in time order.
 
         Args:
-            reference: Has a frame before and after each of `rows`.
-            other: Frames around them.
-            rows: Which frames of the reference.
+            rows: Frames (K,) of the reference, which has one before and one after each.
             gap_s: Longest time between neighbouring frames that still are one track.
         """
         later, sooner = rows + 1, rows - 1
@@ -129,9 +101,8 @@ class CameraPair:
         xy = reference.xy[rows] + known * (t_s - reference.t_s[rows])[..., None]
         jerk_px_s3 = 3e6  # ten times what a hand does: the track jumped to another thing
         seen, velocity = carried(other, t_s, gap_s, jerk_px_s3 / self.focal_px)
-        middle = 0.5 * (
-            reference.xy[later] + reference.xy[sooner]
-        )  # of other frames again: its noise is not `xy`'s
+        # of other frames again: its noise is not `xy`'s
+        middle = 0.5 * (reference.xy[later] + reference.xy[sooner])
         one, two = _pairs(xy.shape[1])
         place = np.concatenate([middle, 0.5 * (middle[:, one] + middle[:, two])], axis=1)
         value, rate, instrument, pixel_effect = self._equations(xy, known, seen, velocity)
@@ -140,10 +111,7 @@ class CameraPair:
     def _equations(
         self, xy: Float, known: Float, seen: Float, velocity: Float
     ) -> tuple[Float, Float, Float, Float]:
-        """Return value, rate, instrument and standard deviation (K, I).
-
-        They are of points, velocities (K, M, 2) in the reference and the other.
-        """
+        """Value, rate, instrument, pixel effect (K, I) of points, velocities (K, M, 2)."""
         ray = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
         a = ray @ self.rotation.T  # the ray in the other camera's frame
         line = cross(np.broadcast_to(self.translation, a.shape), a)
@@ -169,10 +137,7 @@ class CameraPair:
         return value, rate, instrument, step_s * pixel_effect
 
     def _depth(self, a: Float, along: Float, place: Float) -> Float:
-        """Return depths (K, M) [m] along the reference rays.
-
-        They are of places on the epipolar lines; NaN where no hand can be.
-        """
+        """Depths (K, M) [m] on reference rays of places on epipolar lines; NaN: no hand."""
         a_along, t_along = (along * a[..., :2]).sum(-1), along @ self.translation[:2]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
@@ -183,9 +148,8 @@ class CameraPair:
 def carried(track: Track, t_s: Float, gap_s: float, jerk_s3: float) -> tuple[Float, Float]:
     """Interpolate points and velocities (K, M, 2) of a track at times (K, 1).
 
-    The interpolant is the cubic through the four frames around each.
-
-    NaN where a frame is missing, a gap is too long, or the third derivative exceeds `jerk_s3` [1/s^3].
+    Cubic through the four frames around each. NaN where a frame is missing, a gap is too long, or the third
+    derivative exceeds `jerk_s3` [1/s^3].
     """
     centre = track.t_s.mean(axis=1)
     first = np.searchsorted(centre, t_s[:, 0]) - 2
@@ -234,40 +198,31 @@ def _pairs(markers: int) -> tuple[Int, Int]:
 
 
 TENTHS = 10  # of a block, the shortest batches
-"""Residual below which a unit is not taken to be better: centroids of a tenth of a pixel, at half a metre."""
 _LENGTHS = (1, 2, 5, 10, 20)  # of batches [tenths of a block]
 _THREE_SIGMA = float(ndtr(3.0))
 
 
 @dataclass(frozen=True, slots=True)
 class TimeOffset:
-    """Time offset of a camera against the reference camera.
-
-    It is how much later the camera's frames really are than their stamps state.
-
-    Attributes:
-        offset_ns: [ns].
-        sigma_ns: Standard deviation [ns].
-        batches: How many stretches of time carry it, as an effective number.
-    """
+    """How much later a camera's frames are than their stamps, against the reference."""
 
     offset_ns: float
-    sigma_ns: float
-    batches: float
+    sigma_ns: float  # standard deviation [ns]
+    batches: float  # how many stretches of time carry it, as an effective number
 
 
 def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
-    """Return the sums (10, I, 8) of one block.
+    """Return the sums (10, I, 8) of one block, and the floor variance of each unit.
 
-    n, s_zg, s_ze, s_zc, s_gg, s_ge, s_ee, and the unit's floor variance.
-
-    Sums are of what is left of each quantity when a constant and a plane over the image are taken out of the block.
+    n, s_zg, s_ze, s_zc, s_gg, s_ge, s_ee, floor: of what is left of each quantity when a constant and a plane
+    over the image are taken out of the block.
 
     Args:
         evidence: Of the block's frames (K, I).
         markers: How many of the items are residuals.
         tenth: In which tenth of the block each frame lies (K,).
     """
+    # residual below which a unit is not taken to be better: centroids of a tenth of a pixel, at half a metre
     residual_floor_px, distance_floor_m = 0.2, 1e-3
     floor = np.full(evidence.value.shape[1], distance_floor_m**2)
     floor[:markers] = residual_floor_px**2
@@ -288,12 +243,11 @@ def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
 
 
 def _plausible(evidence: Evidence, floor: Float) -> Bool:
-    """Return the mask (T, I) of plausible evidence.
+    """Mask (T, I): nothing jumps, and both cameras see the marker move alike.
 
-    Nothing jumps there and both cameras see the marker move alike; NaN is not plausible.
-
-    Values are compared with the median of five in a row, which follows any smooth course; velocities of the two
-    cameras with each other. Both by the median of their differences, which outliers do not move (Hampel, 1974).
+    Values are compared with the median of five in a row, which follows any smooth course; velocities of the
+    two cameras with each other. Both by the median of their differences, which outliers do not move (Hampel,
+    1974).
     """
     good = np.isfinite(evidence.value + evidence.rate + evidence.instrument + evidence.place.sum(axis=-1))
     value = np.where(good, evidence.value, np.nan)
@@ -306,10 +260,7 @@ def _plausible(evidence: Evidence, floor: Float) -> Bool:
 
 
 def _median(x: Float) -> Float:
-    """Return medians along the first axis, ignoring NaN.
-
-    Of two middle values it is the lower one. numpy's own is slow on small arrays.
-    """
+    """Lower medians on axis 0 without NaN; numpy's own is slow on small arrays."""
     ordered = np.sort(x, axis=0)  # NaN last
     middle = np.maximum(np.isfinite(x).sum(axis=0) - 1, 0) // 2
     return np.take_along_axis(ordered, middle[None], axis=0)[0]
@@ -321,20 +272,14 @@ def _about_mean(x: Float, good: Bool, n: Int) -> Float:
 
 
 def _without(x: Float, column: Float) -> Float:
-    """Return x (T, I) without its component along `column` (T, I).
-
-    Nothing is removed where that is only noise.
-    """
+    """x (T, I) without its component along `column` (T, I), unless that is noise."""
     length = (column * column).sum(axis=0)
     still = 1e-3  # [1, normalised image]: half a pixel
     return x - column * ((column * x).sum(axis=0) / (length + still**2 * len(x)))
 
 
 def fit_offset(blocks: Float) -> TimeOffset | None:
-    """Fit the offset from the sums (B, 10, I, 8) of blocks.
-
-    None where there is too little motion to estimate it.
-    """
+    """Fit the offset from the sums (B, 10, I, 8) of blocks; None: too little motion."""
     n, zg, ze, _, gg, ge, ee, _ = np.moveaxis(blocks.sum(axis=1), -1, 0)
     floor = blocks[:, 0, :, 7]
     moved = zg > 0.0
@@ -373,10 +318,7 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
 
 
 def _scatter(information: Float, residual: Float, length: int) -> tuple[float, float]:
-    """Return the standard deviation of the offset [s] and the effective batch count.
-
-    It is estimated from batches of so many tenths (`length`).
-    """
+    """Sigma of the offset [s] and effective number of batches of `length` tenths."""
     starts = np.arange(0, len(information), length)
     information, residual = np.add.reduceat(information, starts), np.add.reduceat(residual, starts)
     total = information.sum()

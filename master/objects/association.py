@@ -1,29 +1,16 @@
 """Observations are associated with features, from an initial pose on.
 
-Initial poses of an object from current observations alone.
+While there is no past, a fit starts from current observations alone. Each tag in each camera has two poses
+that show it nearly alike, tilted one way or the other (Collins, Bartoli, "Infinitesimal Plane-Based Pose
+Estimation", 2014); both are named. Beads that two cameras see are points, and three of them whose distances
+are the object's give a pose. Where a slave named two places of a colour, both are tried. Which of all these
+is right the fit decides.
 
-A fit starts from these while there is no past.
-
-Tags: each tag in each camera has two poses that show it nearly alike, tilted one way or the other (Collins, Bartoli,
-"Infinitesimal Plane-Based Pose Estimation", 2014); both are named. Beads: those that two cameras see are points, and
-three of them whose distances are the object's give a pose. Where a slave named two places of a colour, both are tried.
-Which of all these is right the fit decides, with all that is seen.
-
-Association of the observations of a window with features.
-
-They are one list, with one image position for each feature, for the fit; and what starts look at.
-
-Two-pose ambiguity of a single visible tag.
-
-Chooses which of its two poses to use, and how certain that choice is.
-
-A flat tag has two poses that nearly explain it, tilted one way or the other. Both are fitted; the one that was assumed
-stays unless the other is clearly better over several frames, and as far as the other is possible the covariance reaches
-over to it.
-
-The other is fitted for nothing where two cameras that see it leave no ambiguity, and costs as much as the first. So
-while the same cameras see the same tag, and the other was out of the question when it was fitted last, it is taken to
-be as bad for the next frames (`_UNLOOKED`). What is published then differs by less than numbers are exact.
+Of a single visible tag both poses are fitted (`SingleTag`); the one that was assumed stays unless the other
+is clearly better over several frames, and as far as the other is possible the covariance reaches over to it.
+While the same cameras see the same tag, and the other was out of the question when it was fitted last, it is
+taken to be as bad for the next frames: it costs as much as the first, and what is published differs by less
+than numbers are exact.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,28 +34,17 @@ _COMBINATIONS = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighted:
-    """One feature in one camera, interpolated to the epoch from two frames.
-
-    As well as two frames determine it.
-
-    Attributes:
-        camera: Which.
-        feature: Which.
-        uv: (K, n, 2) [px] n points; K places it may be: one, or two where the slave named an alternative.
-    """
+    """One feature in one camera, interpolated to the epoch from two frames."""
 
     camera: int
     feature: int
-    uv: Float
+    uv: Float  # (K, n, 2) [px] n points; K places it may be: two where the slave named an alternative
 
 
 def poses_of_tags(
     sighted: Sequence[Sighted], features: Features, cameras: tuple[CameraModel, ...]
 ) -> list[Float]:
-    """Return two poses `T_rig_object` (4, 4) for each tag in each camera.
-
-    The likelier first.
-    """
+    """Return two poses `T_rig_object` (4, 4), likelier first, by tag and camera."""
     poses: list[tuple[float, Float]] = []
     for seen in sighted:
         if seen.feature >= features.beads:
@@ -82,17 +58,12 @@ def poses_of_tags(
 
 
 def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
-    """Return the two possible poses of a tag seen at normalised points (4, 2).
+    """Return the two poses that show a tag at points (4, 2), each with its residual.
 
-    For each, the residual of the corners and `T_camera_object`.
-
-    The derivative J of the homography at the tag's middle, seen from a view turned to it, is a rotation's upper left
-    2x2 times a scale; its third row is known but for the sign (ibid., 4.1). OpenCV 5 has this wrong for tags near the
-    optical axis.
-
-    Args:
-        corners: (4, 3) [m] of the tag, object frame, as printed top left, top right, bottom right, bottom left.
-        xy: Where they are seen, undistorted (x/z, y/z).
+    The derivative J of the homography at the tag's middle, seen from a view turned to it, is a rotation's
+    upper left 2x2 times a scale; its third row is known but for the sign (ibid., 4.1). OpenCV 5 has this
+    wrong for tags near the optical axis. `corners` (4, 3) [m], object frame, as printed top left, top right,
+    bottom right, bottom left; `xy` undistorted (x/z, y/z). The poses are `T_camera_object`.
     """
     edge = 0.25 * float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
     flat = tag_corners(edge)
@@ -111,10 +82,7 @@ def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
 
 
 def _ways(A: Float, rotation: Float, corners: Float, flat: Float, xy: Float) -> list[tuple[float, Float]]:
-    """The two poses of a tag whose turn has `A` (2, 2) as upper left part.
-
-    As `two_poses` returns them.
-    """
+    """The two poses, as of `two_poses`, of a turn with `A` (2, 2) as upper left part."""
     left = np.eye(2) - A.T @ A
     b = np.sqrt(np.maximum(np.diagonal(left), 0.0)) * [1.0, 1.0 if left[0, 1] >= 0.0 else -1.0]
     out: list[tuple[float, Float]] = []
@@ -130,10 +98,7 @@ def _ways(A: Float, rotation: Float, corners: Float, flat: Float, xy: Float) -> 
 
 
 def _homography(plane: Float, xy: Float) -> Float | None:
-    """Return the homography (3, 3) from a plane's points to their images.
-
-    Points (4, 2) and images (4, 2); its last element is 1. None: three of the points are collinear.
-    """
+    """Return the homography (3, 3), H[2, 2] = 1, of plane to image; None: collinear."""
     rows = np.zeros((8, 8))
     rows[::2, :2], rows[::2, 2] = plane, 1.0
     rows[1::2, 3:5], rows[1::2, 5] = plane, 1.0
@@ -145,20 +110,14 @@ def _homography(plane: Float, xy: Float) -> Float | None:
 
 
 def _rotation_to(line_of_sight: Float) -> Float:
-    """Return the smallest rotation (3, 3) from the z axis to a line of sight.
-
-    The line of sight is the direction of a vector (3,) in front of the camera.
-    """
+    """Return the smallest rotation (3, 3) from the z axis to a line of sight (3,)."""
     x, y, z = line_of_sight / np.linalg.norm(line_of_sight)
     cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
 
 def _shift(rotated: Float, xy: Float) -> Float:
-    """Solve for the origin (3,) of rotated points by linear least squares.
-
-    The rotated points (N, 3) are seen at (N, 2).
-    """
+    """Solve for the origin (3,) of rotated points (N, 3) seen at (N, 2), linearly."""
     rows = np.zeros((2 * len(xy), 3))
     rows[::2, 0] = rows[1::2, 1] = 1.0
     rows[:, 2] = -xy.ravel()
@@ -168,10 +127,7 @@ def _shift(rotated: Float, xy: Float) -> Float:
 
 
 def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: CameraArrays) -> list[Float]:
-    """Return poses `T_rig_object` (4, 4) from three or more beads.
-
-    Only beads whose mutual distances match the object; the best pose first.
-    """
+    """Return poses (4, 4), best first, of three beads of the object's distances."""
     places = [_points(sighted, bead, cameras) for bead in range(features.beads)]
     seen = [bead for bead, found in enumerate(places) if len(found)]
     poses: list[tuple[float, Float]] = []
@@ -193,10 +149,7 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
 
 
 def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Float:
-    """Return the possible positions (K, 3) [m] of a bead in the rig frame.
-
-    Of all choices of its image positions, those whose rays meet.
-    """
+    """Return a bead's possible positions (K, 3) [m], rig frame, where its rays meet."""
     views = [seen for seen in sighted if seen.feature == bead]
     if len(views) < 2:
         return np.empty((0, 3))
@@ -211,14 +164,13 @@ def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Flo
 
 
 def _sides(points: Float) -> Float:
-    """Distances (3,) between three points (3, 3)."""
     return np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
 
 
 def reach(taus: Float) -> Int:
-    """Select the two times that carry an image position to the epoch.
+    """Select the two times, nearest first, that carry an image position to 0.
 
-    `taus` (n,) are times from an epoch [s]; the nearest is first. Returns one index where only one is usable.
+    `taus` (n,) are times from an epoch [s]. Returns one index where only one is usable.
     """
     order: Int = np.argsort(np.abs(taus))
     near_s = 0.012  # frames of several cameras that are taken for one moment without bringing them there
@@ -232,10 +184,7 @@ CentroidSigma = Callable[[int, Float, Float], Float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Association:
-    """Observations of a window with one image position for each.
-
-    `feature` (n,) is what each is a part of.
-    """
+    """Observations of a window, one image position for each of `feature` (n,)."""
 
     seen: Observations
     feature: Int
@@ -254,12 +203,9 @@ class Association:
     ) -> "Association | None":
         """All that is seen; None: nothing.
 
-        Args:
-            window: The observations.
-            features: Of the object.
-            cameras: Of the rig.
-            T: A pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken. None: none.
-            doubt: Camera, pose and areas (..., B) [px^2] of its beads -> by how much their centroids may be off [px].
+        `T`: a pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken.
+        `centroid_sigma`: camera, pose and areas (..., B) [px^2] of its beads -> by how much their centroids
+        may be off [px].
         """
         columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
         for c, both in enumerate(window.views):
@@ -290,10 +236,7 @@ class Association:
         return cls(seen, features.feature[point], now, features.count, len(cameras))
 
     def used(self, fitted: Fitted) -> Bool:
-        """Return (C, F) which features the pose rests on in which camera.
-
-        The frames nearest to the epoch count.
-        """
+        """Return (C, F) features by camera that a pose rests on in the nearest frames."""
         out = np.zeros((self.cameras, self.features), np.bool_)
         associated = fitted.used & self.now
         out[self.seen.camera[associated], self.feature[associated]] = True
@@ -303,10 +246,7 @@ class Association:
 def _nearer(
     line: list[ImageObservation], point: Int, features: Features, camera: CameraModel, T: Float | None
 ) -> tuple[Float, Float]:
-    """Return positions (K, 2) of the points (K,) of observations; sigmas.
-
-    The alternative is taken where a pose has the point nearer to it.
-    """
+    """Return positions (K, 2), of alternatives those nearer to a pose; sigmas."""
     uv, sigma = np.concatenate([one.uv for one in line]), np.concatenate([one.sigma_px for one in line])
     alternative = np.concatenate([one.alt_uv for one in line])
     if T is None or np.isnan(alternative).all():
@@ -317,10 +257,7 @@ def _nearer(
 
 
 def sighted_now(window: Window, features: Features) -> list[Sighted]:
-    """Return what each camera sees now of each feature.
-
-    The observations are brought to the epoch along a line.
-    """
+    """Return what each camera sees now of each feature, on a line to the epoch."""
     out: list[Sighted] = []
     at_ns = window.t_ns - window.origin_ns
     for c, both in enumerate(window.views):
@@ -340,10 +277,7 @@ def sighted_now(window: Window, features: Features) -> list[Sighted]:
 
 
 def _brought(points: Int, line: tuple[ImageObservation, ...], at_ns: int) -> Float:
-    """Extrapolate points (n, 2) of the nearest observation to a time.
-
-    They move on as from the next observation that has them all.
-    """
+    """Extrapolate the nearest observation's points (n, 2) to a time, by the next."""
     found: list[tuple[Float, Float]] = []
     for observation in line:
         rows = [
@@ -364,10 +298,7 @@ _FLIP_RAD = np.radians(8.0)  # poses of a tag nearer than this are one
 
 @dataclass(slots=True)
 class _Clear:
-    """A tag whose other pose is ruled out.
-
-    Which cameras saw it, how much better the other pose is, and for how many more frames this holds.
-    """
+    """A tag whose other pose is ruled out: by which cameras, how clearly, how long."""
 
     seen_by: tuple[int, ...]
     better: float
@@ -375,16 +306,10 @@ class _Clear:
 
 
 class SingleTag:
-    """Resolver of the two-pose ambiguity of a single tag.
-
-    Push machine. Holds how much better the other pose has been of late, and what was ruled out when it was fitted.
-    """
+    """Push machine: a single tag's two poses; how much better the other was of late."""
 
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...], fit: PoseFit) -> None:
-        """Set up for an object's features, the rig's cameras and the pose fit.
-
-        `fit` fits the features to what the cameras saw.
-        """
+        """Set up; `fit` fits the features to what the cameras saw."""
         self._features, self._cameras, self._fit = features, cameras, fit
         self._log_odds = 0.0
         self._clear: _Clear | None = None
@@ -394,15 +319,9 @@ class SingleTag:
         self._log_odds, self._clear = 0.0, None
 
     def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
-        """Return the pose to use, its covariance widened by the alternative pose.
+        """Return the pose to use, its covariance widened by that of a lone tag's other.
 
-        The fit is returned unchanged where more than one tag is seen.
-
-        Args:
-            window: The observations.
-            seen: What was fitted.
-            fitted: The pose.
-            begins: There is no pose before it: the better one is taken at once.
+        `begins`: there is no pose before it: the better one is taken at once.
         """
         features = np.unique(seen.feature[fitted.used])
         forget = 0.8  # of that sum, from frame to frame
@@ -424,14 +343,14 @@ class SingleTag:
             return fitted
         better = 0.5 * (fitted.cost - other.cost)
         self._log_odds = forget * self._log_odds + 2.0 * better * (1.0 - forget) * 2.0
-        # chi square, summed over frames, by which the other pose of a tag must be better
-        # chi square of the other pose's being better at which it is out of the question: exp(-30) is nothing
+        flips = 12.0  # chi square, summed over frames, by which the other pose of a tag must be better
+        impossible = -30.0  # chi square by which it is out of the question: exp(-30) is nothing
         if begins:
             if better > 0.0:
                 fitted, other, better = other, fitted, -better
-        elif self._log_odds > 12.0:
+        elif self._log_odds > flips:
             fitted, other, better, self._log_odds = other, fitted, -better, 0.0
-        elif better < (-30.0):
+        elif better < impossible:
             # frames for which that holds: less than a tenth of a second, before a sum of it would be forgotten
             unlooked = 5
             self._clear = _Clear(who, better, unlooked)
@@ -458,10 +377,7 @@ class SingleTag:
 
 
 def _reaching(fitted: Fitted, other: Fitted, better: float) -> Fitted:
-    """Widen the covariance of a fit towards the alternative pose.
-
-    The covariance reaches over to the other pose as far as that is possible, by how much better it is.
-    """
+    """Widen a fit's covariance towards the other pose as far as that is possible."""
     share = 1.0 / (1.0 + np.exp(np.clip(-better, -50.0, 50.0)))
     off = np.concatenate(
         [

@@ -1,31 +1,20 @@
 """Find which fingers touch an object, and carry an unseen one with the hand.
 
-Detection of a hand that carries an object, by how both move.
-
-It works also for a hand whose fingers nobody sees.
-
-Whoever holds a thing hides from the cameras the fingers that hold it. But what is held moves as the palm does. Over
-some tenths of a second an object's motion foretells where the palm gets to if it is fixed to it; if that is a way long
-enough to be no noise, and the palm, which is near, went it, then the object is carried. It stays so at rest, until the
-palm has moved about the object, or fingers are seen to be away from it.
-
-A hand that pushes an object along with the palm looks the same.
-
-How near the fingers of a hand are to objects, and which of them touch.
-
 The skin of a finger is capsules from joint to joint with the radii of the profile
-(`common.geometry.tapered_capsules`). The
-distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
-bar often holds it with the middle ones. The object's poses around the hand's epoch are brought to it: between two of
-them by interpolation, behind the last by its motion, a tenth of a second at most.
+(`common.geometry.tapered_capsules`). The distance that is published is that of the last segment; a finger
+*touches* with any of its three, since whoever grasps a bar often holds it with the middle ones. The object's
+poses around the hand's epoch are brought to it: between two of them by interpolation, behind the last by its
+motion, a tenth of a second at most. The uncertainty of a distance is along the normal of the surface: the
+joints, the object's place, its turn by the lever from its origin, and flesh that gives way. A finger touches
+from a distance `NEAR_M` on that noise alone does not explain, and lets go beyond `FAR_M` (and as much): so it
+does not flicker.
 
-How sure a distance is follows from the covariances along the normal of the surface: that of the joints, that of the
-object's place, that of its turn by the lever from its origin, and flesh that gives way. A finger touches from a
-distance `NEAR_M` on that noise alone does not explain, and lets go beyond `FAR_M` (and as much): so it does not
-flicker.
-
-An object is *held* by the thumb or the palm and a finger against them; or, since a hand hides what it does with what it
-holds, where it moves with the palm (`master.objects.contact`).
+An object is *held* by the thumb or the palm and a finger against them; or, since a hand hides what it does
+with what it holds, where it moves with the palm (`Carried`): over some tenths of a second an object's motion
+predicts where the palm gets to if it is fixed to it; if that is a way long enough to be no noise, and the
+palm, which is near, went it, then the object is carried. It stays so at rest, until the palm has moved about
+the object, or fingers are seen to be away from it. A hand that pushes an object along with the palm looks the
+same.
 """
 
 from collections import deque
@@ -55,10 +44,7 @@ SPAN_S = 0.35  # over which motions are compared
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moment:
-    """An object and the palm at one time.
-
-    A time [ns], `T_rig_object` (4, 4), the palm (3,) [m], rig frame.
-    """
+    """Object `T_rig_object` (4, 4) and palm (3,) [m], rig frame, at a time."""
 
     t_ns: int
     T: Float
@@ -66,25 +52,17 @@ class _Moment:
 
 
 class Carried:
-    """Detector of one hand that carries one object.
-
-    Push machine. Holds their last places, and where the palm is on what it carries.
-    """
+    """Push machine: whether a hand carries an object, by how both moved of late."""
 
     def __init__(self) -> None:
-        """Begin with a hand that carries nothing."""
         self._moments: deque[_Moment] = deque()
         self._at_m: Float | None = None
 
     def push(self, t_ns: int, T_rig_object: Float, palm_m: Float, distance_m: float, away: bool) -> bool:
-        """Whether the object is carried.
+        """Whether the object is carried, at rising times.
 
-        Args:
-            t_ns: The epoch; it rises.
-            T_rig_object: Where the object is (4, 4).
-            palm_m: The palm (3,), rig frame; NaN: not known.
-            distance_m: Between palm and object.
-            away: The fingers are seen not to touch it.
+        `palm_m` (3,), rig frame; NaN: not known. `distance_m` between palm and object; `away`: fingers are
+        seen not to touch it.
         """
         if np.isnan(palm_m).any() or np.isnan(distance_m):
             return self._at_m is not None and not away
@@ -137,20 +115,14 @@ _PALM = 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PointEstimate:
-    """Pose estimate of an object at an epoch.
-
-    `T_rig_object` (4, 4) and covariance (6, 6).
-    """
+    """Pose `T_rig_object` (4, 4) of an object at an epoch, covariance (6, 6)."""
 
     T: Float
     cov: Float
 
 
 class ContactMonitor:
-    """Detector of contacts of one hand.
-
-    Push machine. Holds the last poses of each object, and which finger touches which.
-    """
+    """Push machine: contacts of a hand; holds objects, last poses and what touched."""
 
     def __init__(self, model: HandModel, objects: Sequence[ObjectProfile]) -> None:
         """Take the hand and the objects near it; those without a shape have no contact."""
@@ -162,10 +134,7 @@ class ContactMonitor:
         self._carried = {name: Carried() for name in self._surfaces}
 
     def push_object(self, pose: ObjectPose) -> None:
-        """Take a pose of an object.
-
-        Of an object that is not watched, or a pose not after the last, nothing is kept.
-        """
+        """Take a pose of an object; one not watched, or not after its last, is ignored."""
         poses = self._poses.get(pose.object)
         if poses is None or (poses and pose.t_ns <= poses[-1].t_ns):
             return
@@ -188,23 +157,23 @@ class ContactMonitor:
             return _unknown(pose, name)
         found, sigma = _gaps(pose, surface, placed)
         # Fingers (5, 3) and the palm's four bones as a sixth of its own.
-        distance, bone_sigma = found.distance_m, sigma
+        distance = found.distance_m
         segments = distance[:_SEGMENTS].reshape(5, 3)
         palm = int(np.argmin(np.nan_to_num(distance[_SEGMENTS:], nan=np.inf))) + _SEGMENTS
         nearest: Int = np.argmin(np.nan_to_num(segments, nan=np.inf), axis=1) + 3 * np.arange(5)
         bones = np.append(nearest, palm)
-        touching = _touches(distance[bones], bone_sigma[bones], self._touching[name])
+        touching = _touches(distance[bones], sigma[bones], self._touching[name])
         self._touching[name] = touching
         last = 3 * np.arange(5) + 2
         centre = np.where(pose.valid[_PALM], pose.position_m[_PALM], np.nan)
-        free = _away(distance[bones[:5]], bone_sigma[bones[:5]])
+        free = _away(distance[bones[:5]], sigma[bones[:5]])
         carried = self._carried[name].push(pose.t_ns, placed.T, centre, float(distance[palm]), free)
         return Contact(
             hand=pose.hand,
             object=name,
             t_ns=pose.t_ns,
             distance_m=distance[last],
-            sigma_m=bone_sigma[last],
+            sigma_m=sigma[last],
             point_m=transform(placed.T, found.point_m[last]),
             touching=touching[:5],
             palm_distance_m=float(distance[palm]),
@@ -213,19 +182,13 @@ class ContactMonitor:
 
 
 def _away(distance: Float, sigma: Float) -> bool:
-    """Check whether fingers (5,) surely hold nothing.
-
-    All are away but the thumb, which alone holds nothing. NaN: open.
-    """
+    """Whether fingers (5,) surely hold nothing (a thumb alone does not); NaN: open."""
     free = 2.5  # standard deviations of a distance beyond which a finger surely does not touch
     return bool((np.nan_to_num(distance - free * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
-    """Return (N,) what touches.
-
-    Given are distances and standard deviations (N,) [m] and what touched before; NaN: not known.
-    """
+    """Return (N,) what touches, by distances, sigmas (N,) [m], and what did before."""
     sure_m = 0.02  # a distance less sure than this is no evidence of touch
     sure = sigma < sure_m
     near_m = 2.5e-3
@@ -236,10 +199,7 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
 
 
 def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nearest, Float]:
-    """Return distances of all bones (19,) and their standard deviations.
-
-    They are in the object frame; NaN where a joint is not valid.
-    """
+    """Return distances of all bones (19,), object frame, and sigmas; NaN: not valid."""
     points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
     capsules = Capsules(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
@@ -264,10 +224,7 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
 
 
 def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
-    """Return the pose of an object at a time, from its last poses.
-
-    None: it is not known.
-    """
+    """Return the pose of an object at a time, from its last poses; None: not known."""
     led_s = 0.1  # by which an object's pose is led on, at most
     if not poses or t_ns - poses[-1].t_ns > led_s * 1e9 or poses[0].t_ns - t_ns > led_s * 1e9:
         return None
@@ -299,15 +256,5 @@ def _pose_of(pose: ObjectPose) -> Float:
 
 
 def _unknown(pose: HandPose, name: str) -> Contact:
-    nothing = np.full(5, np.nan)
-    return Contact(
-        hand=pose.hand,
-        object=name,
-        t_ns=pose.t_ns,
-        distance_m=nothing,
-        sigma_m=nothing,
-        point_m=np.full((5, 3), np.nan),
-        touching=np.zeros(5, np.bool_),
-        palm_distance_m=np.nan,
-        held=False,
-    )
+    nothing, nowhere, touching = np.full(5, np.nan), np.full((5, 3), np.nan), np.zeros(5, np.bool_)
+    return Contact(pose.hand, name, pose.t_ns, nothing, nothing, nowhere, touching, np.nan, held=False)

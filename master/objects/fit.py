@@ -1,45 +1,23 @@
 """A fit finds the pose and motion of an object by weighted sums.
 
-All cameras of a rig laid out by observation.
+Each observation (a bead, a corner of a tag) around an epoch has its own time, that of its row, and a place in
+the distorted image. The object's motion about the epoch is a Taylor series of its place and turn to the
+fourth order,
 
-They give where each sees its point, and how that changes with the point.
+    X = R(theta(t)) R0 q + p(t),   p(t) = sum_k p_k t^k / k!,   theta(t) = sum_{k>0} theta_k t^k / k!
 
-What a fit asks for in each of its rounds with the same cameras is looked up once (`Views`).
+whose derivatives are drawn at random with the sizes of what hands do (as `master.fabrik.sync` has it for
+single markers; Rasmussen, Williams 2006, 2.7). Minimised is the reprojection error in units of its noise plus
+these priors, by Gauss-Newton: one linear problem of 30 unknowns per round, whatever the number of cameras and
+features. Cameras need not be in step, and a rolling shutter is no special case. How hard the object is moved
+is not known: the last linear problem is solved for each degree of vigour, each counts by its evidence, and
+where they disagree the covariance grows.
 
-Motion of a rigid object about an epoch.
-
-It is a Taylor series of its position and of its rotation.
-
-X = R(theta(t)) R0 q + p(t),   p(t) = sum_k p_k t^k / k!,   theta(t) = sum_{k>0} theta_k t^k / k!
-
-Observations of an object as weighted sums.
-
-Errors that stay from frame to frame are eliminated from them exactly.
-
-An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each frame. The
-first is an unknown of its own, eliminated by its Schur complement, so four observations of one bead at rest are not
-taken for four measurements.
-
-A feature that misses the pose by more than noise and a bad calibration is weighed down as a whole, in its camera, by
-Geman and McClure's law (iteratively reweighted least squares); one thing taken for another so costs itself.
-
-Pose of a rigid object at an epoch, from the observations of all cameras.
-
-The observations are those around the epoch.
-
-Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
-object's motion about the epoch is a Taylor series of its place and of its turn (`master.objects.fit`), to the
-fourth order, whose speed, acceleration, jerk and snap are drawn at random with the sizes of what hands do (as
-`master.fabrik.sync` has it for single markers; Rasmussen, Williams 2006, 2.7).
-
-Minimised is the reprojection error in units of its noise plus these priors, by Gauss-Newton from a start. Everything is
-one linear problem of 30 unknowns per round, whatever the number of cameras and features: cameras need not be in step,
-one that was lost costs what it saw, and a rolling shutter is no special case.
-
-**Vigour.** How hard the object is moved is not known: the last linear problem is solved for each degree of vigour, each
-counts by its evidence, and where they disagree the covariance grows.
-
-Noise, and what is taken for a feature and is none: `master.objects.fit`.
+An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each
+frame. The first is an unknown of its own, eliminated by its Schur complement, so four observations of one
+bead at rest are not taken for four measurements. A feature that misses the pose by more than noise and a bad
+calibration is weighed down as a whole, in its camera, by Geman and McClure's law (iteratively reweighted
+least squares).
 """
 
 from dataclasses import dataclass
@@ -54,31 +32,21 @@ from master.fabrik.intersection import RAYS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """The cameras of n observations, and the radii of the balls that they see.
+    """The cameras of n observations, and the radii of the balls that they see."""
 
-    Attributes:
-        R, t: (n, 3, 3), (n, 3) of `T_camera_rig`.
-        lens: (5, n) k1, k2, p1, p2, k3.
-        focal, centre: (n, 2) [px].
-        radius_2: (n,) squares of the radii [m^2], 0: a point.
-    """
-
-    R: Float
-    t: Float
-    lens: Float
-    focal: Float
-    centre: Float
-    radius_2: Float
+    R: Float  # (n, 3, 3) of `T_camera_rig`
+    t: Float  # (n, 3)
+    lens: Float  # (5, n) k1, k2, p1, p2, k3
+    focal: Float  # (n, 2) [px]
+    centre: Float  # (n, 2) [px]
+    radius_2: Float  # (n,) squares of the radii [m^2], 0: a point
 
     def see(self, points: Float) -> tuple[Float, Float, Float]:
-        """Project points (n, 3) [m] into the cameras.
-
-        For balls about the points it is the middles of their outlines.
+        """Project points (n, 3) [m]; of balls about them the middles of their outlines.
 
         An ellipse, the outline of a ball of radius r at (x, y, z), has its middle at (x, y) z / (z^2 - r^2).
-
-        Returns:
-            Pixels (n, 2); their derivatives (n, 2, 3) [px/m] by the points, rig frame; depth (n,) [m]. NaN: behind.
+        Returns pixels (n, 2); derivatives (n, 2, 3) [px/m] by the points, rig frame; depth (n,) [m]. NaN:
+        behind.
         """
         own = (self.R @ points[..., None])[..., 0] + self.t
         before_m = 1e-3  # a point nearer to the plane of a camera than this is not before it
@@ -110,7 +78,6 @@ class Cameras:
     """The cameras of a rig. Holds no state between calls."""
 
     def __init__(self, cameras: tuple[CameraModel, ...]) -> None:
-        """Lay them out."""
         self._R = np.array([c.T_camera_rig[:3, :3] for c in cameras])
         self._t = np.array([c.T_camera_rig[:3, 3] for c in cameras])
         self._lens = np.array([c.distortion for c in cameras]).T
@@ -135,24 +102,16 @@ _POWERS = np.arange(ORDERS)
 
 
 def basis_at(tau_s: Float) -> Float:
-    """Return weights (..., ORDERS) of the derivatives at times (...).
-
-    The times are from the epoch [s].
-    """
+    """Return weights (..., ORDERS) of the derivatives at times (...) [s] from 0."""
     return tau_s[..., None] ** _POWERS / _FACTORIAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A pose and its derivatives.
+    """A pose and its derivatives, those of order 0 being 0."""
 
-    Attributes:
-        T: (4, 4) `T_rig_object`.
-        rates: (ORDERS, 2, 3) derivatives of place [m/s^k] and turn [rad/s^k], rig axes; those of order 0 are 0.
-    """
-
-    T: Float
-    rates: Float
+    T: Float  # (4, 4) `T_rig_object`
+    rates: Float  # (ORDERS, 2, 3) of place [m/s^k] and turn [rad/s^k], rig axes
 
     @classmethod
     def still(cls, T: Float) -> "Motion":
@@ -183,10 +142,7 @@ def _stepped(T: Float, step: Float) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Past:
-    """Prior from earlier frames at the epoch.
-
-    It is of position, rotation and speeds: the estimate, and its information (12, 12).
-    """
+    """Prior from earlier frames at the epoch, with its information (12, 12)."""
 
     motion: Motion
     precision: Float
@@ -205,23 +161,14 @@ class Past:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Observations of one object around an epoch, n points.
+    """Observations of one object around an epoch, n points."""
 
-    Attributes:
-        camera: (n,) which camera.
-        point: (n,) which row of `Features.points`.
-        tau_s: (n,) when, from the epoch [s].
-        uv: (n, 2) [px], distorted image.
-        sigma_px: (n,) standard deviation per axis.
-        t_sigma_s: (n,) of the times, the same error for all of a camera.
-    """
-
-    camera: Int
-    point: Int
-    tau_s: Float
-    uv: Float
-    sigma_px: Float
-    t_sigma_s: Float
+    camera: Int  # (n,)
+    point: Int  # (n,) which row of `Features.points`
+    tau_s: Float  # (n,) when, from the epoch [s]
+    uv: Float  # (n, 2) [px], distorted image
+    sigma_px: Float  # (n,) standard deviation per axis
+    t_sigma_s: Float  # (n,) of the times, the same error for all of a camera
 
     def some(self, associated: Bool) -> "Observations":
         """Those of a mask (n,)."""
@@ -236,19 +183,12 @@ class Observations:
 
 
 class Sums:
-    """Weighted sums of observations.
-
-    Determines which observations belong together, and their variances. Holds no state between calls.
-    """
+    """Weighted sums of observations; holds which belong together, and variances."""
 
     def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
-        """Set up for observations.
+        """Set up; `feature` (n,) of what each is a part, `points` of the object.
 
-        Args:
-            seen: The observations.
-            feature: (n,) of what each is a part.
-            floor_2: (n,) variance per axis [px^2] that light, lens and calibration leave.
-            points: How many points the object has.
+        `floor_2` (n,): variance per axis [px^2] that light, lens and calibration leave.
         """
         variance = seen.sigma_px**2
         independent_share, independent_px = 0.7, 0.1  # as in `master.fabrik.sync`
@@ -270,16 +210,11 @@ class Sums:
         self._numbers = 2.0 * np.bincount(self._whole[first])
 
     def weigh(self, miss: Float, lag_2: Float) -> tuple[Float, Float, float]:
-        """Return the chi-square and weight (n,) of each observation, and the cost.
+        """Return chi square (n,), weight (n,) of each observation, and the cost.
 
-        The chi-square (n,) is per measured number of the feature that the observation belongs to.
-
-        The weight forgives what a bad calibration leaves (`RaySettings.rig_px`), the cost only what this one is
-        known to leave.
-
-        Args:
-            miss: (n, 2) by which the observations miss the pose [px].
-            lag_2: (n,) variance that the uncertainty of their times makes [px^2].
+        The chi square is per measured number of the feature that the observation belongs to. The weight
+        forgives what a bad calibration leaves (`RaySettings.rig_px`), the cost only what this one is known to
+        leave. `miss` (n, 2) [px]; `lag_2` (n,) variance that the uncertainty of their times makes [px^2].
         """
         total = self._total + lag_2
         squared = 0.5 * np.vecdot(miss, miss)
@@ -293,10 +228,7 @@ class Sums:
     def normal(self, rows: Float, weight: Float, lag_2: Float) -> tuple[Float, Float]:
         """Normal matrix (N, N) and gradient (N,), the errors that stay eliminated.
 
-        Args:
-            rows: (n, 2, N + 1) derivatives of what is seen by the unknowns; last, by what it is missed [px].
-            weight: (n,) of the observations.
-            lag_2: As of `weigh`.
+        `rows` (n, 2, N + 1): derivatives of what is seen by the unknowns; last, by what it is missed [px].
         """
         size = rows.shape[2]
         w = weight / (self._independent + lag_2)
@@ -322,25 +254,15 @@ _REPORTED = np.eye(_N)[:, :12]  # place, turn and their speeds
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A fitted pose at an epoch.
-
-    Attributes:
-        motion: Pose and derivatives.
-        cov: (12, 12) of place, turn, speed and turning.
-        cost: Robust cost, in units of chi square, priors included.
-        weight: (n,) of each observation, 0..1.
-        misfit: (n,) chi square of each observation's feature in its camera, per number measured.
-        residual_m: (n,) by how much each misses the object [m].
-        alone: The observations determine the pose, without the prior.
-    """
+    """A fitted pose at an epoch."""
 
     motion: Motion
-    cov: Float
-    cost: float
-    weight: Float
-    chi2: Float
-    residual_m: Float
-    measured_only: bool = True
+    cov: Float  # (12, 12) of place, turn, speed and turning
+    cost: float  # robust cost, in units of chi square, priors included
+    weight: Float  # (n,) of each observation, 0..1
+    chi2: Float  # (n,) of each observation's feature in its camera, per number measured
+    residual_m: Float  # (n,) by how much each misses the object [m]
+    measured_only: bool = True  # the observations determine the pose, without the prior
 
     @property
     def used(self) -> Bool:
@@ -360,12 +282,9 @@ class PoseFit:
     def __init__(
         self, cameras: tuple[CameraModel, ...], points: Float, radius_m: Float, floor_px: Float
     ) -> None:
-        """Set up.
+        """Set up for points (P, 3) [m], object frame, of radii (P,), 0: a corner.
 
-        Args:
-            cameras: Of the rig.
-            points: (P, 3) [m] of the object, `radius_m` (P,) of beads, 0: a corner.
-            floor_px: (P,) standard deviation of what light, lens and calibration leave, per point and camera.
+        `floor_px` (P,): standard deviation of what light, lens and calibration leave, per point and camera.
         """
         self._cameras, self._points, self._radius = Cameras(cameras), points, radius_m
         self._floor_2 = floor_px * floor_px
@@ -378,11 +297,7 @@ class PoseFit:
     ) -> Fitted | None:
         """Fit from a start; None: it leads nowhere (behind a camera, not determined).
 
-        Args:
-            seen: Observations.
-            start: At the epoch.
-            past: What else is known; None: nothing.
-            feature: (n,) of what each observation is a part: what is weighed down together with it in its camera.
+        `feature` (n,): of what each observation is a part, which is weighed down as a whole in its camera.
         """
         task = _Task(
             seen,
@@ -412,10 +327,7 @@ class PoseFit:
         return None if problem is None else self._mixed(problem, motion)
 
     def _mixed(self, problem: "_Problem", motion: Motion) -> Fitted | None:
-        """Return the mean over all degrees of vigour.
-
-        It is from the problem linearised at their solution for the most vigour.
-        """
+        """Return the mean over all degrees of vigour, linearised at that of the most."""
         # Unknowns are now the derivatives themselves: their priors are about 0.
         pull = problem.gradient + self._priors[-1] @ problem.rates + problem.normal @ problem.rates
         normal = problem.normal + self._priors
@@ -444,10 +356,7 @@ class PoseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """One linearised problem.
-
-    Normal matrix (30, 30) and gradient (30,) and what comes with them.
-    """
+    """One linearised problem: normal matrix (30, 30), gradient (30,), what follows."""
 
     normal: Float
     gradient: Float
@@ -460,25 +369,15 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """All of a fit that stays the same from round to round.
-
-    Attributes:
-        seen: Observations, n.
-        points: (n, 3) [m], object frame.
-        basis: (n, ORDERS) weights of the derivatives.
-        views: Their cameras.
-        sums: What adds them up.
-        past: What else is known.
-        prior: (30, 30) information on the derivatives.
-    """
+    """All of a fit that stays the same from round to round."""
 
     seen: Observations
-    points: Float
-    basis: Float
+    points: Float  # (n, 3) [m], object frame
+    basis: Float  # (n, ORDERS) weights of the derivatives
     views: Views
     sums: Sums
     past: Past | None
-    prior: Float
+    prior: Float  # (30, 30) information on the derivatives
 
     def linear(self, motion: Motion) -> _Problem | None:
         """The problem linearised at a motion; None: something is behind its camera."""
@@ -505,10 +404,7 @@ class _Task:
         return _Problem(normal, gradient - self.prior @ now, cost, now, weight, chi2, residual)
 
     def _rows(self, by_place: Float, by_rotation: Float, rotation: Float, theta: Float, miss: Float) -> Float:
-        """Return (n, 2, 31) derivatives by all unknowns, and the residual.
-
-        The unknowns are position and rotation of each order; then comes the residual.
-        """
+        """Return (n, 2, 31) derivatives by position, rotation of each order; residual."""
         rows = np.empty((len(miss), 2, _N + 1))
         rows[..., _N] = miss
         rows[..., :3] = by_place
@@ -526,7 +422,6 @@ def _precision(level: int) -> Float:
     """Diagonal prior (30, 30) of the derivatives at one degree of vigour."""
     acceleration = _ACCELERATION[level]
     w_per_s = 18.0  # jerk by acceleration, and snap by jerk: as hands do
-    sizes = np.stack(
-        [_SPEED[level], acceleration, acceleration * w_per_s, acceleration * w_per_s**2]
-    )  # (4, 2): of place and turn
+    # (4, 2): of place and turn
+    sizes = np.stack([_SPEED[level], acceleration, acceleration * w_per_s, acceleration * w_per_s**2])
     return np.diag(np.concatenate([_LEAST, (1.0 / sizes**2).repeat(3, axis=1).ravel()]))

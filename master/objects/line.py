@@ -1,32 +1,20 @@
 """The pipeline of one object fits, filters and extrapolates its pose.
 
-Filter that smooths the pose of an object as it arrives.
+Detections of markers and tags go in, the pose at every frame of the leading camera comes out. `ObjectLine` is
+a push machine without clock, socket or thread. For each epoch (`master.objects.window`) the pose is fitted
+(`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most
+of what is seen in the wrong place, from what is seen alone (`master.objects.association`), the best of all
+starts.
 
-An object at rest thus does not tremble.
+**Too little is seen** to determine all of it, as two beads of three: then the prior estimate counts as well,
+as it was at a time before all frames of this fit, so that nothing counts twice. **One tag** has two poses
+that nearly explain it (`SingleTag`). **Nothing is seen**: the pose is led on with dying speed, and after
+`HELD_S` there is none.
 
-The 1 € filter of its rig, as of the hand (`master.estimator.smoothing`), with position and rotation as its groups
-and the noise as it is measured. The position is that of the middle of the features, about which the rotation is
-unsure; at the object's own origin, a lever away, the noise of the rotation would shake the position as well. A
-rotation counts by how far it moves what is a decimetre away.
-
-Where an object went: the last poses that were fitted, and where they lead it.
-
-Led on for a fit, for what is seen too little of it, and for what is shown while nobody sees it: then its speed dies.
-
-Pipeline of one object.
-
-Detections of markers and tags go in, its pose at every frame of the leading camera comes out.
-
-`ObjectLine` is a push machine without clock, socket or thread. For each epoch (`master.objects.window`) the pose is
-fitted (`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most of
-what is seen in the wrong place, from what is seen alone (`master.objects.association`), the best of all starts.
-
-**Too little is seen** to determine all of it, as two beads of three: then the prior estimate counts as well
-(`master.objects.line`), as it was at a time before all frames of this fit, so that nothing counts twice.
-
-**One tag** has two poses that nearly explain it (`master.objects.association`).
-
-**Nothing is seen**: the pose is led on with dying speed, and after `HELD_S` there is none.
+The 1 € filter is that of the rig, as of the hand (`master.estimator.smoothing`), with position and rotation
+as its groups and the noise as it is measured. The position is that of the middle of the features, about which
+the rotation is unsure; at the object's own origin, a lever away, the noise of the rotation would shake the
+position as well. A rotation counts by how far it moves what is a decimetre away.
 """
 
 from collections import deque
@@ -56,18 +44,10 @@ from master.objects.window import Hidden, Window, Windows
 
 
 class PoseFilter:
-    """1 € filter of an object's pose.
-
-    Push machine. Holds the filter, the measured noise, and the pose that it output last.
-    """
+    """Push machine: 1 € filter of an object's pose; holds noise and the last output."""
 
     def __init__(self, middle_m: Float, parameters: OneEuroParameters) -> None:
-        """Set up.
-
-        Args:
-            middle_m: (3,) middle of the features, object frame [m].
-            parameters: Of the 1 € filter [m, s].
-        """
+        """Set up; `middle_m` (3,): of the features, object frame; parameters in [m, s]."""
         self._middle, self._parameters = middle_m, parameters
         self._filter: OneEuro | None = None
         self._noise = NoiseEstimator()
@@ -89,10 +69,6 @@ class PoseFilter:
         self._values, self._t_ns = values, t_ns
         return rigid(self._R, values[:3] - self._R @ self._middle)
 
-    def held(self, t_ns: int, T: Float) -> Float:
-        """The pose to show of one that was led on: as it is."""
-        return T
-
     def forget(self) -> None:
         """Begin anew with the next pose."""
         self._filter = None
@@ -108,17 +84,12 @@ _SIX, _TWELVE = np.arange(6), np.arange(12)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """A pose that was fitted."""
-
     t_ns: int
     fitted: Fitted
 
 
 class Trajectory:
-    """Recent fitted poses of an object, sixteen at most.
-
-    Push machine. Also holds when a pose was last fully constrained by the observations alone.
-    """
+    """Push machine: sixteen fitted poses, and when one was last fully constrained."""
 
     def __init__(self) -> None:
         poses = 16
@@ -126,14 +97,10 @@ class Trajectory:
         self._sure_ns = -(2**63)
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
         return bool(self._known)
 
     def push(self, t_ns: int, fitted: Fitted) -> bool:
-        """Add the pose of an epoch.
-
-        False: the pose has not been fully constrained for too long, and all poses are forgotten.
-        """
+        """Add a pose; False: not fully constrained for too long, all are forgotten."""
         self._known.append(_Known(t_ns, fitted))
         if fitted.measured_only:
             self._sure_ns = t_ns
@@ -162,10 +129,7 @@ class Trajectory:
         return last.fitted.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
 
     def past(self, t_ns: int, oldest_ns: int) -> Past:
-        """Return the prior at an epoch from before all that is seen around it.
-
-        The oldest of these observations is at `oldest_ns`.
-        """
+        """Return the prior at an epoch, from before its oldest observation."""
         known = next((k for k in reversed(self._known) if k.t_ns <= oldest_ns), self._known[0])
         dt = max((t_ns - known.t_ns) * 1e-9, 1e-3)
         step = np.eye(12)
@@ -175,10 +139,7 @@ class Trajectory:
         return Past(known.fitted.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
 
     def held_cov(self, t_ns: int) -> Float | None:
-        """Return the covariance (6, 6) of the pose predicted without observations.
-
-        None: the pose is no longer to be held.
-        """
+        """Return the covariance (6, 6) predicted unobserved; None: to be held no more."""
         if not self._known or self.unsure_s(t_ns) > HELD_S:
             return None
         known = self._known[-1]
@@ -193,16 +154,10 @@ class Trajectory:
 def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
     """Grow a fit's covariance in the directions the observations do not constrain.
 
-    By what may have happened in these directions for so long [s].
-
-    A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
-    rest on: its covariance grows as that of a thing that nobody sees.
-
-    Args:
-        fitted: With the past.
-        alone: Without.
-        since_s: For how long.
-        poor_m: What is less sure than this is not reported [m].
+    By what may have happened there for `since_s`. A turn about the line through two beads shows in nothing
+    but what it does to other turns, which is too little to rest on: its covariance grows as that of a thing
+    that nobody sees. `measured` is `fitted` without the past; what is less sure than `poor_m` is not
+    reported.
     """
     size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
     unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
@@ -222,30 +177,19 @@ _TRACKED_RAD = np.radians(10.0)  # less sure than this is led on rather than mea
 
 @dataclass(frozen=True, slots=True)
 class SolvedObject:
-    """A pose of an object, with its latest input time.
-
-    That is when the last frame that contributed to it was handed to its slave [ns].
-    """
+    """A pose, and when its last contributing frame was handed to its slave."""
 
     pose: ObjectPose
     ready_t_ns: int
 
 
 class ObjectLine:
-    """Pipeline of one object from observations to poses.
-
-    Push machine. Holds the observations that wait, where the object went, the filter, and how sure a tag's pose is.
-    """
+    """Push machine: observations of one object to poses, fitted, filtered, led on."""
 
     def __init__(
         self, profile: ObjectProfile, rig: RigCalibration, models: Mapping[str, CameraModel]
     ) -> None:
-        """Set up.
-
-        Args:
-            profile: The object; it has beads or tags.
-            rig: Whose markers its beads are.
-            models: The rig's cameras by name, in its order.
+        """Set up an object of beads or tags in a rig, whose cameras are `models`.
 
         Raises:
             CalibrationError: A bead is none of the rig's markers.
@@ -328,10 +272,7 @@ class ObjectLine:
         return ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
 
     def _found(self, window: Window, seen: Association, predicted: Motion | None) -> Fitted | None:
-        """Return the pose at the epoch.
-
-        None: what is seen is not the object, or does not constrain its pose.
-        """
+        """Return the pose; None: it is not the object, or not constrained."""
         if predicted is not None:
             led = self._fitted(seen, predicted, window.t_ns, led=True)
             if led is not None and self._holds(seen, led):
@@ -361,9 +302,7 @@ class ObjectLine:
     def _fitted(self, seen: Association, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
         """Fit the pose, with the past as prior where the present is too weak.
 
-        The past is used only for a pose that was predicted (`led`), where the present does not constrain enough.
-
-        How it may have moved since is then in it.
+        Only of a pose that was predicted (`led`). How it may have moved since is then in it.
         """
         measured = self._fit(seen.seen, start, feature=seen.feature)
         poor_m = 6e-3  # less sure than this: the past counts
@@ -413,20 +352,9 @@ class ObjectLine:
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
         )
         self._lost_behind = shown.occluded
-        T = self._filter.held(window.t_ns, predicted.T)
-        return ObjectPose(
-            object=self.name,
-            t_ns=window.t_ns,
-            position_m=T[:3, 3],
-            orientation_wxyz=matrix_to_quaternion(T[:3, :3]),
-            cov=cov,
-            residual_m=np.nan,
-            source=int(ObjectSource.HELD),
-            tracked=False,
-            seen=0,
-            expected=shown.expected,
-            occluded=shown.occluded,
-        )
+        T, source = predicted.T, int(ObjectSource.HELD)
+        pose = self.name, window.t_ns, T[:3, 3], matrix_to_quaternion(T[:3, :3]), cov
+        return ObjectPose(*pose, np.nan, source, False, 0, shown.expected, shown.occluded)
 
     def _glimpsed(self, window: Window) -> bool:
         """Whether a camera sees some of the beads and not all, while there is no pose."""
@@ -438,16 +366,6 @@ class ObjectLine:
     def _none(self, window: Window) -> ObjectPose:
         """No pose; what hid it when it was lost is taken to hide it still."""
         self._filter.forget()
-        return ObjectPose(
-            object=self.name,
-            t_ns=window.t_ns,
-            position_m=np.full(3, np.nan),
-            orientation_wxyz=np.full(4, np.nan),
-            cov=np.full((6, 6), np.nan),
-            residual_m=np.nan,
-            source=int(ObjectSource.NONE),
-            tracked=False,
-            seen=0,
-            expected=0,
-            occluded=self._lost_behind or self._glimpsed(window),
-        )
+        nowhere = np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan), np.nan
+        source, occluded = int(ObjectSource.NONE), self._lost_behind or self._glimpsed(window)
+        return ObjectPose(self.name, window.t_ns, *nowhere, source, False, 0, 0, occluded)

@@ -1,29 +1,20 @@
 """An object has a surface and features, and occludes some of them.
 
-All parts of one kind of an object's surface, as arrays.
+An object is a union of boxes, closed cylinders and balls, each convex. Outside of all the distance to the
+union is the least of theirs, exactly; inside of two at once it is that of the one whose surface is farther,
+which is a bound.
 
-They give distances to them, nearest points on them, and intersections of rays with them.
+A body of round cones is a union of balls along its bones, so its distance to a surface is the least of
+"distance of the middle less radius" along the bone (`nearest_to_capsules`). For one convex part that is a
+convex function of where on the bone, which a search on a grid and a second on the cell around its best
+narrows to a 256th of the bone.
 
-Each part is about its own origin, along its own axes. Coordinates come first in `own` (K, D, N), so that sums over them
-are sums of rows: a hand asks for hundreds of points at once, and most of what that costs is the number of calls.
+`Features`: a camera is *expected* to see a feature that lies in its image, is turned to it, is large enough
+and is not behind the object itself. Some are at the edge of that, and a slave may find them or not: that
+these are missing is no evidence.
 
-Surface of an object: distances of points, and occlusion.
-
-How far points are from it, and what it hides from an eye.
-
-An object is a union of boxes, closed cylinders and balls, each convex. Outside of all the distance to the union is the
-least of theirs, exactly; inside of two at once it is that of the one whose surface is farther, which is a bound.
-
-A body of round cones is a union of balls along its bones, so its distance to a surface is the least of "distance of the
-middle less radius" along the bone (`nearest_to_capsules`). For one convex part that is a convex function of where on
-the bone, which a search on a grid and a second on the cell around its best narrows to a 256th of the bone.
-
-Visible features of an object.
-
-Its beads and the corners of its tags are one list of points; it states which of them face a camera.
-
-A camera is *expected* to see a feature that lies in its image, is turned to it, is large enough and is not behind the
-object itself. Some are at the edge of that, and a slave may find them or not: that these are missing is no evidence.
+`Parts`: coordinates come first in `own` (K, D, N), so that sums over them are sums of rows: a hand asks for
+hundreds of points at once, and most of what that costs is the number of calls.
 """
 
 from collections.abc import Sequence
@@ -59,18 +50,14 @@ class Parts(Protocol):
         ...
 
     def feet(self, part: Int, own: Float) -> Float:
-        """Return nearest points (N, 3) on the surfaces of parts (N,) to points (N, 3).
-
-        Each is in the frame of its part.
-        """
+        """Return nearest surface points (N, 3) of parts (N,) to points, part frames."""
         ...
 
     def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """Return from where to where rays are inside a part.
+        """Return from where to where rays are inside a part, a little below its skin.
 
-        The rays are ways (K, 3, N) from starts (K, 3); inside is a little below the part's skin.
-
-        Both (K, N) are shares of the way; where the second is not above the first, the sight passes by.
+        Ways (K, 3, N) from starts (K, 3). Both (K, N) are shares of the way; where the second is not above
+        the first, the sight passes by.
         """
         ...
 
@@ -158,10 +145,7 @@ def by_kind(shapes: Sequence[Shape]) -> list[tuple[list[Shape], Parts]]:
 
 
 def _feet_of_box(half: Float, points: Float) -> Float:
-    """Return nearest points (N, D) on the surfaces of boxes.
-
-    The boxes have these halves of their sides (N, D), of any dimension.
-    """
+    """Return nearest points (N, D) on boxes of these halves of their sides (N, D)."""
     foot = np.minimum(np.maximum(points, -half), half)
     inside = np.flatnonzero((foot == points).all(axis=1))
     if len(inside):
@@ -173,10 +157,7 @@ def _feet_of_box(half: Float, points: Float) -> Float:
 
 
 def _through_slabs(half: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """Intersect rays with slabs, as `Parts.through`.
-
-    The slabs are between planes at plus and minus `half` (K, D) along each axis.
-    """
+    """Intersect rays, as `Parts.through`, with slabs between planes at +- `half`."""
     by = np.where(np.abs(way) > _TINY, way, _TINY)
     one, other = (-half - start)[:, :, None] / by, (half - start)[:, :, None] / by
     return np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
@@ -204,17 +185,11 @@ _GRID: Float = np.linspace(0.0, 1.0, _STEPS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nearest:
-    """Where a surface is nearest to something.
+    """Where a surface is nearest to something."""
 
-    Attributes:
-        distance_m: (N,) negative inside; inf: there is no surface.
-        point_m: (N, 3) on the surface, object frame.
-        along: (N,) where on the bone the nearest ball is, 0..1.
-    """
-
-    distance_m: Float
-    point_m: Float
-    along: Float
+    distance_m: Float  # (N,) negative inside; inf: there is no surface
+    point_m: Float  # (N, 3) on the surface, object frame
+    along: Float  # (N,) where on the bone the nearest ball is, 0..1
 
 
 class _PosedSurface:
@@ -231,10 +206,7 @@ class _PosedSurface:
         return self._R @ points.T + self._t[:, :, None]
 
     def feet(self, part: Int, points: Float) -> Float:
-        """Return the nearest surface points (N, 3) to points (N, 3).
-
-        On the surfaces of some of the parts (N,), all in the object frame.
-        """
+        """Return nearest surface points (N, 3) of parts (N,) to points, object frame."""
         R, t = self._R[part], self._t[part]
         foot = self.parts.feet(part, (R @ points[..., None])[..., 0] + t)
         return ((foot - t)[:, None] @ R)[:, 0]
@@ -255,14 +227,10 @@ class Surface:
         self._kinds = [_PosedSurface(shapes, kind) for shapes, kind in by_kind(parts)]
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
         return bool(self._kinds)
 
     def nearest(self, points: Float) -> tuple[Float, Float]:
-        """Return the distances (N,) [m] and nearest surface points of points (N, 3).
-
-        Points in [m]; distances are negative inside; the surface points are (N, 3).
-        """
+        """Return distances (N,) [m], negative inside, and nearest surface points (N, 3)."""
         best, at = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
         for kind in self._kinds:
             each = kind.parts.distances(kind.own(points))
@@ -287,10 +255,7 @@ class Surface:
         along, scale_up = capsules.stop_m - capsules.start_m, capsules.stop_radius_m - capsules.start_radius_m
 
         def least(share: Float) -> tuple[Int, Float]:
-            """Return which ball on each bone is nearest to the surface, and its gap (N,).
-
-            The balls are at positions (N, S) along the bones.
-            """
+            """Return the ball at (N, S) of each bone nearest to the surface, its gap (N,)."""
             middle = capsules.start_m[:, None] + share[..., None] * along[:, None]
             radius = capsules.start_radius_m[:, None] + share * scale_up[:, None]
             gap = self.distances(middle.reshape(-1, 3)).reshape(share.shape) - radius
@@ -305,10 +270,7 @@ class Surface:
         return Nearest(gap, self.nearest(capsules.start_m + associated[:, None] * along)[1], associated)
 
     def hides(self, eye: Float, points: Float) -> Bool:
-        """Return a mask (...) of the points that the object hides from an eye.
-
-        Eye (3,) [m] and points (..., 3) [m] in the object frame; True where the object itself is between them.
-        """
+        """Return a mask (...) of points (..., 3) hidden from an eye (3,), object frame."""
         flat = points.reshape(-1, 3)
         hidden = np.zeros(len(flat), np.bool_)
         if len(flat):
@@ -330,29 +292,17 @@ _BULGE: Float = np.sqrt(1.0 - (_DISC * _DISC).sum(axis=1))[:, None]  # of a ball
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """The points of an object.
+    """The points of an object."""
 
-    Attributes:
-        names: (F,) of beads, then of tags.
-        points: (P, 3) [m], object frame: one of each bead, four corners of each tag.
-        feature: (P,) to which feature each belongs.
-        radius_m: (P,) of beads; 0: a corner.
-        rows: (B,) which rows of `MarkerDetections` are the beads.
-        tag_ids: (N,) numbers of the tags.
-        normals: (F, 3) outward of tags; 0: a bead.
-        cells: Along an edge of a tag, its black border included; 0: there are none.
-        surface: What hides features of the object itself.
-    """
-
-    names: tuple[str, ...]
-    points: Float
-    feature: Int
-    radius_m: Float
-    rows: Int
-    tag_ids: tuple[int, ...]
-    normals: Float
-    cells: int
-    surface: Surface
+    names: tuple[str, ...]  # (F,) of beads, then of tags
+    points: Float  # (P, 3) [m], object frame: one of each bead, four corners of each tag
+    feature: Int  # (P,) to which feature each belongs
+    radius_m: Float  # (P,) of beads; 0: a corner
+    rows: Int  # (B,) which rows of `MarkerDetections` are the beads
+    tag_ids: tuple[int, ...]  # (N,)
+    normals: Float  # (F, 3) outward of tags; 0: a bead
+    cells: int  # along an edge of a tag, its black border included; 0: there are none
+    surface: Surface  # what hides features of the object itself
 
     @classmethod
     def of(cls, profile: ObjectProfile, markers: tuple[str, ...]) -> "Features":
@@ -407,12 +357,8 @@ class Features:
     def expected(self, T_rig_object: Float, camera: CameraModel, ease: float = 1.0) -> Bool:
         """Return (F,) which features a camera sees of the object at a pose (4, 4).
 
-        Nothing is in front of the object.
-
-        Args:
-            T_rig_object: The pose.
-            camera: The camera.
-            ease: By what all that is asked of a feature is multiplied; below 1 those are returned that may be seen.
+        Nothing is in front of the object. `ease`: by what all that is asked of a feature is multiplied; below
+        1 those are returned that may be seen.
         """
         eye = (camera.centre - T_rig_object[:3, 3]) @ T_rig_object[:3, :3]
         uv = camera.project(transform(T_rig_object, self.points))
@@ -427,10 +373,7 @@ class Features:
         return shows
 
     def _tags_show(self, eye: Float, uv: Float, ease: float) -> Bool:
-        """Return (N,) which tags face an eye and are large in its image.
-
-        The eye is (3,) [m], object frame; the image is (P, 2) [px].
-        """
+        """Return (N,) which tags face an eye (3,), object frame, large in image (P, 2)."""
         count = len(self.tag_ids)
         if not count:
             return np.zeros(0, np.bool_)
@@ -452,10 +395,7 @@ class Features:
         )
 
     def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
-        """Return (B,) which beads an eye sees.
-
-        They are large enough for an eye (3,) [m], object frame, and not behind the object.
-        """
+        """Return (B,) which beads are large for an eye (3,), and not behind the object."""
         if not self.beads:
             return np.zeros(0, np.bool_)
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]

@@ -1,17 +1,15 @@
 """Tracker line of one object: device poses in, object pose in the rig out.
 
-The device is one that tracks itself.
-
     T_rig_object(t) = T_rig_tracking T_tracking_device(t) inv(T_object_tracker)
 
-No cameras, and so no epochs of theirs: each pose of the device is one of the object, at its own time, which is the
-stamp and `stamp_offset_us`. How sure it is the registration knows: what was left of it against the cameras, which has
-the device's jitter in it, and how sure it is itself; both are of the object's own frame, the lever from the device to
-it included. The cameras' errors are in it, too, so the covariance is rather too large than too small.
+The device tracks itself: each of its poses is one of the object, at its own time, which is the stamp and
+`stamp_offset_us`. Its covariance is the registration's: what was left of it against the cameras, which has
+the device's jitter and the cameras' errors in it, and its own; both are of the object's own frame, the lever
+included.
 
-**It has lost itself**, or its base stations: the last pose is held, ever less sure, for half a second; then there is
-none. **It leaps**, as it does by a mirror: a pose that no hand could have carried it to is passed over, unless it stays
-there. Nothing measures how the pose misses anything, so `residual_m` is NaN.
+**It has lost itself**, or its base stations: the last pose is held, ever less sure, for half a second; then
+there is none. **It leaps**, as it does by a mirror: a pose that no hand could have carried it to is passed
+over, unless it stays there. Nothing measures how the pose misses anything, so `residual_m` is NaN.
 """
 
 from collections import Counter
@@ -38,20 +36,14 @@ def registered(profile: ObjectProfile, rig: RigCalibration) -> bool:
 
 
 class TrackerLine:
-    """Converter of one tracker's device poses to object poses.
+    """Push machine: one tracker's device poses to object poses.
 
-    Push machine. Holds the last pose, since when there is none, and a leap that is not accepted yet.
-
-    Attributes:
-        counts: Poses that were `lost`, and those passed over as a `leap`, or because they were `late` or broken.
+    Holds the last pose, since when there is none, and a leap that is not accepted yet. Counts poses that were
+    `lost`, and those passed over as a `leap`, or because they were `late` or `broken`.
     """
 
     def __init__(self, profile: ObjectProfile, rig: RigCalibration) -> None:
-        """Set up.
-
-        Args:
-            profile: The object; it has a tracker, and defines where that sits.
-            rig: It defines where the tracking system lies.
+        """Set up an object with a tracker; the rig defines where the tracking lies.
 
         Raises:
             CalibrationError: The tracker is not registered yet.
@@ -74,9 +66,7 @@ class TrackerLine:
         self.counts: Counter[str] = Counter()
 
     def push(self, message: TrackerPose) -> list[SolvedObject]:
-        """Take one device pose on the master's clock; return the object's pose.
-
-        Returns none if it came too late.
+        """Take a device pose on the master's clock; return the object's, if not late.
 
         Raises:
             ValueError: It is of another device.
@@ -98,10 +88,7 @@ class TrackerLine:
         return []
 
     def _measured(self, t_ns: int, message: TrackerPose) -> ObjectPose | None:
-        """Return the object's pose from a device pose, or None.
-
-        None: the device has lost tracking, or what it reports is impossible.
-        """
+        """Return the object's pose; None: tracking is lost, or the report impossible."""
         place, quaternion = message.position_m, message.orientation_wxyz
         if np.isnan(place).any() or np.isnan(quaternion).any():
             self.counts["lost"] += 1
@@ -133,10 +120,7 @@ class TrackerLine:
         return pose
 
     def _leaps(self, t_ns: int, place_m: Float) -> bool:
-        """Check for a leap that no hand could make since the last pose.
-
-        A leap is refused for a while; after that the new position is accepted.
-        """
+        """Check for a leap that no hand could make; after a while it is accepted."""
         if self._last is None:
             return False
         way = _distance(place_m, self._last.position_m)
@@ -184,10 +168,7 @@ def _distance(one_m: Float, other_m: Float) -> float:
 
 
 def covariance_of(profile: ObjectProfile) -> Float:
-    """Return the covariance (6, 6) of an object's pose from its tracker.
-
-    Of position and small rotation, by the figures of its registration.
-    """
+    """Return a tracked pose's covariance (6, 6), by the figures of its registration."""
     how = profile.provenance.get("T_object_tracker")
     residual = {} if how is None else how.residual
     place_m = np.hypot(residual.get("position_mm", 0.0), residual.get("position_sigma_mm", 0.0)) * 1e-3

@@ -1,23 +1,16 @@
 """A window holds the observations of one object around an epoch.
 
-Observations of one object around an epoch, from all cameras of a rig.
-
-Also when an epoch has all the observations that it will get.
-
 An epoch is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
-`master.fabrik.sync`. It is complete when every other camera has delivered a frame at or after it, its tags included
-where the object has tags: those of a frame have come, or never will, when the markers of the next are there. It is due
-when the message time has passed its deadline. Message time is the newest capture time: no clock is read.
+`master.fabrik.sync`. It is complete when every other camera has delivered a frame at or after it, its tags
+included where the object has tags: those of a frame have come, or never will, when the markers of the next
+are there. It is due when the message time has passed its deadline. Message time is the newest capture time:
+no clock is read. Nothing is carried to the epoch here: every point keeps the time of its own row
+(`master.objects.fit`).
 
-Nothing is carried to the epoch here: every point keeps the time of its own row (`master.objects.fit`).
-
-Occluded features of an object.
-
-What each camera should see of it is compared with what it sees.
-
-A feature that a camera should see and does not is hidden, and so is a bead that shows much less of its disc than it has
-shown: how much of a ball counts as painted depends on light and colour, so each bead in each camera is compared with
-what it shows when it is whole, which is learnt as the larger part of what it has shown.
+A feature that a camera should see and does not is hidden, and so is a bead that shows much less of its disc
+than it has shown: how much of a ball counts as painted depends on light and colour, so each bead in each
+camera is compared with what it shows when it is whole, which is learnt as the larger part of what it has
+shown.
 """
 
 from collections import deque
@@ -39,55 +32,34 @@ _DEADLINE = 1.25  # periods
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservation:
-    """One camera's observation of the object in one frame.
+    """One camera's observation of K points in one frame, by markers or by tags."""
 
-    By markers or by tags; K points that it looked for.
-
-    Attributes:
-        centre_ns: When its centre row was exposed.
-        ready_t_ns: When the frame was handed to its slave.
-        point: (K,) rows of `Features.points`.
-        uv: (K, 2) [px] as from a lens that keeps blobs in their place; NaN: not seen.
-        alt_uv: (K, 2) [px] second places; NaN: none.
-        t_ns: (K,) when the rows were exposed [ns], from the first frame of all.
-        sigma_px: (K,), t_sigma_s: the same for all.
-        area_px2: (K,) of blobs; NaN: a corner.
-    """
-
-    centre_ns: int
-    ready_t_ns: int
-    point: Int
-    uv: Float
-    alt_uv: Float
-    t_ns: Float
-    sigma_px: Float
-    t_sigma_s: float
-    area_px2: Float
+    centre_ns: int  # when its centre row was exposed
+    ready_t_ns: int  # when the frame was handed to its slave
+    point: Int  # (K,) rows of `Features.points`
+    uv: Float  # (K, 2) [px] as from a lens that keeps blobs in their place; NaN: not seen
+    alt_uv: Float  # (K, 2) [px] second places; NaN: none
+    t_ns: Float  # (K,) when the rows were exposed [ns], from the first frame of all
+    sigma_px: Float  # (K,)
+    t_sigma_s: float  # the same for all
+    area_px2: Float  # (K,) of blobs; NaN: a corner
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """All observations around an epoch.
 
-    Attributes:
-        t_ns: The epoch, master's clock.
-        origin_ns: The first frame of all, to which the times of observations count.
-        views: Of each camera up to four observations by markers and four by tags, each kind the nearest first.
-        ready_t_ns: When the last contributing frame was handed to its slave.
-        period_ns: From frame to frame, of the slowest camera.
+    `views` of each camera: up to four observations by markers and four by tags, each kind the nearest first.
     """
 
-    t_ns: int
-    origin_ns: int
+    t_ns: int  # the epoch, master's clock
+    origin_ns: int  # the first frame of all, to which the times of observations count
     views: tuple[tuple[tuple[ImageObservation, ...], tuple[ImageObservation, ...]], ...]
-    ready_t_ns: int
-    period_ns: int
+    ready_t_ns: int  # when the last contributing frame was handed to its slave
+    period_ns: int  # from frame to frame, of the slowest camera
 
     def near(self, camera: int, kind: int) -> ImageObservation | None:
-        """Return the observation that shows what a camera sees at the epoch.
-
-        None: the camera did not look.
-        """
+        """Return a camera's observation at the epoch; None: it did not look."""
         views = self.views[camera][kind]
         if not views or abs(views[0].centre_ns - self.t_ns) > _DEADLINE * self.period_ns:
             return None
@@ -95,10 +67,7 @@ class Window:
 
 
 class Windows:
-    """Collector of observations into epochs.
-
-    Push machine. Holds the last observations of each camera and the epochs that wait.
-    """
+    """Push machine: observations to epochs; holds the last of each camera."""
 
     def __init__(
         self,
@@ -108,13 +77,9 @@ class Windows:
         predict: bool = False,
         late_ns: Mapping[str, int] | None = None,
     ) -> None:
-        """Take the cameras in the rig's order.
+        """Take the cameras in the rig's order; `late_ns`: frames are later than stamps.
 
-        Args:
-            cameras: Camera name -> model.
-            features: Of the object.
-            predict: Do not wait for a camera whose last frame is nearer to the epoch than its next.
-            late_ns: Camera -> how much later its frames are than their stamps.
+        `predict`: do not wait for a camera whose last frame is nearer to the epoch than its next.
         """
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
         self._features, self._predict, self._late_ns = features, predict, dict(late_ns or {})
@@ -129,9 +94,7 @@ class Windows:
         self._newest_ns = self._emitted_ns = -(2**63)
 
     def push(self, message: MarkerDetections | TagDetections) -> list[Window]:
-        """Take one camera's detections; return the epochs now complete or due.
-
-        Oldest first.
+        """Take one camera's detections; return epochs complete or due, oldest first.
 
         Raises:
             ValueError: The camera is not of this rig.
@@ -194,11 +157,8 @@ class Windows:
             both = np.stack([message.uv[rows], message.alt_uv[rows]])
             if self._shift[c].any and len(rows):
                 # Of an alternative the area is not reported: about that of the marker.
-                both = (
-                    self._shift[c]
-                    .centres(both.reshape(1, -1, 2), np.tile(area, 2)[None])[0]
-                    .reshape(both.shape)
-                )
+                centres = self._shift[c].centres(both.reshape(1, -1, 2), np.tile(area, 2)[None])
+                both = centres[0].reshape(both.shape)
             uv, alternative = both
         return ImageObservation(
             centre_ns=centre_ns,
@@ -213,18 +173,12 @@ class Windows:
         )
 
     def _corners(self, message: TagDetections) -> tuple[Int, Float, Float]:
-        """Return the tag corners of the object that a frame shows.
-
-        Point indices (4 N), their image positions (4 N, 2) and sigmas.
-        """
+        """Return a frame's tag corners: points (4 N), places (4 N, 2), sigmas."""
+        features, ids = self._features, self._features.tag_ids
         found = [
-            (
-                self._features.corners_of(self._features.tag_ids.index(number)),
-                message.uv[k],
-                message.sigma_px[k],
-            )
+            (features.corners_of(ids.index(number)), message.uv[k], message.sigma_px[k])
             for k, number in enumerate(message.ids.tolist())
-            if number in self._features.tag_ids
+            if number in ids
         ]
         if not found:
             return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
@@ -287,10 +241,7 @@ def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[Im
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Count of seen and of expected features.
-
-    Also whether something hides a part.
-    """
+    """Count of seen and of expected features, and whether a part is hidden."""
 
     seen: int
     expected: int
@@ -298,24 +249,14 @@ class Seen:
 
 
 class Hidden:
-    """Detector of occluded features.
-
-    Push machine. Holds how much of its disc each bead shows in each camera when it is whole.
-    """
+    """Push machine: occluded features; holds how much of a whole bead cameras see."""
 
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...]) -> None:
-        """Set up."""
         self._features, self._cameras = features, cameras
         self._whole = np.full((len(cameras), features.beads), np.nan)
 
     def look(self, window: Window, T_rig_object: Float, used: Bool) -> Seen:
-        """Judge the occlusion at an epoch.
-
-        Args:
-            window: What was looked for.
-            T_rig_object: (4, 4) the pose.
-            used: (C, F) what the pose rests on in the nearest frames.
-        """
+        """Judge the occlusion of a pose; `used` (C, F): what it rests on, nearest frames."""
         beads = self._features.beads
         expected, occluded = np.zeros(used.shape, np.bool_), False
         for c, camera in enumerate(self._cameras):
@@ -334,8 +275,6 @@ class Hidden:
     def centroid_sigma_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
         """Return the centroid error [px] of beads (..., B) in camera `c` by occlusion.
 
-        It is by how much the centroids may be off, as something hides a part of the beads.
-
         Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.
         """
         share, radius_px = self._share(c, T_rig_object, area_px2)
@@ -344,18 +283,12 @@ class Hidden:
         return np.where(missing > 0.0, np.minimum(missing, 1.0) * radius_px, 0.0)  # NaN: not known, 0
 
     def _share(self, c: int, T: Float, area_px2: Float) -> tuple[Float, Float]:
-        """Return the share of their discs that beads show, and the disc radii (B,) [px].
-
-        The shares (..., B) are of beads of these areas [px^2].
-        """
+        """Return (..., B) shares of discs that beads of areas [px^2] show; radii (B,)."""
         rows = slice(0, self._features.beads)
         camera = self._cameras[c]
         line_of_sight = self._features.points[rows] @ T[:3, :3].T + (T[:3, 3] - camera.centre)
-        radius = (
-            self._features.radius_m[rows]
-            * camera.matrix[0, 0]
-            / np.sqrt(np.vecdot(line_of_sight, line_of_sight))
-        )
+        distance = np.sqrt(np.vecdot(line_of_sight, line_of_sight))
+        radius = self._features.radius_m[rows] * camera.matrix[0, 0] / distance
         return area_px2 / (np.pi * radius * radius), radius
 
     def _partly(self, c: int, T: Float, markers: ImageObservation, seen: Bool) -> bool:

@@ -1,21 +1,8 @@
 """The master publishes results and tracker poses on the bus and asks cameras.
 
-Output interface of the master for hands, objects, contact and gestures.
-
-Behind it are a file, the bus, and any later output.
-
-Bus output of hands, objects, contact and gestures.
-
-For the viewer and for any program of the user.
-
-Publisher of tracker poses on the master's clock.
-
-For registering a tracker: `phalanx calibrate tracker --live`.
-
-A tracker's poses come as datagrams, to the master alone, and mean nothing in the rig until it is registered. So that
-the registration can see them beside the objects' poses without being a master itself, they go on the bus as they came.
-
-Asks the cameras for their pictures as long as somebody looks.
+A tracker's poses come as datagrams, to the master alone, and mean nothing in the rig until it is registered.
+So that the registration (`phalanx calibrate tracker --live`) sees them beside the objects' poses without
+being a master itself, they go on the bus as they came.
 """
 
 import logging
@@ -30,10 +17,7 @@ from common.messages import Command, Contact, Gesture, HandPose, ResultMessage, 
 
 
 class Sink(Protocol):
-    """Output that takes the results of the master.
-
-    Those of each hand and object come in the order of their time. Opened by its constructor.
-    """
+    """Output that takes the master's results, of each hand and object in time order."""
 
     def write(self, message: ResultMessage) -> None:
         """Take one message. What a sink is not for, it leaves alone.
@@ -44,9 +28,7 @@ class Sink(Protocol):
         ...
 
     def close(self) -> None:
-        """Finish writing.
-
-        What was written is complete and readable from here on. Safe to call twice.
+        """Finish writing: what was written is complete and readable. Safe to call twice.
 
         Raises:
             PhalanxError: The result could not be completed; nothing half written is left.
@@ -58,22 +40,13 @@ _STREAM = {HandPose: "hand", Contact: "contact", Gesture: "gesture"}
 
 
 class BusSink:
-    """A `Sink` that publishes each message on the bus.
-
-    On the stream of its type, under the name of its hand or object.
-
-    The bus belongs to the caller.
-    """
+    """A `Sink` that publishes on the caller's bus, on the stream of each type."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
 
     def write(self, message: ResultMessage) -> None:
-        """Publish the message; a slow or absent reader never delays the master.
-
-        Raises:
-            BusError: The bus is closed.
-        """
+        """Publish the message; a slow or absent reader never delays the master."""
         if isinstance(message, HandPose | Contact | Gesture):
             self._bus.publish(_STREAM[type(message)], message.hand, message)
         else:
@@ -96,21 +69,14 @@ class Taking(Protocol[TakenT_co]):
 
 
 class DevicePoses(Generic[ReceivedT]):
-    """Message source that publishes tracker poses as they pass.
-
-    The bus belongs to the caller.
-    """
+    """Message source that publishes tracker poses on the caller's bus as they pass."""
 
     def __init__(self, source: Taking[ReceivedT], bus: Bus) -> None:
         """Stand between a source and who reads it."""
         self._source, self._bus = source, bus
 
     def get(self, timeout_s: float) -> ReceivedT | None:
-        """The next message; one of a tracker is on the bus, too, stream `device`.
-
-        Raises:
-            BusError: The bus is closed.
-        """
+        """The next message; one of a tracker is on the bus, too, stream `device`."""
         message = self._source.get(timeout_s)
         if isinstance(message, TrackerPose):
             self._bus.publish("device", message.source, message)
@@ -123,17 +89,13 @@ _log = logging.getLogger(__name__)
 
 
 class PictureAsker:
-    """Requester of camera pictures, one thread per camera.
-
-    A camera that is not there keeps no other waiting. Holds the threads.
-    """
+    """Requester of camera pictures, one thread each: no camera keeps another waiting."""
 
     def __init__(
         self,
         bus: Bus,
         cameras: Iterable[str],
         verb: str = "preview",
-        # a camera shows itself for 3 s after each request
         period_s: float = 2.0,
         notify: Callable[[str], None] = _log.info,
     ) -> None:
@@ -141,10 +103,8 @@ class PictureAsker:
 
         Args:
             bus: Must stay open until `close`.
-            cameras: Whom.
             verb: "preview", which a camera shows for three seconds, or "still", one whole frame.
-            period_s: From one question to the next.
-            say: Called once when a camera does not answer, and again after it was there.
+            notify: Called once when a camera does not answer, and again after it was there.
         """
         self._bus, self._verb, self._period_s, self._notify = bus, verb, period_s, notify
         self._closing = threading.Event()
@@ -156,10 +116,7 @@ class PictureAsker:
             thread.start()
 
     def close(self) -> None:
-        """Stop asking.
-
-        Waits for an unanswered request, at most a second. Safe to call twice.
-        """
+        """Stop asking; waits at most a second for an answer. Safe to call twice."""
         self._closing.set()
         for thread in self._threads:
             thread.join()

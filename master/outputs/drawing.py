@@ -1,36 +1,13 @@
 """Draw hands, points and panels into pictures.
 
-Viewer and picture share these colours, states and wrist geometry.
-
-Colours of a hand, the same in the viewer and in the picture.
-
-Okabe & Ito, 2008: safe for colour-blind eyes.
-
-How well an object's position is known, in one word.
-
-The viewer and the picture of a run colour the object by it.
-
-Drawable lines of a wrist device's laser light.
-
-Rays of its fan, and arcs across them.
-
-Pose of a wrist device in the frame of a marker rig.
-
-The device is on the forearm, which the solved palm and the wrist's flexion place.
+Viewer and picture share colours (Okabe & Ito, 2008: safe for colour-blind eyes), object states, and the
+geometry of a wrist device. The device is on the forearm, which the solved palm and the wrist's flexion place
+in the rig frame:
 
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
-with `T_camera_palm` of a straight wrist (`common.hand.wrist`). A bend that is not measured counts as none.
-
-Shaded image of a hand.
-
-Spheres swept along the bones and the palm, drawn into a depth buffer.
-
-Orthographic view; the view frame is OpenCV's (x right, y down, z away from the eye), pixels follow it.
-
-Plots beside the hand in the picture of a run.
-
-Angles, latency or marker noise, error or what was seen.
+with `T_camera_palm` of a straight wrist (`common.hand.wrist`); a bend that is not measured counts as none. A
+hand is drawn as spheres swept along bones and palm into a depth buffer, orthographic, in OpenCV's axes.
 """
 
 from dataclasses import dataclass
@@ -138,9 +115,7 @@ _REACH_M = (0.06, 0.12, 0.18)  # arcs; the fingers of a large hand end within th
 def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
     """Return unit directions (K, 3) of the laser fan in the camera frame.
 
-    Evenly spaced over the fan.
-
-    Where the rig does not specify where its middle goes, that is the camera's view, as far as it lies in the plane.
+    Where the rig does not specify its middle, that is the camera's view projected onto the laser plane.
     """
     laser = rig.laser
     ahead = np.array([0.0, 0.0, 1.0] if laser is None or laser.forward is None else laser.forward)
@@ -154,37 +129,24 @@ def fan_rays(rig: RigCalibration, setup: WristSetup) -> Float:
 
 
 def fan(laser_m: Float, rays: Float) -> list[Float]:
-    """Return the line strips (n, 3) [m] of a laser fan: rays, and arcs across.
-
-    From `laser_m` (3,) along `rays` (K, 3).
-    """
+    """Return the line strips (n, 3) [m] of a laser fan: rays, and arcs across."""
     outline = [np.stack([laser_m, laser_m + _REACH_M[-1] * ray]) for ray in rays]
     return outline + [laser_m + reach * rays for reach in _REACH_M]
 
 
-_ELBOW = np.array(
-    [0.0, 0.0, -1.0]
-)  # along the forearm, in its own axes: the fingers of a straight hand go along z
+# along the forearm, in its own axes: the fingers of a straight hand go along z
+_ELBOW = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DevicePlace:
-    """Forearm poses at T times.
+    """Forearm poses at T times, rig frame; NaN where the pose is not valid."""
 
-    NaN where the pose is not valid.
-
-    Attributes:
-        wrist_m: (T, 3) the wrist [m], rig frame.
-        R_rig_palm: (T, 3, 3).
-        R_rig_forearm: (T, 3, 3).
-        wrist_angles_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as in the poses; NaN: not measured.
-    """
-
-    wrist_m: Float
-    R_rig_palm: Float
-    R_rig_forearm: Float
-    wrist_angles_rad: Float
-    sigma_rad: Float
+    wrist_m: Float  # (T, 3) the wrist [m]
+    R_rig_palm: Float  # (T, 3, 3)
+    R_rig_forearm: Float  # (T, 3, 3)
+    wrist_angles_rad: Float  # (T, 2) flexion and deviation of the wrist, as in the poses; NaN: not measured
+    sigma_rad: Float  # (T, 2) of these angles
 
     @classmethod
     def of(cls, poses: Poses, hand: HandModel) -> "DevicePlace":
@@ -198,10 +160,7 @@ class DevicePlace:
         return cls(wrist_m, R, forearm, poses.wrist_angles_rad, poses.wrist_angles_sigma_rad)
 
     def cameras(self, T_camera_palm: Float) -> Float:
-        """Return the poses (T, 4, 4) of the device's camera, camera -> rig.
-
-        From T_camera_palm (4, 4) of the device's file.
-        """
+        """Return the poses (T, 4, 4) of the device's camera, camera -> rig."""
         T_palm_camera = invert(T_camera_palm)
         out = np.tile(np.eye(4), (len(self.wrist_m), 1, 1))
         out[:, :3, :3] = self.R_rig_forearm @ T_palm_camera[:3, :3]
@@ -213,10 +172,7 @@ class DevicePlace:
         return np.stack([self.wrist_m, self.wrist_m + length_m * (self.R_rig_forearm @ _ELBOW)], axis=1)
 
     def uncertainty_m(self, length_m: float) -> Float:
-        """Return 2 sigma rings (T, K, 3) [m] about the ends of `arm_m`.
-
-        Where these ends are at 2 sigma of the wrist's flexion; NaN: not known.
-        """
+        """Rings (T, K, 3) [m]: ends of `arm_m` at 2 sigma of the bend; NaN: not known."""
         corners = 24
         angle = np.linspace(0.0, 2.0 * np.pi, corners)
         around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -234,40 +190,26 @@ _WEBS = ((1, 2), (2, 3), (3, 4))  # neighbouring fingers whose metacarpals the p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Where the eye stands.
+    """Where the eye stands."""
 
-    Attributes:
-        rotation: Rig frame -> view frame (3, 3).
-        centre_m: Point of the rig frame (3,) [m] that is drawn at the centre of the image.
-        scale_px_m: Pixels per metre.
-        width_px, height_px: Image size.
-    """
-
-    rotation: Float
-    centre_m: Float
-    scale_px_m: float
+    rotation: Float  # rig frame -> view frame (3, 3)
+    centre_m: Float  # point of the rig frame (3,) [m] that is drawn at the centre of the image
+    scale_px_m: float  # pixels per metre
     width_px: int
     height_px: int
 
     def project(self, points_m: Float) -> Float:
-        """Project points (..., 3) [m] of the rig frame to pixels and depth [px].
-
-        Returns (..., 3) [px]; NaN stays NaN.
-        """
+        """Project points (..., 3) [m] of the rig frame to u, v, depth (..., 3) [px]."""
         view = (points_m - self.centre_m) @ self.rotation.T * self.scale_px_m
         return view + np.array([self.width_px / 2, self.height_px / 2, 0.0])
 
 
 def render_hand(view: View, position_m: Float, radius_m: Float) -> tuple[Pixels, Pixels]:
-    """Draw one hand.
+    """Draw one hand: brightness (H, W) in 0..1, and coverage (H, W), 0 or 1.
 
     Args:
-        view: The eye.
         position_m: Joints (26, 3) [m], rig frame. A bone with a NaN end is not drawn.
         radius_m: (26,) [m].
-
-    Returns:
-        Brightness (H, W) in 0..1, and coverage (H, W): 1 on the hand, 0 elsewhere.
     """
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
     normal = np.zeros((view.height_px, view.width_px, 3), np.float32)
@@ -352,10 +294,7 @@ def style(axes: Axes, title: str) -> None:
 
 
 def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
-    """Draw three panels down the right side.
-
-    A thin line marks the row that is shown as a hand.
-    """
+    """Draw three panels down the right side; a thin line marks the row shown."""
     left, width, height = 0.655, 0.33, 0.205
     boxes = [figure.add_axes((left, bottom, width, height)) for bottom in _BOTTOMS]
     seconds = (poses.t_ns - poses.t_ns[0]).astype(np.float64) * 1e-9

@@ -1,16 +1,8 @@
 """The picture shows a run and its rig on 1600 x 900 pixels.
 
-Small view of the whole rig in the picture of a run.
-
-Cameras, rays to the caps, hand, and the volume that the rig's file states.
-
-Picture of a run (1600 x 900).
-
-The hand as solved, the rig around it, and how good the run was.
-
-The rig frame is that of a camera that looks along +z at the back of the hand, y down; the hand is shown
-as that camera sees it, turned a little to the side, so it stands upright. All axes of the hand and of
-the rig have one scale. The hand of a wrist device, whose camera looks along the palm, is shown from above the palm
+The rig frame is that of a camera that looks along +z at the back of the hand, y down; the hand is shown as
+that camera sees it, turned a little to the side, so it stands upright. All axes of the hand and of the rig
+have one scale. The hand of a wrist device, whose camera looks along the palm, is shown from above the palm
 and behind the wrist.
 """
 
@@ -58,7 +50,7 @@ _RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
 def draw_rig(
     figure: Figure, poses: Poses, row: int, rig: RigCalibration, wrist: WristPicture | None = None
 ) -> None:
-    """Draw it from the side, lower left."""
+    """Draw cameras, rays to the caps, hand and volume from the side, lower left."""
     axes = figure.add_axes((0.012, 0.02, 0.215, 0.33))
     style(axes, "Rig, seen from the side")
     axes.set_xticks([])
@@ -141,13 +133,11 @@ def draw_summary(
     Args:
         path: The file; replaced only by a complete one.
         poses: The run; without a valid pose the picture states so.
-        rig: Camera places.
         model: The hand; its name, side and limits are shown.
         summary: Key figures by the names of the summary JSON; others are left out.
         truth: Row by row with `poses`; drawn as a ghost, and as error over time.
         row: The pose to show; None: an open hand with as many tracked joints as there are.
-        wrist: The wrist device, alone or beside the rig of markers; None: there is none.
-        told: Objects and gestures of the run; a strip of the latter stands below the hand, if there are any.
+        results: Objects and gestures of the run; a strip of the latter stands below the hand, if there are any.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -169,11 +159,9 @@ def draw_summary(
 
 
 def best_row(poses: Poses, results: ResultPicture | None = None) -> int | None:
-    """Choose the row to show in the picture.
+    """Choose the row to show in the picture; None: no pose is valid.
 
     Preferred: all joints valid if possible, an object held or known, most joints tracked, fingers spread.
-
-    None: none is valid. `results` has the objects.
     """
     whole = poses.valid.sum(axis=1)
     if not whole.any():
@@ -260,17 +248,9 @@ def _hand(
     pixels = view.project(at)
     _bones(axes, pixels, colours, width=3.4)
     for joint in np.flatnonzero(poses.valid[row]).tolist():
-        face = unit(colours[joint]) if poses.tracked[row, joint] else PAPER
-        axes.plot(
-            pixels[joint, 0],
-            pixels[joint, 1],
-            "o",
-            ms=8,
-            mfc=face,
-            mec=unit(colours[joint]),
-            mew=2.0,
-            zorder=6,
-        )
+        edge = unit(colours[joint])
+        face = edge if poses.tracked[row, joint] else PAPER
+        axes.plot(pixels[joint, 0], pixels[joint, 1], "o", ms=8, mfc=face, mec=edge, mew=2.0, zorder=6)
     caps = view.project(poses.markers_m[row])
     for m in range(poses.marker_count):
         ring = unit(series_rgb(m))

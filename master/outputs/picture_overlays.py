@@ -1,17 +1,10 @@
 """Overlays draw wrist device, objects and gestures in the picture of a run.
 
-Wrist device in the picture of a run.
-
-Its laser's fan about the hand, and what its camera sees.
-
-Beside marker cameras it stands in their rig where palm and bend place it (`device_place`), and the forearm is drawn.
-
-Objects and gestures in the picture of a run.
-
-The object in the hand, and a strip of the gestures of the hand.
+Beside marker cameras a wrist device stands in their rig where palm and bend place it (`DevicePlace`), and the
+forearm is drawn; alone, what its camera sees is drawn.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -45,7 +38,7 @@ from master.outputs.drawing import (
     unit,
 )
 from master.outputs.poses import Poses, PosesTruth
-from master.outputs.result_files import Contacts, ObjectPoses
+from master.outputs.result_files import Contacts, ObjectPoses, nearest_rows
 from master.rig.setup import RigSetup
 from master.rig.wrist import WristSetup
 
@@ -55,22 +48,14 @@ _FOREARM_M = 0.055  # of it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristPicture:
-    """How to draw one wrist device.
+    """How to draw one wrist device."""
 
-    Attributes:
-        rig: Name of its rig.
-        in_rig: Poses are in the frame of a rig of markers, not of its camera.
-        setup: Laser plane and palm.
-        camera: Its camera.
-        rays: (K, 3) directions of the laser's light.
-        frame: What the camera saw by laser and LEDs at the row that is shown, (H, W) grey, or None.
-    """
-
-    rig: str
-    in_rig: bool
+    rig: str  # name of its rig
+    in_rig: bool  # poses are in the frame of a rig of markers, not of its camera
     setup: WristSetup
     camera: CameraModel
-    rays: Float
+    rays: Float  # (K, 3) directions of the laser's light
+    # what the camera saw by laser and LEDs at the row that is shown, (H, W) grey, or None
     frame: Image | None = None
 
     @classmethod
@@ -82,29 +67,20 @@ class WristPicture:
         return cls(setup.wrist_rig.name, setup.has_markers, setup.wrist, setup.wrist.optics, rays, frame)
 
     def pose(self, poses: Poses, row: int) -> Float:
-        """Return the camera's pose (4, 4) in the frame of the poses at a row.
-
-        NaN: not known.
-        """
+        """Return the camera's pose (4, 4) in the frame of the poses; NaN: not known."""
         if not self.in_rig:
             return np.eye(4)
         place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
         return place.cameras(self.setup.T_camera_palm)[0]
 
     def reach_m(self, poses: Poses, row: int) -> Float:
-        """Return points (N, 3) [m] that must be in the hand's picture at a row.
-
-        The device's camera, or the end of the forearm.
-        """
+        """Return points (N, 3) [m] that must be in the picture: camera, or forearm end."""
         if not self.in_rig:
             return np.zeros((1, 3))
         return DevicePlace.of(poses.rows(row, row + 1), self.setup.model).arm_m(_FOREARM_M)[0]
 
     def draw_laser(self, axes: Axes, view: View, poses: Poses, row: int) -> list[Line2D]:
-        """Draw the laser fan and points about the hand; return the legend entries.
-
-        Beside marker cameras also the forearm.
-        """
+        """Draw laser fan, points, and in a rig the forearm; return the legend entries."""
         T = self.pose(poses, row)
         for line in fan(self.setup.laser_m, self.rays):
             pixels = view.project(transform(T, line))
@@ -121,28 +97,21 @@ class WristPicture:
         ]  # fmt: skip
 
     def _draw_forearm(self, axes: Axes, view: View, poses: Poses, row: int) -> Line2D:
-        """Draw the forearm from the wrist towards the elbow; return its legend entry.
-
-        Also where that end is at 2 sigma.
-        """
+        """Draw the forearm and its end at 2 sigma; return the legend entry."""
         place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
         colour = unit(SOURCE_RGB[Source.WRIST])
         arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.uncertainty_m(_FOREARM_M)[0])
         axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=(0, (4, 1.5)), zorder=4)
         axes.plot(ring[:, 0], ring[:, 1], color=colour, lw=1.0, zorder=4)
         flexion, deviation = np.degrees(place.wrist_angles_rad[0])
+        known = np.isfinite(flexion)
         wrist_angles = (
-            f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°"
-            if np.isfinite(flexion)
-            else "bend of the wrist not known"
+            f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°" if known else "bend of the wrist not known"
         )
         return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {wrist_angles}")
 
     def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
-        """Draw the camera's view at the lower left.
-
-        Its frame, the hand and the laser points as the camera should see them.
-        """
+        """Draw the camera's frame, hand and laser points as it should see them."""
         axes = figure.add_axes(_BOX)
         style(axes, "Camera, with the hand as solved")
         axes.set_xticks([])
@@ -179,14 +148,7 @@ _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResultPicture:
-    """What is drawn beside the hand.
-
-    Attributes:
-        profiles: The objects' files.
-        objects: Where they were.
-        contacts: How near the hand was to each.
-        gestures: What the hand signalled, in the order of time.
-    """
+    """What is drawn beside the hand: objects, contacts and gestures in time order."""
 
     profiles: Sequence[ObjectProfile] = ()
     objects: Sequence[ObjectPoses] = ()
@@ -194,14 +156,11 @@ class ResultPicture:
     gestures: Sequence[Gesture] = ()
 
     def interest(self, t_ns: Int) -> Float:
-        """Rate how much the times (T,) show of the objects.
-
-        2 held, 1 known, 0 nothing.
-        """
+        """Rate how much the times (T,) show of the objects: 2 held, 1 known, 0 nothing."""
         known = np.zeros(len(t_ns))
         for poses in self.objects:
             if len(poses):
-                rows = _nearest(poses.t_ns, t_ns)
+                rows = nearest_rows(poses.t_ns, t_ns)
                 near = np.abs(poses.t_ns[rows] - t_ns) < _NEAR_NS
                 known = np.maximum(known, near & poses.tracked[rows])
         for near in self.contacts:
@@ -209,10 +168,7 @@ class ResultPicture:
         return known
 
     def points_m(self, t_ns: int) -> Float:
-        """Return the outline (N, 3) [m] of the objects at a time.
-
-        The outline must be in the picture.
-        """
+        """Return the outline (N, 3) [m] of the objects at a time."""
         found = [
             transform(T, np.concatenate([_outline(part) for part in profile.shape]))
             for profile, T, _ in self._placed(t_ns)
@@ -253,10 +209,7 @@ class ResultPicture:
         return entries
 
     def draw_strip(self, figure: Figure, t_ns: Int, row: int) -> None:
-        """Draw the gestures of the hand over the run.
-
-        A lane for each kind of gesture that occurred.
-        """
+        """Draw the gestures over the run, a lane for each kind that occurred."""
         axes = figure.add_axes(STRIP_BOX)
         style(axes, "Gestures of the hand")
         first, span = int(t_ns[0]), max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-3)
@@ -298,14 +251,11 @@ class ResultPicture:
         axes.axvline((int(t_ns[row]) - first) * 1e-9, color=INK, lw=1.0, alpha=0.7)
 
     def _placed(self, t_ns: int) -> list[tuple[ObjectProfile, Float, ObjectAppearance]]:
-        """Return the objects whose position is known at a time.
-
-        For each: file, pose (4, 4), how well it is known.
-        """
-        profiles: Mapping[str, ObjectProfile] = {one.name: one for one in self.profiles}
+        """File, pose (4, 4) and appearance of each object that is known at a time."""
+        profiles = {one.name: one for one in self.profiles}
         found: list[tuple[ObjectProfile, Float, ObjectAppearance]] = []
         for poses in self.objects:
-            row = int(_nearest(poses.t_ns, np.array([t_ns]))[0]) if len(poses) else -1
+            row = int(nearest_rows(poses.t_ns, np.array([t_ns]))[0]) if len(poses) else -1
             if (
                 row < 0
                 or abs(int(poses.t_ns[row]) - t_ns) > _NEAR_NS
@@ -321,10 +271,7 @@ class ResultPicture:
 
 
 def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str, int, int]]:
-    """Return name, begin and end [ns] of every gesture of a kind.
-
-    In the order of their beginnings; for a tap the name is its key.
-    """
+    """Name (of a tap: key), begin and end [ns] of every gesture of a kind, by begin."""
     found: dict[tuple[str, int], int] = {}
     ended: set[tuple[str, int]] = set()
     for one in gestures:
@@ -339,10 +286,7 @@ def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str
 
 
 def _words(name: str, letters: int) -> str:
-    """Cut each line of a name to a number of letters.
-
-    Empty where the shortened name would be meaningless.
-    """
+    """Cut each line of a name to some letters; empty where that means nothing."""
     lines = name.split("\n")
     letters_least = 3  # of a name that is cut off
     if letters < min(max(map(len, lines)), letters_least):
@@ -363,11 +307,3 @@ def _outline(part: Shape) -> Float:
         circle = part.radius_m * np.stack([np.cos(_ROUND), np.sin(_ROUND), 0.0 * _ROUND], axis=1)
         points = np.concatenate([np.roll(circle, shift, axis=1) for shift in range(3)])
     return points if part.T_object_part is None else transform(np.array(part.T_object_part), points)
-
-
-def _nearest(rising_ns: Int, t_ns: Int) -> Int:
-    """Rows (T,) of rising times that are nearest to others (T,)."""
-    after = np.clip(np.searchsorted(rising_ns, t_ns), 0, len(rising_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(rising_ns[before] - t_ns) <= np.abs(rising_ns[after] - t_ns)
-    return np.where(nearer, before, after)

@@ -1,18 +1,7 @@
 """Poses holds a run as arrays, its truth beside it, and its file poses.npz.
 
-Many poses as arrays.
-
-What poses.npz holds, and what pictures, viewers and scores read.
-
-True motion of the hand, row by row beside the poses.
-
-Where a simulation or a recording knows it.
-
-Writer and reader of poses.npz, the record of a run readable with numpy.
-
-Also writes and reads all files of a run at once.
-
-Each appears under its name complete or not at all, and identical poses make identical bytes (`table_file`).
+poses.npz is readable with numpy. All files of a run are written at once; each appears under its name complete
+or not at all, and identical poses make identical bytes (`TableFile`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,58 +22,33 @@ from master.outputs.result_files import GesturesFile, TableFile, contact_file, o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """T poses of one hand, row by row; fields as in `HandPose`.
-
-    Attributes:
-        hand: Name of the hand profile.
-        t_ns: (T,) [ns].
-        position_m: (T, 26, 3) [m], rig frame.
-        orientation_wxyz: (T, 26, 4).
-        radius_m: (T, 26) [m].
-        valid, tracked: (T, 26).
-        cov_m2: (T, 26, 3, 3) [m^2].
-        source: (T, 26) `Source` codes.
-        angles_rad: (T, 5, 4) [rad].
-        markers_m, markers_raw_m: (T, M, 3) [m], after and before the filter.
-        markers_cov_m2: (T, M, 3, 3) [m^2], of `markers_raw_m`.
-        inside_volume: (T, 26).
-        latency_ns: (T,) [ns]; 0 in an offline run.
-        laser_m: (T, 5, 3) laser points of a wrist device [m], frame of its camera.
-        solver_mode: (T, 5) `SolverMode` codes: what a wrist device solved each finger from.
-        ambiguous: (T, 5) another pose of that finger explains what was seen as well.
-        palm_world_wxyz, palm_world_sigma_rad: (T, 4), (T, 2) palm in the world of a wrist device's IMU; NaN: none.
-        wrist_angles_rad, wrist_angles_sigma_rad: (T, 2) of the wrist, where a device sits on the forearm; NaN: none.
-    """
+    """T poses of one hand, row by row; fields as in `HandPose`."""
 
     hand: str
-    t_ns: Int
-    position_m: Float
-    orientation_wxyz: Float
-    radius_m: Float
-    valid: Bool
-    tracked: Bool
-    cov_m2: Float
-    source: Code
-    angles_rad: Float
-    markers_m: Float
-    markers_raw_m: Float
-    markers_cov_m2: Float
-    inside_volume: Bool
-    latency_ns: Int
-    laser_m: Float
-    solver_mode: Code
-    ambiguous: Bool
-    palm_world_wxyz: Float
-    palm_world_sigma_rad: Float
-    wrist_angles_rad: Float
-    wrist_angles_sigma_rad: Float
+    t_ns: Int  # (T,) [ns]
+    position_m: Float  # (T, 26, 3) [m], rig frame
+    orientation_wxyz: Float  # (T, 26, 4)
+    radius_m: Float  # (T, 26) [m]
+    valid: Bool  # (T, 26)
+    tracked: Bool  # (T, 26)
+    cov_m2: Float  # (T, 26, 3, 3) [m^2]
+    source: Code  # (T, 26) `Source` codes
+    angles_rad: Float  # (T, 5, 4) [rad]
+    markers_m: Float  # (T, M, 3) [m], after the filter
+    markers_raw_m: Float  # (T, M, 3) [m], before the filter
+    markers_cov_m2: Float  # (T, M, 3, 3) [m^2], of `markers_raw_m`
+    inside_volume: Bool  # (T, 26)
+    latency_ns: Int  # (T,) [ns]; 0 in an offline run
+    laser_m: Float  # (T, 5, 3) laser points of a wrist device [m], frame of its camera
+    solver_mode: Code  # (T, 5) `SolverMode` codes: what a wrist device solved each finger from
+    ambiguous: Bool  # (T, 5) another pose of that finger explains what was seen as well
+    palm_world_wxyz: Float  # (T, 4) palm in the world of a wrist device's IMU; NaN: none
+    palm_world_sigma_rad: Float  # (T, 2)
+    wrist_angles_rad: Float  # (T, 2) of the wrist, where a device sits on the forearm; NaN: none
+    wrist_angles_sigma_rad: Float  # (T, 2)
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together.
-
-        Raises:
-            ValueError: Naming the array, its shape or type, and what is expected.
-        """
+        """Refuse arrays of shapes or types that do not fit together; ValueError."""
         dtype = record(self.markers_m.shape[1] if self.markers_m.ndim == 3 else 0)
         for name in dtype.names or ():
             array = getattr(self, name)
@@ -118,6 +82,16 @@ class Poses:
         }
         return cls(hand=poses[0].hand, **arrays)
 
+    @classmethod
+    def joined(cls, batches: Sequence["Poses"]) -> "Poses":
+        """Concatenate poses of one hand and one marker count; at least one batch."""
+        arrays: dict[str, Any] = {
+            one.name: np.concatenate([getattr(batch, one.name) for batch in batches])
+            for one in fields(cls)
+            if one.name != "hand"
+        }
+        return cls(hand=batches[0].hand, **arrays)
+
     def pose(self, index: int) -> HandPose:
         """Row `index` as the message it came from."""
         times = ("t_ns", "latency_ns")
@@ -135,10 +109,7 @@ class Poses:
 
 
 def record(marker_count: int) -> np.dtype[np.void]:
-    """Return one row of poses.npz as a structured type.
-
-    The only place that fixes names, types and shapes.
-    """
+    """Return the type of a row of poses.npz; nothing else fixes names and shapes."""
     j, m = JOINT_COUNT, marker_count
     return np.dtype(
         [
@@ -169,26 +140,16 @@ def record(marker_count: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosesTruth:
-    """True joints and caps at the times of T poses.
+    """True joints and caps at the times of T poses; NaN: unknown there."""
 
-    NaN: unknown there.
-
-    Attributes:
-        joints_m: (T, 26, 3) [m], rig frame.
-        markers_m: (T, M, 3) [m], centroids of the painted caps, rig frame.
-        laser_m: (T, 5, 3) [m], where the laser meets each finger, of a wrist device; None: a marker rig.
-    """
-
-    joints_m: Float
-    markers_m: Float
+    joints_m: Float  # (T, 26, 3) [m], rig frame
+    markers_m: Float  # (T, M, 3) [m], centroids of the painted caps, rig frame
+    # (T, 5, 3) [m], where the laser meets each finger, of a wrist device; None: a marker rig
     laser_m: Float | None = None
 
     @classmethod
     def of_webxr(cls, joints_m: Float, markers_m: Float, laser_m: Float | None = None) -> "PosesTruth":
-        """Build the truth from the 25 WebXR joints (T, 25, 3) of a rendered recording.
-
-        The palm is derived.
-        """
+        """Build the truth from 25 WebXR joints (T, 25, 3); the palm is derived."""
         palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
         return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m, laser_m)
 
@@ -198,20 +159,14 @@ class PosesTruth:
         return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop], laser_m)
 
     def errors_m(self, poses: Poses) -> dict[str, Float]:
-        """Return the distances (T, K) [m] from the truth for each measured quantity.
-
-        A mapping from quantity to distances; NaN where either of the two is not known.
-        """
+        """Map each measured quantity to its distances (T, K) [m]; NaN: unknown."""
         joints = {"joints": self.joint_error_m(poses)}
         if self.laser_m is None:
             return joints | {"markers": self.marker_error_m(poses)}
         return joints | {"laser": distance_m(poses.laser_m, self.laser_m)}
 
     def joint_error_m(self, poses: Poses) -> Float:
-        """Return the distance (T, 25) [m] of every joint but the palm from the truth.
-
-        NaN where the pose is not valid or there is no truth.
-        """
+        """Return the distance (T, 25) [m] from the truth, without the palm; NaN: unknown."""
         error = distance_m(poses.position_m, self.joints_m)
         return np.where(poses.valid, error, np.nan)[:, 1:]
 
@@ -226,10 +181,7 @@ def distance_m(a: Float, b: Float) -> Float:
 
 
 def mean_known(values: Float) -> Float:
-    """Return the mean (T,) over the second axis of (T, K), ignoring NaN values.
-
-    NaN where no value is known.
-    """
+    """Return the mean (T,) over the second axis without NaN; NaN: nothing known."""
     known = ~np.isnan(values)
     count = known.sum(axis=1)
     total = np.where(known, values, 0.0).sum(axis=1)
@@ -237,19 +189,10 @@ def mean_known(values: Float) -> Float:
 
 
 class PosesFile:
-    """poses.npz of one hand; holds the spool of rows written so far."""
+    """poses.npz of one hand, until `close` a spool."""
 
     def __init__(self, path: Path, hand: str, marker_count: int) -> None:
-        """Open the spool in the folder of `path`.
-
-        Args:
-            path: The .npz to write.
-            hand: Name of the hand profile; every pose must carry it.
-            marker_count: M; every pose must have as many markers.
-
-        Raises:
-            RecordingError: The folder is missing or read-only.
-        """
+        """Open the spool for a hand and its M markers; RecordingError as `TableFile`."""
         self._path, self._hand = path, hand
         self._markers = (marker_count, 3)
         self._file = TableFile(path, record(marker_count), {"hand": hand})
@@ -267,34 +210,15 @@ class PosesFile:
         self._file.write(pose)
 
     def close(self) -> None:
-        """Write the .npz; an older file of that name is replaced only by a complete one.
-
-        Raises:
-            RecordingError: Disk full or folder gone; no part of a file is left.
-        """
+        """Write the .npz; as `TableFile`."""
         self._file.close()
 
 
 class RunFiles:
-    """A `Sink` that writes the files of a run.
-
-    A poses.npz for each hand, and beside it the other results.
-
-    The first hand's poses stand at the path itself, those of others beside it under their names; objects, contact and
-    gestures in the same folder (`told_files`).
-    """
+    """A `Sink` that writes poses.npz, and further hands and results beside it."""
 
     def __init__(self, path: Path, marker_counts: Mapping[str, int], objects: Sequence[str] = ()) -> None:
-        """Open the spools.
-
-        Args:
-            path: Of the first hand's poses.
-            marker_counts: Name of the hand profile -> M.
-            objects: Names of the objects.
-
-        Raises:
-            RecordingError: The folder is missing or read-only.
-        """
+        """Open the spools; `marker_counts`: hand profile -> M, the first at `path`."""
         first, folder = next(iter(marker_counts)), path.parent
         self._hands = {
             hand: PosesFile(path if hand == first else path_of_hand(path, hand), hand, count)
@@ -335,13 +259,7 @@ class RunFiles:
             self._contacts[message.hand, message.object].write(message)
 
     def close(self) -> None:
-        """Write each file.
-
-        A file that cannot be completed does not keep any other from being written.
-
-        Raises:
-            RecordingError: Disk full or folder gone; no part of a file is left.
-        """
+        """Write each file, also where another one cannot be completed; RecordingError."""
         with ExitStack() as all_of_them:
             files = (*self._hands.values(), *self._objects.values(), *self._contacts.values(), self._gestures)
             for file in files:
@@ -349,19 +267,12 @@ class RunFiles:
 
 
 def path_of_hand(path: Path, hand: str) -> Path:
-    """Return the poses file of a hand other than the first.
-
-    poses.npz -> poses-HAND.npz.
-    """
+    """Name the poses file of a hand other than the first: poses-HAND.npz."""
     return path.with_name(f"{path.stem}-{hand}{path.suffix}")
 
 
 def save_poses(path: Path, poses: Poses) -> None:
-    """Write poses.npz in one call.
-
-    Raises:
-        RecordingError: As `PosesFile`.
-    """
+    """Write poses.npz in one call; RecordingError as `PosesFile`."""
     file = PosesFile(path, poses.hand, poses.marker_count)
     for index in range(len(poses)):
         file.write(poses.pose(index))
@@ -369,11 +280,7 @@ def save_poses(path: Path, poses: Poses) -> None:
 
 
 def load_poses(path: Path) -> Poses:
-    """Read a poses.npz.
-
-    Raises:
-        RecordingError: Missing, not an .npz, a key missing or of the wrong type or shape.
-    """
+    """Read a poses.npz; RecordingError: missing, or not of this type and shape."""
     names = [*(record(0).names or ()), "hand"]
     arrays = read_npz(path, names, "not a poses.npz of ours")
     hand = str(arrays.pop("hand"))

@@ -1,20 +1,9 @@
 """The viewer runs in processes of its own and reads the bus.
 
-Launcher of Rerun's own viewer as a child process.
-
-The viewer listens on 127.0.0.1 only; the launcher also ends it.
-
-The SDK's `spawn` and `serve_*` listen on every interface; the same program started by hand can be bound.
-Its usage statistics are switched off in a private settings folder, the user's own settings stay untouched.
-
-Viewer in a process of its own.
-
-Reads what a master publishes from the bus and never slows the tracking.
-
-It subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses pictures,
-not poses; the only thing it sends is "preview" to the cameras, which then show themselves for three seconds.
-The native and the web viewer are child processes that listen on 127.0.0.1 only, with a memory limit and with
-their makers' usage statistics switched off (docs/viewer.md).
+It never slows the tracking: a full subscription drops its oldest message, so a slow screen loses pictures,
+not poses. It sends nothing but "preview" to the cameras. Native and web viewer are child processes, as the
+SDK's `spawn` and `serve_*` listen on every interface: these listen on 127.0.0.1 only, with a memory limit,
+and with usage statistics switched off in a private settings folder (docs/viewer.md).
 """
 
 import logging
@@ -57,10 +46,7 @@ _FIX = "without a display use --web or --save FILE.rrd; a busy port needs anothe
 
 
 class ViewerProcess:
-    """A running viewer: a window, or a web page when `web_port` is given.
-
-    Ends with the `with` block.
-    """
+    """A running viewer: a window, or a web page when `web_port` is given."""
 
     def __init__(self, web_port: int | None) -> None:
         """Start it and wait until it listens.
@@ -117,7 +103,7 @@ class ViewerProcess:
 
     @property
     def address(self) -> str:
-        """Return the address to show to the user."""
+        """The address to show to the user."""
         if self._web_port is None:
             return "viewer window opened"
         return f"http://{LOOPBACK}:{self._web_port}?url={quote(self.url, safe='')}"
@@ -149,11 +135,7 @@ class ViewerProcess:
         self.close()
 
     def check(self) -> None:
-        """Nothing while it runs, or when its user closed it.
-
-        Raises:
-            PhalanxError: It ended by itself; the text has its reason.
-        """
+        """Do nothing while it runs or its user closed it; else PhalanxError has why."""
         if not self.alive() and self._child.returncode != 0:
             last = self._errors.read_text(errors="replace").strip().splitlines()[-1:] or ["no reason given"]
             raise PhalanxError(f"the viewer ended (exit {self._child.returncode}): {last[0]}; {_FIX}")
@@ -239,16 +221,12 @@ def run_viewer(
     web_port: int = 9090,
     on_ready: Callable[[str], None] = _log.info,
 ) -> int:
-    """Show what is on the bus until `stop` is set or the viewer's window is closed.
+    """Show what is on the bus, which stays open, until `stop` or the viewer's end.
 
     Args:
-        bus: Where hands, health and previews are published and the cameras can be asked; left open.
-        setups: What watches each hand.
         mode: "spawn" a window, serve the "web" viewer on 127.0.0.1, or "save" an .rrd.
         path: The .rrd of mode "save"; None otherwise.
-        stop: Set from another thread or a signal handler.
-        web_port: TCP port of the web page on 127.0.0.1.
-        on_ready: Called once where the result is to be seen (an address or a file).
+        on_ready: Called once with where the result is to be seen (an address or a file).
 
     Returns:
         Number of poses shown.
@@ -256,7 +234,6 @@ def run_viewer(
     Raises:
         RecordingError: The .rrd cannot be written.
         PhalanxError: The viewer did not start (no display?) or takes no data any more.
-        BusError: The bus is closed.
         ValueError: Mode and `path` do not fit.
     """
     if (mode == "save") != (path is not None):
@@ -285,14 +262,12 @@ def write_rrd(
     """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.
 
     Args:
-        path: The file; replaced only by a complete one.
-        poses: The run.
-        setup: What watched the hand.
+        path: Replaced only by a complete file.
         detections: Camera -> its frames in the order of time, on the clock of the poses.
         truth: Row by row with `poses`.
         images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
-        told: Objects, contact and gestures of the run, each in the order of time.
-        tell: Called with how many poses of how many are written.
+        results: Objects, contact and gestures of the run, each in the order of time.
+        progress: Called with how many poses of how many are written.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -319,10 +294,7 @@ def write_rrd(
 def _pump(
     scene: RerunScene, recording: rr.RecordingStream, subscribers: _Subscribers, go_on: Callable[[], bool]
 ) -> int:
-    """Move messages from the bus to the scene while `go_on`.
-
-    Also the last ones after it.
-    """
+    """Move messages from the bus to the scene while `go_on`, and the last after it."""
     shown, flush_ns, going = 0, now_ns(), True
     at_ns: int | None = None  # newest time of the master, on whose clock the timeline is
     while going:
@@ -446,11 +418,7 @@ def _saved(path: Path) -> Generator[rr.RecordingStream, None, None]:
 
 
 def _flush(recording: rr.RecordingStream) -> None:
-    """Wait until everything is written or received.
-
-    Raises:
-        PhalanxError: It is not taken: disk full, or a viewer that hangs.
-    """
+    """Wait until all is written or received; PhalanxError: disk full, viewer hangs."""
     try:
         flush_timeout_s = 5.0
         recording.flush(timeout_sec=flush_timeout_s)

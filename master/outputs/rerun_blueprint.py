@@ -1,16 +1,7 @@
 """The blueprint lays the viewer out, and columns and states fill it.
 
-Initial layout of the viewer.
-
-The scene on the left, cameras below it, plots on the right.
-
-Rows of entities as columns, a batch at a time.
-
-A live viewer (2 or 3 poses a batch) and a file go the same way.
-
-Lanes of lasting states over time in the viewer.
-
-Such as a pose of the hand or a held object.
+The scene on the left, cameras below it, plots on the right. Rows go to the viewer as columns, a batch at a
+time: 2 or 3 poses live, many to a file. What lasts (a pose of the hand, a held object) is a lane of states.
 """
 
 from collections.abc import Sequence
@@ -57,15 +48,7 @@ def camera_path(camera: str) -> str:
 
 
 def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rrb.Blueprint:
-    """Return the saved layout.
-
-    Plots follow the last 10 s of a live run and show all of a recorded one.
-
-    Args:
-        setups: What watches each hand.
-        live: The data streams in.
-        with_truth: There is a truth to show errors against.
-    """
+    """Return the layout; plots follow the last 10 s of a live run, or show all."""
     cameras = {name: camera for setup in setups for name, camera in setup.cameras.items()}
     rate_hz = max(camera.frame_rate_hz for camera in cameras.values())  # of the fastest
     with_markers = any(setup.has_markers for setup in setups)
@@ -137,10 +120,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
 
 
 def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
-    """Return the viewpoint [m] of the scene.
-
-    Chosen so that every static camera is in the picture.
-    """
+    """Viewpoint [m] of the scene from which every static camera is in the picture."""
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
     models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
     reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
@@ -182,19 +162,13 @@ PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its 
 
 
 class Columns:
-    """Sender of rows to a recording, each at its `t_ns` on the timeline.
-
-    The recording belongs to the caller.
-    """
+    """Sender of rows to a recording that belongs to the caller, each at its `t_ns`."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
 
     def send(self, path: str, t_ns: Int, columns: rr.ComponentColumnList, lengths: Int | None) -> None:
-        """Send rows at `t_ns`.
-
-        `lengths` (T,) instances each (0 clears the last row), None: one each.
-        """
+        """Send rows of `lengths` (T,) instances (0 clears the last row); None: one each."""
         index = rr.TimeColumn(TIMELINE, duration=cast("list[np.timedelta64]", t_ns.astype("timedelta64[ns]")))
         parts = columns if lengths is None else columns.partition(lengths)
         self._rec.send_columns(path, [index], parts)
@@ -216,15 +190,10 @@ class Columns:
     def pixels(
         self, path: str, t_ns: Int, uv: Float, colours: npt.NDArray[np.uint32], radius_px: float
     ) -> None:
-        """Send those of the pixels (T, N, 2) that are not NaN, in colours (T, N).
-
-        (0, 0) = centre of the first pixel.
-        """
+        """Send those of the pixels (T, N, 2) that are not NaN, in colours (T, N)."""
         shown = seen(uv)
         columns = rr.Points2D.columns(
-            positions=uv[shown] + PIXEL_CENTRE,
-            colors=colours[shown],
-            radii=np.full(shown.sum(), radius_px),
+            positions=uv[shown] + PIXEL_CENTRE, colors=colours[shown], radii=np.full(shown.sum(), radius_px)
         )
         self.send(path, t_ns, columns, shown.sum(axis=1))
 
@@ -248,10 +217,7 @@ class Columns:
         self.send(path, t_ns, columns, np.asarray(shown, np.int64))
 
     def scalars(self, path: str, t_ns: Int, values: Float) -> None:
-        """Send one number per row.
-
-        NaN is sent as such: the viewer breaks the line there, and would bridge a missing row.
-        """
+        """Send one number per row; at NaN the viewer breaks the line."""
         self.send(path, t_ns, rr.Scalars.columns(scalars=values), None)
 
     def name(self, path: str, name: str, rgb: Rgb) -> None:
@@ -265,20 +231,14 @@ def seen(points: Float) -> Bool:
 
 
 class States:
-    """Logger of state changes to a recording that belongs to the caller.
-
-    Holds the last state of each lane.
-    """
+    """Logger of state changes to a recording that belongs to the caller."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
         self._last: dict[str, str | None] = {}
 
     def log(self, lane: str, t_ns: int, state: str | None) -> None:
-        """Log the state of a lane (a path of names) at a time.
-
-        None: no state. Logging the same state again costs nothing.
-        """
+        """Log the state of a lane (a path of names) if it changed; None: no state."""
         if self._last.get(lane) == state:
             return
         self._last[lane] = state

@@ -1,32 +1,18 @@
 """Layers log objects, contact and gestures to one Rerun recording.
 
-Gestures in the viewer's scene.
-
-Which gesture the hand makes, where it makes it, and lanes of gestures over time.
-
 world/gestures/HAND/pose             the name of the pose beside the palm
 world/gestures/HAND/pinch            thumb to finger, brighter as it closes, with the distance of their skins
 world/gestures/HAND/dial             circle about the dial's axis; /turned: arc of the angle, with its degrees
 world/gestures/HAND/ray              where a finger points
 world/gestures/HAND/tap              the key that was tapped, for half a second
-states/HAND/KIND                     the same over time
-events/HAND                          every begin, end and tap as a line of text
-
-Objects in the viewer's scene.
-
-Where each is and how well that is known, and where fingers touch it.
-
+states/HAND/KIND; events/HAND        the same over time; every begin, end and tap as a line of text
 world/objects/OBJECT                 its place; nothing below it while nobody knows where it is
-world/objects/OBJECT/shape/...       boxes, cylinders, balls of its file, coloured by `object_appearance`
+world/objects/OBJECT/shape/...       boxes, cylinders, balls of its file, coloured by `ObjectAppearance`
 world/objects/OBJECT/beads, /tags    what it is seen by
 world/contact/HAND/OBJECT/points     where it is nearest to each finger: red touched, yellow within 3 cm
 world/contact/HAND/OBJECT/gaps       from the fingertip to there, with the distance of the skin
 plots/contact_mm/OBJECT/FINGER       distance of the skin, negative inside
 states/HAND/OBJECT                   held, touched
-
-Results of a master other than hands, in one Rerun recording.
-
-Objects, contact and gestures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,10 +39,7 @@ _LABEL_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
 
 
 class GesturesLayer:
-    """Logger of gestures to a recording that belongs to the caller.
-
-    Holds which key each hand tapped last, and when.
-    """
+    """Logger of gestures to a recording that belongs to the caller."""
 
     def __init__(self, recording: rr.RecordingStream, states: States) -> None:
         self._rec, self._states = recording, states
@@ -65,9 +48,7 @@ class GesturesLayer:
     def log(self, gestures: Sequence[Gesture], joints_m: Mapping[tuple[str, int], Float]) -> None:
         """Log gestures of any hands, in the order of time.
 
-        Args:
-            gestures: The messages.
-            joints_m: Hand and `t_ns` -> (6, 3) the five tips and the palm [m], rig frame, where they are known.
+        `joints_m`: hand and `t_ns` -> (6, 3) the five tips and the palm [m], rig frame, where they are known.
         """
         for one in gestures:
             root = rr.new_entity_path([WORLD, "gestures", one.hand])
@@ -148,10 +129,7 @@ class GesturesLayer:
 
 
 def arc(axis: Float, angle_rad: float) -> Float:
-    """Return points (N, 3) of a unit circle arc about an axis (3,).
-
-    From its top (the side of -y) on, by an angle about the axis.
-    """
+    """Return points (N, 3) of a unit circle about an axis, from its top (-y) on."""
     first = np.array([0.0, -1.0, 0.0]) - axis * -axis[1]
     if np.linalg.norm(first) < 1e-3:
         first = np.array([1.0, 0.0, 0.0])
@@ -182,10 +160,7 @@ class _Shown:
 
 
 class ObjectsLayer:
-    """Logger of objects and contact to a recording that belongs to the caller.
-
-    Holds how each object is shown.
-    """
+    """Logger of objects and contact to a recording that belongs to the caller."""
 
     def __init__(
         self, recording: rr.RecordingStream, states: States, profiles: Sequence[ObjectProfile]
@@ -201,10 +176,8 @@ class ObjectsLayer:
         """Log a batch of poses of any objects, each in the order of time."""
         for name in dict.fromkeys(pose.object for pose in poses):
             own = [pose for pose in poses if pose.object == name]
-            root, shown = (
-                rr.new_entity_path([WORLD, "objects", name]),
-                self._shown.setdefault(name, _Shown(None)),
-            )
+            root = rr.new_entity_path([WORLD, "objects", name])
+            shown = self._shown.setdefault(name, _Shown(None))
             for pose in own:
                 if (look := ObjectAppearance.of(pose)) != shown.look:
                     self._states.at(pose.t_ns)
@@ -221,18 +194,15 @@ class ObjectsLayer:
     def log_contacts(self, contacts: Sequence[Contact], tips_m: Mapping[tuple[str, int], Float]) -> None:
         """Log contact of any hands and objects, each in the order of time.
 
-        Args:
-            contacts: The messages.
-            tips_m: Hand and `t_ns` -> the five fingertips, and what else there is (N, 3) [m], where they are known.
+        `tips_m`: hand and `t_ns` -> the five fingertips, and what else there is (N, 3) [m], where they are
+        known.
         """
         for hand, name in dict.fromkeys((one.hand, one.object) for one in contacts):
             own = [one for one in contacts if (one.hand, one.object) == (hand, name)]
             t = np.array([one.t_ns for one in own], np.int64)
             root = rr.new_entity_path([WORLD, "contact", hand, name])
-            distance, point = (
-                np.array([one.distance_m for one in own]),
-                np.array([one.point_m for one in own]),
-            )
+            distance = np.array([one.distance_m for one in own])
+            point = np.array([one.point_m for one in own])
             touching = np.array([one.touching for one in own])
             near_m = 0.03  # of a finger that is shown beside an object
             near = seen(point) & (distance < near_m)
@@ -360,12 +330,7 @@ _NAMED = [*TIPS.tolist(), PALM]
 
 
 class ResultLayer:
-    """Logger of results to a recording that belongs to the caller.
-
-    Holds tips and palm of the last poses.
-
-    Contact and gestures are drawn at the joints of their own epoch.
-    """
+    """Logger of results; contact and gestures are drawn at their own epoch's joints."""
 
     def __init__(self, recording: rr.RecordingStream, objects: Sequence[ObjectProfile]) -> None:
         states = States(recording)

@@ -1,37 +1,6 @@
-"""Log hands, cameras, objects and the wrist device as a 3D scene of Rerun.
+"""The scene logs hands, rig and camera pictures to one Rerun recording.
 
-Wrist device in the viewer's scene.
-
-The fan of its laser, where that meets each finger, and what the device saw.
-
-world                                a device alone: all of it, turned as the forearm is held, up is up; where an IMU
-                                     measures it
-world/laser/fan                      the laser's light, as far as the rig specifies where it goes
-world/laser/points                   where it meets each finger, in the finger's colour
-world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
-world/cameras/CAM/laser              the same points as this camera should see them
-world/cameras/CAM/detections/...     laser, tips: as it saw them, where that is known
-
-Beside marker cameras the same entities stand in the rig frame: `world/laser`, `world/rays/CAM` and `world/cameras/CAM`
-move with the device, which the solved palm and the wrist's bend place (`device_place`). Added are
-
-world/hand/HAND/forearm              from the wrist towards the elbow
-world/hand/HAND/forearm_uncertainty        a ring: where its far end is at 2 sigma of the bend
-plots/wrist_angles_deg/...             flexion and deviation
-
-The scene logs hands, rig and camera pictures to one Rerun recording.
-
-Camera pictures in the viewer.
-
-Few enough, and at the size in which all centroids are.
-
-Contents of the viewer's scene as entities of one Rerun recording.
-
-Poses, detections, images and health.
-
-Poses are logged as columns (`rerun_columns`). Every row stands on the timeline "capture" at its `t_ns`.
-The scene holds the times of the last second (rate), the images' state, and which entities have got their
-style.
+Every row stands on the timeline "capture" at its `t_ns`. Entities:
 
     about                                text: what the colours mean
     world/volume                         box that the rig states
@@ -42,14 +11,20 @@ style.
     world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips, up to 3 cm
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
-    world/objects, contact               what else is tracked, and where fingers touch it: see `rerun_objects`
-    world/gestures; states; events       what the hands signal: see `rerun_gestures`
-    world/laser, ...                     of a wrist device, alone or beside the markers: see `rerun_wrist`
+    world/objects, contact, gestures; states; events       see `rerun_results`
     world/truth/skeleton, markers        where a truth is known
     plots/...                            latency, rate, jitter, error, PIP angles, bend of the wrist, counts, health
 
-Of several hands the first has these paths; markers, laser, truth and plots of another carry its name behind the group
-(`world/markers/HAND/raw`, `plots/pip_deg/HAND/index`).
+Of a wrist device; `world` is turned as the forearm is held (up is up) where an IMU measures it:
+
+    world/laser/fan, points              its light as far as the rig specifies it; where it meets each finger
+    world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
+    world/cameras/CAM/laser              the same points as this camera should see them; /detections/laser, tips
+
+Beside marker cameras `world/laser`, `world/rays/CAM` and `world/cameras/CAM` move with the device
+(`DevicePlace`), and `world/hand/HAND/forearm`, `forearm_uncertainty` (a ring: its far end at 2 sigma of the
+bend) and `plots/wrist_angles_deg` are added. Of several hands the first has these paths; markers, laser,
+truth and plots of another carry its name behind the group (`world/markers/HAND/raw`).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -101,10 +76,7 @@ _FINGER_RGB = [series_rgb(finger) for finger in range(FINGER_COUNT)]
 
 
 class WristLayer:
-    """Logger of one wrist device to a recording that belongs to the caller.
-
-    Holds the viewing direction of the first pose.
-    """
+    """Logger of one wrist device to a recording that belongs to the caller."""
 
     def __init__(
         self,
@@ -119,12 +91,9 @@ class WristLayer:
         """Log what never changes.
 
         Args:
-            recording: Where it goes.
-            camera: The device's camera.
-            setup: The device.
-            spread: Directions (K, 3) of its light, see `fan_rays`.
+            spread: Directions (K, 3) of the device's light, see `fan_rays`.
             group: What stands behind the paths of laser and plots, see `RerunScene`.
-            in_rig: Poses are in the frame of a rig of markers, not of its camera.
+            in_rig: Poses are in the frame of a rig of markers, not of the device's camera.
         """
         self._rows, self._setup, self._in_rig = Columns(recording), setup, in_rig
         self._laser, self._group = f"{WORLD}/laser{group}", group
@@ -191,10 +160,7 @@ class WristLayer:
             )
 
     def _log_held(self, poses: Poses) -> None:
-        """Rotate the scene so that y points down along gravity.
-
-        What the camera first looked along, z, stays ahead.
-        """
+        """Turn the scene: y down along gravity, the first viewing direction ahead."""
         known = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
         if not len(known):
             return
@@ -208,10 +174,7 @@ class WristLayer:
         self._rows.send(WORLD, poses.t_ns[known], columns, None)
 
     def log_detections(self, frames: Sequence[WristDetections]) -> None:
-        """Log the laser and fingertips that the camera saw, in its image.
-
-        Frames in the order of time.
-        """
+        """Log laser and fingertips as the camera saw them; frames in order of time."""
         t = np.array([frame.t_ns for frame in frames], np.int64)
         colours = np.broadcast_to(pack(_FINGER_RGB), (len(frames), FINGER_COUNT))
         path = f"{camera_path(self._camera)}/detections"
@@ -224,7 +187,7 @@ class WristLayer:
 
 
 def _level(world_camera: Float) -> Float:
-    """Return the rotation from the IMU's world to x right, y down, z ahead.
+    """Rotation from the IMU's world to x right, y down, z ahead.
 
     Ahead is where the camera looks, or its image's top where it looks up.
     """
@@ -237,10 +200,7 @@ def _level(world_camera: Float) -> Float:
 
 
 class CameraImages:
-    """Logger of images to `recording`, which belongs to the caller.
-
-    Holds time and size of each camera's last image.
-    """
+    """Logger of camera images to a recording that belongs to the caller."""
 
     def __init__(self, recording: rr.RecordingStream, models: Mapping[str, CameraModel]) -> None:
         """Take the cameras of the rig by name."""
@@ -250,19 +210,15 @@ class CameraImages:
         self._size: dict[str, tuple[int, int]] = {}
 
     def log(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
-        """Show an image of a camera at its full size, however small it is.
+        """Show an image of a camera at its full size; return whether it was logged.
 
-        More than 10 a second are dropped, and so are images of a camera that the rig does not have, bytes that are
-        no JPEG, and what claims to be larger than the camera's picture.
+        Dropped are more than 10 a second, images of a camera that the rig does not have, bytes that are no JPEG, and
+        what claims to be larger than the camera's picture.
 
         Args:
-            camera: A camera of the rig.
             image: (H, W, 3) BGR, (H, W) grey, or a whole JPEG file as bytes.
             t_ns: Capture time [ns].
             shown_ns: Where it stands on the timeline [ns]; None: at `t_ns`.
-
-        Returns:
-            Whether it was logged.
         """
         last = self._last_ns.get(camera)
         image_period_ns = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
@@ -301,26 +257,17 @@ def _size(image: Image | bytes) -> Size | None:
 
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)
-_HINGE_OF_ANGLE = np.array(
-    [[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS]
-)  # joint that angle (5, 4) turns
+# joint that angle (5, 4) turns
+_HINGE_OF_ANGLE = np.array([[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS])
 _AT_LIMIT_RAD = np.deg2rad(0.5)
 _FRUSTUM_LINE_M = 0.0004
 
 
 class RerunScene:
-    """Logger of the hands and their sensors to `recording`.
-
-    Logs what observes each hand, and the hands. The recording belongs to the caller.
-    """
+    """Logger of the hands and what observes them; the recording is the caller's."""
 
     def __init__(self, recording: rr.RecordingStream, setups: Sequence[RigSetup]) -> None:
-        """Log what never changes: frames, frusta, names and colours of plots.
-
-        Args:
-            recording: Where it goes.
-            setups: One for each hand; cameras that several of them have are shown once.
-        """
+        """Log what never changes; cameras that several setups have are shown once."""
         self._rec, self._rows = recording, Columns(recording)
         self._first = setups[0]
         self._setups = {setup.hand.profile.name: setup for setup in setups}
@@ -362,10 +309,7 @@ class RerunScene:
         return int(self._recent_ns[-1]) if len(self._recent_ns) else None
 
     def log_poses(self, poses: Poses, truth: PosesTruth | None = None) -> None:
-        """Log a batch of poses of one hand and their truth row by row.
-
-        In the order of time.
-        """
+        """Log a batch of poses of one hand, and their truth row by row, in time order."""
         if not len(poses):
             return
         setup = self._setups.get(poses.hand, self._first)
@@ -380,10 +324,7 @@ class RerunScene:
         self._results.remember(poses)
 
     def log_results(self, results: Sequence[ResultMessage]) -> None:
-        """Log objects, contact and gestures, each in the order of time.
-
-        After the poses of the hands that they belong to.
-        """
+        """Log objects, contact and gestures in time order, after their hands' poses."""
         self._results.log(results)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
@@ -545,10 +486,7 @@ class RerunScene:
             self._rows.scalars(path, t, mean_known(error) * 1e3)
 
     def _rate_hz(self, t_ns: Int) -> Float:
-        """Return poses per second (T,) over the second that ends at each row.
-
-        NaN for the very first.
-        """
+        """Poses per second (T,) over the second up to each row; NaN for the very first."""
         times = np.concatenate([self._recent_ns, t_ns])
         rows = np.arange(len(self._recent_ns), len(times))
         first = np.searchsorted(times, times[rows] - 1_000_000_000)
@@ -562,10 +500,7 @@ def _marker_colours(count: int) -> npt.NDArray[np.uint32]:
 
 
 def _at_limit(angles_rad: Float, hand: HandModel) -> Bool:
-    """Return a mask (T, 26) of the joints with an angle at its limit.
-
-    A fixed angle does not count.
-    """
+    """Mask (T, 26) of joints with an angle, other than a fixed one, at its limit."""
     low, high = hand.limits_at(angles_rad[..., FLEXION])
     reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
     reached &= high - low > 2 * _AT_LIMIT_RAD
@@ -576,9 +511,6 @@ def _at_limit(angles_rad: Float, hand: HandModel) -> Bool:
 
 
 def _strips(at: Float, shown: Bool) -> list[Float]:
-    """Return the line strips of joints (T, 26, 3) that are shown (T, 6).
-
-    One for every (row, strip) shown, in that order.
-    """
+    """Line strips of joints (T, 26, 3), one for each True of `shown` (T, 6)."""
     rows, strips = np.nonzero(shown)
     return [at[i, list(_STRIPS[k])] for i, k in zip(rows.tolist(), strips.tolist(), strict=True)]

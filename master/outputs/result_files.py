@@ -1,22 +1,15 @@
 """Tables and files keep the objects, contacts and gestures of a run.
 
-Table of fixed row type that becomes an .npz when the run ends.
-
-In constant memory; the file is complete or not written at all.
-
-Rows are spooled to a nameless file beside the target, so a run may have any length and a full disk shows while
-tracking, not at the end. `close` turns the spool into the .npz: uncompressed, with fixed time stamps, hence
-byte-identical for identical rows.
-
-Writer and reader of the results of a run beside the hands.
-
-object_<name>.npz, contact_<hand>_<object>.npz, gestures.jsonl.
-
-They stand in the folder of poses.npz. A gesture is a line of JSON with the fields of the message; NaN is null.
+object_<name>.npz, contact_<hand>_<object>.npz and gestures.jsonl (a message a line, NaN is null) beside
+poses.npz. What is written is spooled to a nameless file beside the target, so a run may have any length in
+constant memory, and a full disk shows while tracking. `close` makes the file, complete or not at all; an .npz
+is uncompressed, with fixed time stamps, hence byte-identical for identical rows.
 """
 
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -29,58 +22,24 @@ import numpy.typing as npt
 from common.arrays import Bool, Code, Float, Int
 from common.calibration.files import replacing
 from common.errors import RecordingError
-from common.messages import FINGER_COUNT, Gesture, Message, ObjectPose
+from common.messages import FINGER_COUNT, Contact, Gesture, Message, ObjectPose
 from common.recording.recorded_files import read_npz, write_npz
 
 Row = np.dtype[np.void]
 
 
-class TableFile:
-    """The file of one table; holds the spool of rows written so far."""
-
-    def __init__(self, path: Path, dtype: Row, labels: Mapping[str, str]) -> None:
-        """Open the spool in the folder of `path`.
-
-        Args:
-            path: The .npz to write.
-            dtype: Of a row: each field is an attribute of the messages, and becomes an array of the file.
-            labels: Texts that stand in the file beside the arrays.
-
-        Raises:
-            RecordingError: The folder is missing or read-only.
-        """
-        self._path, self._dtype, self._labels = path, dtype, dict(labels)
-        self._rows = 0
-        self._closed = False
+class _SpooledFile(ABC):
+    def __init__(self, path: Path) -> None:
+        """Open the spool in the folder of `path`; RecordingError: missing or read-only."""
+        self._path, self._closed = path, False
         try:
             # Its name is gone at once: a killed process leaves nothing behind.
             self._spool: IO[bytes] = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
         except OSError as error:
             raise cannot_write(path, error) from error
 
-    def write(self, message: Message) -> None:
-        """Append the row of one message.
-
-        Raises:
-            RecordingError: Disk full; the run's file is given up, see `close`.
-            ValueError: It is closed.
-        """
-        if self._closed:
-            raise ValueError(f"{self._path}: already closed")
-        row = np.empty((), self._dtype)
-        for name in self._dtype.names or ():
-            row[name] = getattr(message, name)
-        try:
-            self._spool.write(row.tobytes())
-        except OSError as error:
-            self._give_up()
-            raise cannot_write(self._path, error) from error
-        self._rows += 1
-
     def close(self) -> None:
-        """Write the .npz.
-
-        An older file of that name is replaced only by a complete one. Safe to call twice.
+        """Make the file, replacing an older one when complete. Safe to call twice.
 
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.
@@ -88,27 +47,65 @@ class TableFile:
         if self._closed:
             return
         try:
-            self._spool.flush()
-            table = self._table()
-            columns: dict[str, npt.NDArray[Any]] = {name: table[name] for name in self._dtype.names or ()}
-            write_npz(self._path, columns | {name: np.array(text) for name, text in self._labels.items()})
+            self._finish()
         except OSError as error:
             raise cannot_write(self._path, error) from error
         finally:
             self._give_up()
 
-    def _table(self) -> npt.NDArray[np.void]:
-        if self._rows == 0:  # an empty file cannot be mapped
-            return np.empty(0, self._dtype)
-        return np.memmap(self._spool, self._dtype, "r", shape=(self._rows,))
+    @abstractmethod
+    def _finish(self) -> None:
+        """Turn the spool into the file."""
+
+    def _append(self, data: bytes) -> None:
+        try:
+            self._spool.write(data)
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from error
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise ValueError(f"{self._path}: already closed")
 
     def _give_up(self) -> None:
         self._closed = True
-        try:
+        # Closing flushes what a full disk refused before; that error was already raised.
+        with suppress(OSError):
             self._spool.close()
-        except OSError:
-            # Closing flushes what a full disk refused before; that error was already raised.
-            return
+
+
+class TableFile(_SpooledFile):
+    """A table of fixed row type that becomes an .npz."""
+
+    def __init__(self, path: Path, dtype: Row, labels: Mapping[str, str]) -> None:
+        """Open the spool in the folder of `path`; RecordingError: missing or read-only.
+
+        Args:
+            dtype: Of a row: each field is an attribute of the messages, and becomes an array of the file.
+            labels: Texts that stand in the file beside the arrays.
+        """
+        self._dtype, self._labels = dtype, dict(labels)
+        self._rows = 0
+        super().__init__(path)
+
+    def write(self, message: Message) -> None:
+        """Append the row of one message; RecordingError: disk full, the file is given up."""
+        self._refuse_closed()
+        row = np.empty((), self._dtype)
+        for name in self._dtype.names or ():
+            row[name] = getattr(message, name)
+        self._append(row.tobytes())
+        self._rows += 1
+
+    def _finish(self) -> None:
+        self._spool.flush()
+        if self._rows == 0:  # an empty file cannot be mapped
+            table = np.empty(0, self._dtype)
+        else:
+            table = np.memmap(self._spool, self._dtype, "r", shape=(self._rows,))
+        columns: dict[str, npt.NDArray[Any]] = {name: table[name] for name in self._dtype.names or ()}
+        write_npz(self._path, columns | {name: np.array(text) for name, text in self._labels.items()})
 
 
 def cannot_write(path: Path, error: OSError) -> RecordingError:
@@ -123,33 +120,20 @@ _OURS = "not written by this program"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPoses:
-    """T poses of one object; fields as in `ObjectPose`.
-
-    Attributes:
-        object: Name of the object file.
-        t_ns: (T,) [ns].
-        position_m: (T, 3) [m], rig frame. NaN: not known.
-        orientation_wxyz: (T, 4) object axes -> rig frame.
-        cov: (T, 6, 6) [m^2, m rad, rad^2].
-        residual_m: (T,) [m].
-        source: (T,) `ObjectSource` codes.
-        tracked, occluded: (T,).
-        seen, expected: (T,).
-        latency_ns: (T,) [ns]; 0 in an offline run.
-    """
+    """T poses of one object; fields as in `ObjectPose`."""
 
     object: str
-    t_ns: Int
-    position_m: Float
-    orientation_wxyz: Float
-    cov: Float
-    residual_m: Float
-    source: Code
-    tracked: Bool
-    seen: Int
-    expected: Int
-    occluded: Bool
-    latency_ns: Int
+    t_ns: Int  # (T,) [ns]
+    position_m: Float  # (T, 3) [m], rig frame. NaN: not known
+    orientation_wxyz: Float  # (T, 4) object axes -> rig frame
+    cov: Float  # (T, 6, 6) [m^2, m rad, rad^2]
+    residual_m: Float  # (T,) [m]
+    source: Code  # (T,) `ObjectSource` codes
+    tracked: Bool  # (T,)
+    seen: Int  # (T,)
+    expected: Int  # (T,)
+    occluded: Bool  # (T,)
+    latency_ns: Int  # (T,) [ns]; 0 in an offline run
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -164,35 +148,36 @@ class ObjectPoses:
         """Stack the poses of one object; also none."""
         return cls(object=name, **_stacked(poses, object_record()))
 
+    def messages(self) -> list[ObjectPose]:
+        """The rows as the messages they were."""
+        return [ObjectPose(object=self.object, **row) for row in _rows(self, object_record())]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contacts:
-    """Distances of one hand to one object at T times.
-
-    Fields as in `Contact`.
-
-    Attributes:
-        hand, object: Their names.
-        t_ns: (T,) [ns], those of the hand's poses.
-        distance_m, sigma_m: (T, 5) [m].
-        point_m: (T, 5, 3) [m], rig frame.
-        touching: (T, 5).
-        palm_distance_m: (T,) [m].
-        held: (T,).
-    """
+    """Distances of one hand to one object at T times; fields as in `Contact`."""
 
     hand: str
     object: str
-    t_ns: Int
-    distance_m: Float
-    sigma_m: Float
-    point_m: Float
-    touching: Bool
-    palm_distance_m: Float
-    held: Bool
+    t_ns: Int  # (T,) [ns], those of the hand's poses
+    distance_m: Float  # (T, 5) [m]
+    sigma_m: Float  # (T, 5) [m]
+    point_m: Float  # (T, 5, 3) [m], rig frame
+    touching: Bool  # (T, 5)
+    palm_distance_m: Float  # (T,) [m]
+    held: Bool  # (T,)
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    @classmethod
+    def of(cls, hand: str, name: str, contacts: Sequence[Contact]) -> "Contacts":
+        """Stack the contacts of a hand and an object; also none."""
+        return cls(hand=hand, object=name, **_stacked(contacts, contact_record()))
+
+    def messages(self) -> list[Contact]:
+        """The rows as the messages they were."""
+        return [Contact(hand=self.hand, object=self.object, **row) for row in _rows(self, contact_record())]
 
 
 def object_record() -> Row:
@@ -238,6 +223,21 @@ def _stacked(messages: Sequence[Message], dtype: Row) -> dict[str, Any]:
     }
 
 
+def _rows(table: ObjectPoses | Contacts, dtype: Row) -> list[dict[str, Any]]:
+    """Each row by its fields: arrays, and plain numbers where a field is one number."""
+    columns = {name: getattr(table, name) for name in dtype.names or ()}
+    values = {name: column.tolist() if column.ndim == 1 else column for name, column in columns.items()}
+    return [{name: value[row] for name, value in values.items()} for row in range(len(table))]
+
+
+def nearest_rows(rising_ns: Int, t_ns: Int) -> Int:
+    """Rows (T,) of rising times that are nearest to others (T,)."""
+    after = np.clip(np.searchsorted(rising_ns, t_ns), 0, len(rising_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(rising_ns[before] - t_ns) <= np.abs(rising_ns[after] - t_ns)
+    return np.where(nearer, before, after)
+
+
 def object_path(folder: Path, name: str) -> Path:
     """Where the poses of an object stand."""
     return folder / f"object_{name}.npz"
@@ -249,80 +249,31 @@ def contact_path(folder: Path, hand: str, name: str) -> Path:
 
 
 def object_file(folder: Path, name: str) -> TableFile:
-    """Open object_<name>.npz.
-
-    Raises:
-        RecordingError: The folder is missing or read-only.
-    """
+    """Open object_<name>.npz; RecordingError: the folder is missing or read-only."""
     return TableFile(object_path(folder, name), object_record(), {"object": name})
 
 
 def contact_file(folder: Path, hand: str, name: str) -> TableFile:
-    """Open contact_<hand>_<object>.npz.
-
-    Raises:
-        RecordingError: The folder is missing or read-only.
-    """
+    """Open contact_<hand>_<object>.npz; RecordingError as `object_file`."""
     return TableFile(contact_path(folder, hand, name), contact_record(), {"hand": hand, "object": name})
 
 
-class GesturesFile:
-    """gestures.jsonl; holds the spool of lines written so far."""
+class GesturesFile(_SpooledFile):
+    """gestures.jsonl in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open the spool.
-
-        Raises:
-            RecordingError: The folder is missing or read-only.
-        """
-        self._path = folder / GESTURES
-        self._closed = False
-        try:
-            self._spool: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
-        except OSError as error:
-            raise cannot_write(self._path, error) from error
+        super().__init__(folder / GESTURES)
 
     def write(self, gesture: Gesture) -> None:
-        """Append a line.
+        """Append a line; RecordingError: disk full, the file is given up."""
+        self._refuse_closed()
+        self._append(gesture_line(gesture))
 
-        Raises:
-            RecordingError: Disk full; the run's file is given up.
-            ValueError: It is closed.
-        """
-        if self._closed:
-            raise ValueError(f"{self._path}: already closed")
-        try:
-            self._spool.write(gesture_line(gesture))
-        except OSError as error:
-            self._give_up()
-            raise cannot_write(self._path, error) from error
-
-    def close(self) -> None:
-        """Write the file.
-
-        An older file is replaced only by a complete one. Safe to call twice.
-
-        Raises:
-            RecordingError: Disk full or folder gone; no part of a file is left.
-        """
-        if self._closed:
-            return
-        try:
-            self._spool.seek(0)
-            with replacing(self._path) as file:
-                while block := self._spool.read(1 << 20):
-                    file.write(block)
-        except OSError as error:
-            raise cannot_write(self._path, error) from error
-        finally:
-            self._give_up()
-
-    def _give_up(self) -> None:
-        self._closed = True
-        try:
-            self._spool.close()
-        except OSError:
-            return  # closing flushes what a full disk refused before; that error was already raised
+    def _finish(self) -> None:
+        self._spool.seek(0)
+        with replacing(self._path) as file:
+            while block := self._spool.read(1 << 20):
+                file.write(block)
 
 
 def gesture_line(gesture: Gesture) -> bytes:
@@ -346,30 +297,17 @@ def _from_list(kind: type, values: object) -> object:
 
 
 def load_object(path: Path) -> ObjectPoses:
-    """Read object_<name>.npz.
-
-    Raises:
-        RecordingError: Missing, not an .npz, a key missing or of the wrong type or shape.
-    """
-    arrays = _table(path, object_record(), ("object",))
-    return ObjectPoses(**arrays)
+    """Read object_<name>.npz; RecordingError: missing, or not of this type and shape."""
+    return ObjectPoses(**_table(path, object_record(), ("object",)))
 
 
 def load_contact(path: Path) -> Contacts:
-    """Read contact_<hand>_<object>.npz.
-
-    Raises:
-        RecordingError: As `load_object`.
-    """
+    """Read contact_<hand>_<object>.npz; RecordingError as `load_object`."""
     return Contacts(**_table(path, contact_record(), ("hand", "object")))
 
 
 def load_gesture_messages(path: Path) -> list[Gesture]:
-    """Read gestures.jsonl.
-
-    Raises:
-        RecordingError: Missing, or a line is no gesture; with its number.
-    """
+    """Read gestures.jsonl; RecordingError: missing, or a line is no gesture."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
@@ -386,11 +324,7 @@ def load_gesture_messages(path: Path) -> list[Gesture]:
 
 
 def _table(path: Path, dtype: Row, labels: tuple[str, ...]) -> dict[str, Any]:
-    """The arrays and labels of a table, of the right types.
-
-    Raises:
-        RecordingError: Missing, not an .npz, a key missing or of the wrong type or shape.
-    """
+    """The arrays and labels of a table; RecordingError as `load_object`."""
     names = dtype.names or ()
     arrays = read_npz(path, [*names, *labels], _OURS)
     count = len(arrays["t_ns"]) if arrays["t_ns"].ndim else -1

@@ -1,7 +1,4 @@
-"""Calibration files that a recording carries.
-
-Also the setups that are rebuilt from them.
-"""
+"""Calibration files that a recording carries, and the setups rebuilt from them."""
 
 import json
 import tempfile
@@ -16,10 +13,7 @@ from master.rig.setup import RigFiles, RigSetup, load_setups
 def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, bytes]:
     """All files that `setups` were read from, by their path in the calibration tree.
 
-    A hand's file from elsewhere stands where the rig would have it.
-
-    Raises:
-        RecordingError: One cannot be read.
+    A hand's file from elsewhere stands where the rig would have it. RecordingError: one cannot be read.
     """
     found: dict[str, bytes] = {}
     for path in files.paths(setups):
@@ -38,19 +32,12 @@ def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, byte
 
 
 def rigs_text(rigs: Sequence[str]) -> str:
-    """Return the names of the rigs as a recording stores them.
-
-    Their order determines which hand is the first.
-    """
+    """Return the names of the rigs as a recording stores them, the first hand first."""
     return json.dumps(list(rigs))
 
 
 def recorded_rigs(recording: MessageRecording) -> tuple[str, ...]:
-    """The names of the rigs of a recording.
-
-    Raises:
-        RecordingError: It does not state them, or one is no plain name.
-    """
+    """Rigs of a recording; RecordingError: not stated, or one is no plain name."""
     text = recording.about.get("rigs")
     rigs = plain_names(recording.path, "rigs", text) if text is not None else ()
     if not rigs:
@@ -61,12 +48,7 @@ def recorded_rigs(recording: MessageRecording) -> tuple[str, ...]:
 
 
 def recorded_setups(recording: MessageRecording) -> tuple[RigSetup, ...]:
-    """What watched each hand, from the files that the recording carries.
-
-    Raises:
-        RecordingError: It carries none.
-        CalibrationError: They are broken.
-    """
+    """Setups from the files that a recording carries; RecordingError: it has none."""
     rigs = recorded_rigs(recording)
     with tempfile.TemporaryDirectory(prefix="phalanx-") as folder:
         unpack(recording, Path(folder))
@@ -74,13 +56,7 @@ def recorded_setups(recording: MessageRecording) -> tuple[RigSetup, ...]:
 
 
 def unpack(recording: MessageRecording, folder: Path) -> None:
-    """Write the files of a recording into a folder, as a calibration tree.
-
-    Their names were checked before.
-
-    Raises:
-        RecordingError: One cannot be written.
-    """
+    """Write a recording's files, of checked names, into a folder; RecordingError."""
     for name, data in recording.files.items():
         path = folder / name
         try:

@@ -1,11 +1,4 @@
-"""`phalanx info` and its neighbours describe a recording in lines of text.
-
-Text output about a recording.
-
-The progress line, and the table of what is in a file.
-
-`phalanx info`.
-"""
+"""`phalanx info` and its neighbours describe a recording in lines of text."""
 
 from argparse import Namespace
 from typing import TextIO
@@ -22,12 +15,7 @@ RAW_FOLDERS = msgspec.json.Decoder(dict[str, str])
 
 
 class ProgressLine:
-    """Progress display on a stream.
-
-    On a terminal in place at every call, elsewhere a line at every fifth.
-
-    Holds how often it was called.
-    """
+    """Progress display: on a terminal in place, elsewhere a line at every fifth call."""
 
     def __init__(self, stream: TextIO, prefix: str) -> None:
         self._stream, self._prefix, self._calls = stream, prefix, 0
@@ -77,10 +65,7 @@ def bar(done: float, length: int = 24) -> str:
 
 
 def table(recording: MessageRecording, events: list[str]) -> list[str]:
-    """Return a table of a recording's streams and their rates.
-
-    Also its length and files, and what has to be known of it.
-    """
+    """Return a table of a recording's streams and rates, length, files and faults."""
     seconds = (recording.end_t_ns - recording.begin_t_ns) * 1e-9
     megabytes = recording.path.stat().st_size * 1e-6
     ended = "cut: it was not ended" if recording.cut else "whole"
@@ -106,10 +91,7 @@ def table(recording: MessageRecording, events: list[str]) -> list[str]:
 
 
 def raw_lines(recording: MessageRecording) -> list[str]:
-    """List the raw frames that the slaves kept beside a recording.
-
-    As far as the slaves reported them; nothing where nobody asked for them.
-    """
+    """List the raw frames that the slaves reported beside a recording."""
     try:
         folders = RAW_FOLDERS.decode(recording.about.get("raw", "{}"))
     except (msgspec.DecodeError, RecursionError):
@@ -131,19 +113,13 @@ def raw_lines(recording: MessageRecording) -> list[str]:
 
 
 def events_of(recording: MessageRecording) -> list[str]:
-    """List the events that a replay cannot repeat, or that are missing from it.
-
-    Events that happened during recording.
-    """
+    """List what happened while recording that a replay cannot repeat or lacks."""
     watch = EventMonitor(recording.begin_t_ns)
     return [line for one in recording.read(["health"]) for line in watch.push(one.t_ns, one.message)]
 
 
 class EventMonitor:
-    """Monitor of events, from the reports of master and recorder.
-
-    Holds their last reports.
-    """
+    """Monitor of events, from the reports of master and recorder."""
 
     def __init__(self, begin_t_ns: int) -> None:
         self._begin_ns = begin_t_ns
@@ -152,10 +128,7 @@ class EventMonitor:
         self.restarted = self.changed = False
 
     def push(self, t_ns: int, message: object) -> list[str]:
-        """Take a report; return lines for what is new in it.
-
-        `restarted`: it is the first of a new master.
-        """
+        """Take a report; return what is new; `restarted`: the first of a new master."""
         self.restarted = False
         if not isinstance(message, Health):
             return []

@@ -1,13 +1,7 @@
 """`phalanx play` runs the player as a process of its own.
 
-Player as a process.
-
-On the bus it acts as the master whose messages it plays, with commands of its own.
-
-Whatever listens to a live master (viewer, console, outputs) sees the recording as if it were live, with the times of
-then.
-
-`phalanx play`.
+On the bus it acts as the master whose messages it plays, with commands of its own: whatever listens to a live
+master (viewer, console, outputs) sees the recording as if it were live, with the times of then.
 """
 
 import secrets
@@ -41,24 +35,15 @@ from master.run.process import host_bus, stop_on_signals
 
 @dataclass(frozen=True, slots=True)
 class PlaySettings:
-    """What is played, and how.
-
-    Attributes:
-        path: The recording.
-        speed: 1: as it was; 0: as fast as it goes.
-        from_s, to_s: The stretch, from the beginning of the recording [s]; None: all.
-        out: Folder for poses.npz and what else there is, or None.
-        loop: Begin again at the end.
-        solved: Publish what was published live instead of solving.
-    """
+    """What is played, and how."""
 
     path: Path
-    speed: float = 1.0
-    from_s: float | None = None
+    speed: float = 1.0  # 1: as it was; 0: as fast as it goes
+    from_s: float | None = None  # after the beginning of the recording [s]; None: all
     to_s: float | None = None
-    out: Path | None = None
-    loop: bool = False
-    solved: bool = False
+    out: Path | None = None  # folder for poses.npz and what else there is, or None
+    loop: bool = False  # begin again at the end
+    solved: bool = False  # publish what was published live instead of solving
 
 
 def run_play(
@@ -68,17 +53,13 @@ def run_play(
     notify: Callable[[str], None],
     show: Callable[[float, float], None] = lambda _position_s, _length_s: None,
 ) -> Passed:
-    """Play until the end, or until stopped.
+    """Play until the end, or until stopped; return the last pass.
 
     Args:
-        settings: What, and how.
         bus: Where it is published; None: nowhere. Left open.
         stop: Set by a signal handler, or by the command "stop".
-        say: Called with a line when something happens.
+        notify: Called with a line when something happens.
         show: Called once a second where it is [s], of how much.
-
-    Returns:
-        The last pass.
 
     Raises:
         RecordingError: The file cannot be read, or carries no files of calibration, or a result cannot be written.
@@ -133,14 +114,7 @@ def run_play(
 
 
 def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable[[str], None]) -> None:
-    """Refuse recordings that cannot be played, and print notices on the others.
-
-    The notices are what has to be known of what can be played.
-
-    Raises:
-        RecordingError: There is nothing to play.
-        PhalanxError: The settings contradict each other.
-    """
+    """Refuse what cannot be played, and print what has to be known of the rest."""
     if settings.loop and settings.out is not None:
         raise PhalanxError("--loop and --out: the files of a run have an end; leave out one of them")
     wanted = "hand" if settings.solved else "taken"
@@ -158,10 +132,7 @@ def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable
 
 
 class _Host:
-    """Command responder and health reporter of the player.
-
-    Holds its id and the thread that reports.
-    """
+    """Command responder and health reporter of the player."""
 
     def __init__(
         self,
@@ -194,10 +165,7 @@ class _Host:
         return (self._player.at_ns - self._begin_ns) * 1e-9
 
     def health(self) -> Health:
-        """Return the player's health, in the form of the master's report.
-
-        Also play.position_s, .length_s, .speed and .paused (0, 1).
-        """
+        """The player's health in the form of the master's, with play.* metrics."""
         metrics = {
             "play.position_s": round(self.position_s, 3),
             "play.length_s": round(self.length_s, 3),
@@ -209,13 +177,7 @@ class _Host:
         return Health(MASTER, self._session, now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
-        """Obey a command to the player.
-
-        "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".
-
-        Raises:
-            ValueError: Another verb, or a body that does not fit; the asker reads what does.
-        """
+        """Obey a command to the player; ValueError: unknown verb, or unfit body."""
         verbs: dict[str, Callable[[], None]] = {
             "report": lambda: None,
             "pause": self._player.pause,
@@ -233,17 +195,14 @@ class _Host:
     def close(self) -> None:
         """Report no more. Safe to call twice."""
         self._closing.set()
-        self._stop_player()
+        self._player.stop()
         for thread in self._threads:
             thread.join()
-
-    def _stop_player(self) -> None:
-        self._player.stop()
 
     def _watch_stop(self) -> None:
         while not self._closing.is_set():
             if self._stop.wait(0.1):
-                self._stop_player()
+                self._player.stop()
                 return
 
     def _report(self) -> None:
@@ -257,11 +216,7 @@ class _Host:
 
 
 def _number(command: Command, key: str) -> float:
-    """The one number in the body of a command.
-
-    Raises:
-        ValueError: It is another body.
-    """
+    """The one number in the body of a command; ValueError: it is another body."""
     text = f'{command.verb}: the body must be {{"{key}": a number}}, not {command.body!r}'
     try:
         body = msgspec.json.decode(command.body, type=dict[str, float])
@@ -274,15 +229,8 @@ def _number(command: Command, key: str) -> float:
 
 def play(options: Namespace) -> None:
     """Play a recording."""
-    settings = PlaySettings(
-        options.file,
-        _speed(options.speed),
-        options.from_s,
-        options.to_s,
-        options.out,
-        options.loop,
-        options.solved,
-    )
+    speed, stretch = _speed(options.speed), (options.from_s, options.to_s)
+    settings = PlaySettings(options.file, speed, *stretch, options.out, options.loop, options.solved)
     stop, line = stop_on_signals(), ProgressLine(sys.stderr, "play")
 
     def show(position_s: float, length_s: float) -> None:
@@ -304,11 +252,7 @@ def play(options: Namespace) -> None:
 
 
 def _speed(text: str) -> float:
-    """The factor that was asked for; 0: as fast as it goes.
-
-    Raises:
-        PhalanxError: It is something else.
-    """
+    """The factor that was asked for; 0: as fast as it goes; else PhalanxError."""
     try:
         factor = 0.0 if text == "max" else float(text)
     except ValueError:

@@ -1,26 +1,10 @@
 """The player turns a recording into the same results on a replay clock.
 
-Playback clock of a recording.
-
-Where in the recording the player is; it can be paused, moved, and run at any speed.
-
-It reads no clock itself: it is passed the time.
-
-Digest of a run: SHA-256 over all poses in their order.
-
-Another is over objects, contact and gestures.
-
-Each message counts as it is encoded for the wire, with `latency_ns` set to 0: how long the machine took is no part of
-the result.
-
-Player of a recording.
-
-What the master received goes through the very same `Dispatcher` again, at any speed, from any time.
-
-What comes out depends on nothing but the messages and their order, so that every pass over the same stretch yields the
-same, bit for bit, however fast; a `Backlog` among them gives what the live master dropped; the player drops it too. To
-begin anywhere but at the start, a new world is shown what came two seconds before, silently: filters and tracks have
-settled by then, but what it publishes from there on is near to that of a whole pass, not equal to it.
+What the master received goes through the very same `Dispatcher` again, at any speed, from any time. What
+comes out depends on nothing but the messages and their order, so that every pass over the same stretch yields
+the same, bit for bit; a `Backlog` among them gives what the live master dropped, and the player drops it too.
+To begin anywhere but at the start, a new world is shown the two seconds before, silently: filters and tracks
+have settled by then, but the result is near to that of a whole pass, not equal to it.
 """
 
 import hashlib
@@ -46,19 +30,13 @@ from master.run.tuning import LivePipeline
 
 
 class ReplayClock:
-    """Map from local time to time in the recording.
+    """Map from local time to time in the recording, with speed and pause.
 
-    Holds a pair of both that belong together, the speed and the pause.
-
-    At speed 0 there is no such map: everything is due at once.
+    It reads no clock itself. At speed 0 there is no such map: everything is due at once.
     """
 
     def __init__(self, begin_t_ns: int, speed: float, now_ns: int) -> None:
-        """Stand at `begin_t_ns` of the recording at `now_ns` here.
-
-        Raises:
-            ValueError: A speed below 0, or none.
-        """
+        """Stand at `begin_t_ns` at `now_ns` here; ValueError: the speed is none."""
         self.paused = False
         self._at_ns, self._since_ns = begin_t_ns, now_ns
         self.speed = _checked(speed)
@@ -89,11 +67,7 @@ class ReplayClock:
         self.paused = False
 
     def set_speed(self, factor: float, now_ns: int) -> None:
-        """Go on at another speed; 0: as fast as it goes.
-
-        Raises:
-            ValueError: Below 0, or no number.
-        """
+        """Go on at another speed; 0: as fast as it goes; ValueError: the speed is none."""
         factor = _checked(factor)
         self.seek(self.position_ns(now_ns), now_ns)
         self.speed = factor
@@ -113,7 +87,11 @@ KINDS = {HandPose: "poses", ObjectPose: "objects", Contact: "contacts", Gesture:
 
 
 class ResultDigest:
-    """Holds a sum for each kind of message, and how many there were."""
+    """SHA-256 over the messages of each kind in their order, and their number.
+
+    Each counts as it is encoded for the wire, with `latency_ns` 0: the machine's speed is no part of the
+    result.
+    """
 
     def __init__(self, results: Iterable[ResultMessage] = ()) -> None:
         """Begin with `results`."""
@@ -150,17 +128,11 @@ _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is
 
 @dataclass(frozen=True, slots=True)
 class Passed:
-    """One pass over a recording.
+    """One pass over a recording."""
 
-    Attributes:
-        digest: Over all that was published.
-        seconds: How long it took [s].
-        whole: From the beginning to the end that was asked for, without a jump.
-    """
-
-    digest: ResultDigest
+    digest: ResultDigest  # over all that was published
     seconds: float
-    whole: bool
+    whole: bool  # from the beginning to the end that was asked for, without a jump
 
     @property
     def poses_per_s(self) -> float:
@@ -169,13 +141,7 @@ class Passed:
 
 
 def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatcher:
-    """Build the dispatcher as a live master does.
-
-    It drops epochs as `load_shedding` states.
-
-    Raises:
-        CalibrationError: The files do not fit together.
-    """
+    """Build the dispatcher as a live master; `load_shedding` drops epochs."""
     stages = StageTimes()
     return Dispatcher(
         setups, [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups], stages
@@ -183,12 +149,7 @@ def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatc
 
 
 class Player:
-    """Player of one recording.
-
-    Holds the clock, the dispatcher of the present pass, and the target of a jump.
-
-    `run` belongs to one thread; the other methods are called on any.
-    """
+    """Player of one recording; `run` belongs to one thread, all else to any."""
 
     def __init__(
         self,
@@ -207,15 +168,12 @@ class Player:
         """Stand at the beginning.
 
         Args:
-            recording: What is played.
-            setups: What watched each hand.
-            sinks: Take what is published.
             speed: 1: as it was; 0: as fast as it goes.
             from_ns, to_ns: The stretch that is played, log times [ns]; None: all.
             solved: Publish what was published live instead of solving.
             again: Takes reports, lists and pictures that were recorded beside.
-            taken: Shown each message that was taken, once all that it yields is out.
-            say: Called with a line where something happened that a replay cannot repeat.
+            observed: Shown each message that was taken, once all that it yields is out.
+            notify: Called with a line where something happened that a replay cannot repeat.
 
         Raises:
             ValueError: The speed is none, or the stretch is empty.
@@ -257,21 +215,13 @@ class Player:
             self._changed.notify()
 
     def set_speed(self, factor: float) -> None:
-        """Go on at another speed.
-
-        Raises:
-            ValueError: Below 0, or no number.
-        """
+        """Go on at another speed; ValueError: below 0, or no number."""
         with self._changed:
             self._clock.set_speed(factor, now_ns())
             self._changed.notify()
 
     def seek(self, t_ns: int) -> None:
-        """Go on from `t_ns`.
-
-        Raises:
-            ValueError: Outside of what is played.
-        """
+        """Go on from `t_ns`; ValueError: outside of what is played."""
         if not self.first_ns <= t_ns <= self.last_ns:
             begin = self._recording.begin_t_ns
             first, last = ((one - begin) * 1e-9 for one in (self.first_ns, self.last_ns))
@@ -287,12 +237,7 @@ class Player:
             self._changed.notify()
 
     def run(self) -> Passed:
-        """Play until the end, with all jumps on the way.
-
-        Raises:
-            RecordingError: The file cannot be read any more.
-            PhalanxError: A sink fails.
-        """
+        """Play until the end, with all jumps; RecordingError, or PhalanxError of a sink."""
         start_ns, whole = self.first_ns, self.first_ns == self._recording.begin_t_ns
         digest, began_ns = ResultDigest(), now_ns()
         while True:
@@ -357,10 +302,7 @@ class Player:
             return False
 
     def _results_of(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[ResultMessage]:
-        """Return the results of a recorded message.
-
-        The dispatcher computes them, or they were published live.
-        """
+        """The results of a recorded message: solved now, or published live."""
         if one.stream in SOLVED:
             return (cast(ResultMessage, one.message),)
         if one.stream != "taken" or dispatcher is None or isinstance(one.message, Backlog):
@@ -368,10 +310,7 @@ class Player:
         return self._solve(dispatcher, cast(SensorMessage, one.message), one.name)
 
     def _solve(self, dispatcher: Dispatcher, message: SensorMessage, name: str) -> Iterable[ResultMessage]:
-        """What the world makes of a message.
-
-        Nothing of one that it cannot solve, which the recording may hold.
-        """
+        """What the world makes of a message; nothing of one that it cannot solve."""
         try:
             return [_plain(solved) for solved in dispatcher.push(message)]
         except PhalanxError:

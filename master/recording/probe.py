@@ -1,21 +1,14 @@
 """A running master publishes its inputs while a recorder asks for them.
 
-Publisher of the master's input messages while somebody records.
+A message goes on the bus (stream `taken`) once all that it yields is out, in the order of receipt, with those
+of the same fifth of a second, on a thread of its own: no pose waits for it. That thread may wait for a
+reader, so that none is lost on the way; where it waits for too long, what does not fit its queue is dropped
+and counted. While nobody taps, there is no thread, and a message costs one comparison.
 
-In the order in which the master receives them.
-
-A message goes on the bus (stream `taken`) once all that it yields is out, with those of the same fifth of a second,
-on a thread of its own: no pose waits for it. That thread may wait for a reader, so that none is lost on the way; where
-it waits for too long, what does not fit its queue is dropped and counted. While nobody taps, there is no thread, and a
-message costs one comparison.
-
-Recorder process that `phalanx run --record FILE` starts.
-
-A process of its own, with an end of its own.
-
-It is there before the first message is taken, so that a replay is what was published live from the first pose on. Its
-standard input is a pipe from this process: when that closes, because we end it or because we died, it ends its file. It
-is in a group of its own, so that Ctrl-C stops the tracking first and the recorder then.
+`phalanx run --record FILE` starts a recorder process, which is there before the first message is taken, so
+that a replay is what was published live from the first pose on. When its standard input, a pipe from this
+process, closes, because we end it or because we died, it ends its file. It is in a group of its own, so that
+Ctrl-C stops the tracking first.
 """
 
 import os
@@ -45,11 +38,7 @@ ReceivedT = TypeVar("ReceivedT", bound=Message)
 
 
 class Probe:
-    """Whether somebody taps, and what is to be shown. The bus belongs to the caller.
-
-    Holds the lease, the queue, and the thread while there is one. `show` belongs to the loop; the rest is called on any
-    thread.
-    """
+    """Whether somebody taps, and what is to be shown; `show` belongs to the loop."""
 
     def __init__(self, bus: Bus, clock: Clock, *, always: bool = False) -> None:
         """Show nothing until `lease`; with `always` everything from the first message on."""
@@ -67,29 +56,20 @@ class Probe:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return `probe.shown`, and of those `probe.dropped`, once there were any.
-
-        What a recorder never received.
-        """
+        """`tap.shown`, and of those `tap.dropped`, once there were any."""
         # What waits to be published can be nobody's loss yet.
         return (
             {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
         )
 
     def lease(self) -> None:
-        """Show everything for three seconds from now.
-
-        Also shows again how far behind the master is.
-        """
+        """Show everything for three seconds from now, and how far behind the master is."""
         self._again = True
         self._until_ns = self._clock.now_ns() + LEASE_NS
         self._start()
 
     def show(self, message: Message, skip: int = 0) -> None:
-        """Queue a message for publishing, if somebody taps.
-
-        Before it publishes the number of dropped epochs, if that has changed.
-        """
+        """Queue a message if somebody taps, after the number of dropped epochs if new."""
         if not self._always:
             if self._until_ns == 0:
                 return
@@ -111,10 +91,7 @@ class Probe:
             self._queue.append(message)  # nobody is woken: the thread looks by itself
 
     def end_always(self) -> None:
-        """Stop showing messages, except to those who tap.
-
-        The recorder that wanted everything is gone.
-        """
+        """Show messages only to those who tap: the recorder that wanted all is gone."""
         self._always = False
 
     def drain(self) -> None:
@@ -142,10 +119,7 @@ class Probe:
                 self._thread.start()
 
     def _work(self) -> None:
-        """Publish all pending messages at once, so that they travel together.
-
-        Ends when nobody taps any more.
-        """
+        """Publish what waits at once, to travel together; end when nobody taps."""
         while True:
             while self._queue and not self._closed:
                 self._busy = True
@@ -164,19 +138,14 @@ class Probe:
 
 
 def came_ns(message: Message, now_ns: int) -> int:
-    """Return the time at which a message was available.
-
-    A frame: when its slave got it. A device's measurement: when it was measured. Else `now_ns`.
-    """
+    """Return when a message was available: at its slave, else measured, else now."""
     return getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
 
 
 class Tapped(Generic[ReceivedT]):
-    """Message source that shows each message when the next is requested.
+    """Source that shows each message, and the backlog, when the next is requested.
 
     By then its reader has processed the message as far as it can.
-
-    With each message it sees how far behind the master is, which holds until the next. Holds the last message.
     """
 
     def __init__(self, source: Taking[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
@@ -200,10 +169,7 @@ class Tapped(Generic[ReceivedT]):
 
 
 class RecorderProcess:
-    """A running recorder.
-
-    Holds the process and the thread that forwards its output.
-    """
+    """A running recorder."""
 
     def __init__(
         self,
@@ -213,14 +179,9 @@ class RecorderProcess:
         notify: Callable[[str], None],
         ended: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start it.
+        """Start it for our open bus at `endpoint`.
 
-        Args:
-            path: The file.
-            files: Files of calibration of the rigs.
-            endpoint: Of our bus, which is open already.
-            say: Called with each line that it prints.
-            ended: Called, on another thread, once it is gone.
+        `notify` is called with each line that it prints, `ended`, on another thread, once it is gone.
         """
         self._notify, self._ended, self._path = notify, ended, path
         self._name = f"recorder-{os.getpid()}"
@@ -236,13 +197,9 @@ class RecorderProcess:
         self._thread = threading.Thread(target=self._listen, name="recorder lines", daemon=True)
         self._thread.start()
 
-    # Python, numpy and the bus on a busy machine
+    # 60 s: Python, numpy and the bus on a busy machine
     def wait_ready(self, bus: Bus, timeout_s: float = 60.0) -> None:
-        """Wait until the recorder receives all that is published from here on.
-
-        Raises:
-            RecordingError: It ended, or does not come in time.
-        """
+        """Wait until the recorder receives all that follows; RecordingError: it does not."""
         deadline = time.monotonic() + timeout_s
         while self._name not in bus.alive():
             if self._process.poll() is not None:
@@ -257,10 +214,7 @@ class RecorderProcess:
             time.sleep(step_s)
 
     def close(self) -> None:
-        """Let the recorder write pending messages and end its file.
-
-        The bus must be open still. Safe to call twice.
-        """
+        """Let the recorder end its file while the bus is open. Safe to call twice."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
@@ -283,7 +237,6 @@ class RecorderProcess:
 
 
 def _command(path: Path, files: RigFiles, endpoint: str, name: str) -> list[str]:
-    """The command line of the recorder."""
     command = [sys.executable, "-m", "master", "record", str(path), "--bus", endpoint, "--owned", name]
     command += ["--calibration", str(files.calibration)]
     for rig in files.rigs:

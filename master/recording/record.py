@@ -1,17 +1,8 @@
 """`phalanx record` runs the recorder and its bus subscriptions as a process.
 
-Bus subscriptions of a recording.
-
-A thread for each stream, and the master's clock as seen from here.
-
-Recorder as a process of its own.
-
-On the bus as "recorder", fed from it, never in the way of the tracking.
-
-It waits for the master, goes on when that was started again, answers `report` and `stop`, and ends its file whatever
-ends it.
-
-`phalanx record`.
+The process is "recorder" on the bus, never in the way of the tracking. It waits for the master, goes on when
+that was started again, answers `report` and `stop`, and ends its file whatever ends it. One thread subscribes
+to each stream.
 """
 
 import secrets
@@ -46,26 +37,19 @@ _ANSWERS = 5
 
 
 class MasterClock:
-    """Offset of the master's clock ahead of this machine's.
-
-    0 on the same machine. Holds the best measurement of it.
-    """
+    """Offset of the master's clock ahead of this machine's; 0 on the same machine."""
 
     def __init__(self) -> None:
         self.ahead_ns = 0
         self._half_trip_ns: int | None = None
 
     def push(self, asked_ns: int, answered_ns: int, remote_ns: int) -> None:
-        """Take one answer.
-
-        It was sent somewhere between the question and its arrival.
-        """
+        """Take one answer, sent somewhere between the question and its arrival."""
         half_trip_ns = (answered_ns - asked_ns) // 2
         if self._half_trip_ns is None or half_trip_ns < self._half_trip_ns:
             ahead = remote_ns - (asked_ns + answered_ns) // 2
-            self.ahead_ns = (
-                0 if abs(ahead) <= half_trip_ns else ahead
-            )  # one clock looks so, and is exact then
+            # one clock looks so, and is exact then
+            self.ahead_ns = 0 if abs(ahead) <= half_trip_ns else ahead
             self._half_trip_ns = half_trip_ns
 
     def now_ns(self) -> int:
@@ -74,10 +58,7 @@ class MasterClock:
 
 
 class StreamSubscriber:
-    """Subscriptions of one connection, and their threads.
-
-    The threads offer all that comes to a recorder.
-    """
+    """Subscriptions of one connection, each with a thread that feeds a recorder."""
 
     def __init__(
         self, bus: Bus, streams: Sequence[str], recorder: MessageRecorder, clock: MasterClock
@@ -102,10 +83,7 @@ class StreamSubscriber:
         return {stream: inbox.dropped for stream, inbox in self._inboxes.items() if inbox.dropped}
 
     def close(self, wait_s: float) -> None:
-        """Take pending messages, waiting no longer than `wait_s`.
-
-        The limit is there because the sender may go on. Safe to call twice.
-        """
+        """Take what waits for at most `wait_s`: the sender may go on. Safe to call twice."""
         self._end_ns = now_ns() + round(wait_s * 1e9)
         self._closing.set()
         for thread in self._threads:
@@ -127,12 +105,7 @@ class StreamSubscriber:
                 return
 
     def _taken_ns(self, message: Message, now_ns: int) -> int:
-        """Return the time at which a message was available.
-
-        The master shows several messages at once, and a replay at the original speed needs their own times.
-
-        None before the one before.
-        """
+        """When a message was available, not before the last: a replay needs these times."""
         there = came_ns(message, now_ns)
         long_ns = 1_000_000_000
         if not 0 <= now_ns - there < long_ns:
@@ -142,12 +115,7 @@ class StreamSubscriber:
 
 
 class ProbeLease:
-    """Repeated request to the master to show what it takes.
-
-    Determines from its answers what never came.
-
-    Holds the clock, the session of the master, and by how much we were behind it at the last answers.
-    """
+    """Repeated request to the master to show what it takes; counts what never came."""
 
     def __init__(self, bus: Bus, subscriber: StreamSubscriber, clock: MasterClock) -> None:
         self._bus, self._subscriber, self._clock = bus, subscriber, clock
@@ -157,11 +125,7 @@ class ProbeLease:
         self.lost = 0
 
     def ask(self) -> Health:
-        """Probe for three seconds more.
-
-        Raises:
-            BusError: The master is not there, or refuses.
-        """
+        """Probe for three seconds more; BusError: the master is not there, or refuses."""
         asked_ns = now_ns()
         health = self._bus.ask(Command("master", "tap"), _ASK_S)
         self._clock.push(asked_ns, now_ns(), health.t_ns)
@@ -184,27 +148,16 @@ _PERIOD_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
-    """What is recorded.
-
-    Attributes:
-        path: The file.
-        files: Files of calibration of the rigs.
-        seconds: Length [s]; None: until stopped.
-        frames_hz: Whole frames of each camera a second; 0: none.
-        previews: Keep the small pictures that somebody looks at, and ask for them.
-        reserve_bytes: Stays free on the disk.
-        ready_as: A name to be announced once it listens; None: nobody waits for that.
-        raw: Have the slaves of all cameras keep raw frames beside it.
-    """
+    """What is recorded."""
 
     path: Path
-    files: RigFiles
-    seconds: float | None = None
-    frames_hz: float = 0.0
-    previews: bool = False
-    reserve_bytes: int = 200_000_000
-    ready_as: str | None = None
-    raw: bool = False
+    files: RigFiles  # files of calibration of the rigs
+    seconds: float | None = None  # length [s]; None: until stopped
+    frames_hz: float = 0.0  # whole frames of each camera a second; 0: none
+    previews: bool = False  # keep the small pictures that somebody looks at, and ask for them
+    reserve_bytes: int = 200_000_000  # stays free on the disk
+    ready_as: str | None = None  # A name to be announced once it listens; None: nobody waits for that
+    raw: bool = False  # have the slaves of all cameras keep raw frames beside it
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -223,14 +176,13 @@ def run_recorder(
     """Record until stopped, until the length is reached, or until the disk is full.
 
     Args:
-        settings: What.
         connect: Waits for the master's bus; None once stopped.
         stop: Set by a signal handler, or by the command "stop".
-        say: Called with a line when something changes.
-        show: Called once a second how it is, and how many messages never came.
+        notify: Called with a line when something changes.
+        show: Called once a second with the progress and how many messages never came.
 
     Returns:
-        How it was at the end.
+        The progress at the end.
 
     Raises:
         RecordingError: The file cannot be made, or the disk is full; what was written is readable.
@@ -267,10 +219,7 @@ def run_recorder(
 
 
 class _Run:
-    """One recording over all its connections.
-
-    Holds its id, and what was lost on connections that are gone.
-    """
+    """One recording over all its connections, with what was lost on past ones."""
 
     def __init__(
         self,
@@ -283,16 +232,9 @@ class _Run:
         notify: Callable[[str], None],
         show: Callable[[Progress, int], None],
     ) -> None:
-        self._settings, self._recorder, self._stop, self._notify, self._show = (
-            settings,
-            recorder,
-            stop,
-            notify,
-            show,
-        )
-        self._cameras, self._raw = cameras, raw
+        self._settings, self._cameras, self._clock, self._recorder = settings, cameras, clock, recorder
+        self._raw, self._stop, self._notify, self._show = raw, stop, notify, show
         self._session = secrets.randbits(63)
-        self._clock = clock
         self._gone_lost = self._gone_dropped = 0
         self._lease: ProbeLease | None = None
         self._subscriber: StreamSubscriber | None = None
@@ -307,11 +249,7 @@ class _Run:
         return self._stop.is_set() or self._recorder.failure is not None or full
 
     def listen(self, bus: Bus) -> None:
-        """Record what comes by one connection, until it is over or the master is gone.
-
-        Raises:
-            BusError: The master refuses to be tapped.
-        """
+        """Record from one connection until it is over or the master gone or refuses."""
         with ExitStack() as stack:
             self._subscriber = StreamSubscriber(bus, self._settings.streams, self._recorder, self._clock)
             stack.callback(self._close_subscriber, self._subscriber)
@@ -333,11 +271,7 @@ class _Run:
             self._keep(bus, self._lease)
 
     def health(self) -> Health:
-        """Return the recorder's health.
-
-        Metrics recorder.seconds, .megabytes, .megabytes_per_s, .free_gb; messages by stream, `dropped` (no room in
-        our queues) and `lost` (shown by the master, never came).
-        """
+        """Counts by stream, and `dropped` (no room), `lost` (never came); metrics."""
         now = self._recorder.progress()
         counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
         metrics = {
@@ -349,11 +283,7 @@ class _Run:
         return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
-        """Obey "report" or "stop".
-
-        Raises:
-            ValueError: Another verb.
-        """
+        """Obey "report" or "stop"; ValueError: another verb."""
         if command.verb not in ("report", "stop"):
             raise ValueError(f"{NAME}: no command {command.verb!r}; there are report, stop")
         if command.verb == "stop":
@@ -384,10 +314,7 @@ class _Run:
             self._notify("the master is gone; waiting for it")
 
     def _look(self, health: Health) -> None:
-        """Print notices for the later player, and record restarts of the master.
-
-        Prints what the player of this file has to know, and keeps in the file where a master was started again.
-        """
+        """Print what the player of this file must know; record restarts of the master."""
         if health.session != self._master:
             self._recorder.offer("health", health, self._clock.now_ns())
             if self._master is None:
@@ -410,10 +337,8 @@ class _Run:
         drain_s, owned_drain_s = 0.5, 10.0
         # One that owns us has stopped, and all that it sent is to be kept; another one goes on without us.
         subscriber.close(drain_s if self._settings.ready_as is None else owned_drain_s)
-        self._gone_lost, self._gone_dropped = (
-            self._lost(),
-            self._gone_dropped + sum(subscriber.dropped.values()),
-        )
+        self._gone_lost = self._lost()
+        self._gone_dropped += sum(subscriber.dropped.values())
         self._lease = self._subscriber = None
 
 
@@ -450,10 +375,7 @@ def record(options: Namespace) -> None:
 
 
 def _master_bus(endpoint: str, stop: threading.Event) -> Bus | None:
-    """Return the bus as the master sees it, once one listens there.
-
-    None when stopped before.
-    """
+    """The bus as the master sees it, once one listens; None: stopped before."""
     return bus_of_master(
         endpoint, stop, lambda _error: _recorder_status(f"waiting for a master at {endpoint}")
     )

@@ -1,22 +1,14 @@
 """The recorder writes messages to a file while slaves keep their raw frames.
 
-Message recorder with a bounded queue.
-
-One thread writes what is offered and monitors the disk.
-
     threads of the bus ── offer ──▶ bounded queue ──▶ writer ──▶ file
                             └ queue full: dropped, and counted by stream
 
-Whoever offers never waits for the disk. Where less than a reserve would be left of it, where it is full or gone, the
-recording ends with what was written, and `failure` states why.
+Whoever offers never waits for the disk. Where less than a reserve would be left of it, where it is full or
+gone, the recording ends with what was written, and `failure` states why.
 
-Raw frames kept by every camera's slave beside a recording of messages.
-
-Begun, kept going, and ended here.
-
-A thread for each camera asks again and again: a slave goes on for as long as it is asked, so that a recorder that was
-killed, or lost its master, leaves ended recordings behind. A camera that refuses is reported, and asked no more; the
-recording of messages goes on in any case.
+Each camera's slave is asked for raw frames again and again, on a thread of its own: it goes on for as long as
+it is asked, so that a recorder that was killed, or lost its master, leaves ended recordings behind. A camera
+that refuses is reported, and asked no more; the recording of messages goes on in any case.
 """
 
 import json
@@ -40,50 +32,35 @@ _POLL_S = 0.25  # so often the disk is looked at, and what waits in a chunk give
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How a recording is.
+    """How a recording is."""
 
-    Attributes:
-        seconds: From the first message to the last that was taken [s].
-        written_bytes: The file so far.
-        bytes_per_s: Over a second or more, the last that is over.
-        free_bytes: Free on the disk.
-        waiting: Messages in the queue.
-        counts: Stream -> messages written.
-        dropped: Stream -> messages that did not fit the queue, or came out of it after a failure.
-    """
-
-    seconds: float
+    seconds: float  # from the first message to the last that was taken [s]
     written_bytes: int
-    bytes_per_s: float
+    bytes_per_s: float  # over a second or more, the last that is over
     free_bytes: int
-    waiting: int
-    counts: dict[str, int]
+    waiting: int  # messages in the queue
+    counts: dict[str, int]  # stream -> messages written
+    # stream -> messages that did not fit the queue, or came out of it after a failure
     dropped: dict[str, int]
 
 
 class MessageRecorder:
-    """Writer of offered messages.
-
-    Holds the queue, its thread, and the counts, each written by one thread alone.
-    """
+    """Writer of offered messages; each count is written by one thread alone."""
 
     def __init__(
         self,
         writer: MessageWriter,
         folder: Path,
-        # a system without any room left cannot even be logged in to
         reserve_bytes: int = 200_000_000,
-        # messages that may wait for the disk: some seconds
         depth: int = 20_000,
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
         """Start the thread.
 
         Args:
-            writer: Of the file; closed by `close`.
-            folder: Where the file stands.
-            reserve_bytes: Stays free on its disk.
-            depth: Messages that may wait.
+            writer: Of the file in `folder`; closed by `close`.
+            reserve_bytes: Stays free on its disk: a full system cannot even be logged in to.
+            depth: Messages that may wait for the disk: some seconds.
             free_bytes: What is free on the disk of a folder.
         """
         self._writer, self._folder, self._reserve, self._free = writer, folder, reserve_bytes, free_bytes
@@ -100,10 +77,7 @@ class MessageRecorder:
         self._thread.start()
 
     def offer(self, stream: str, message: Message, t_ns: int) -> None:
-        """Take a message that came at `t_ns`, or count it as dropped.
-
-        Never waits. Any thread may call it.
-        """
+        """Take a message of any thread, or count it as dropped; never wait."""
         # and no picture is taken where so many wait: they would fill the memory
         pictures = isinstance(message, Preview | Still) and self._waiting.qsize() >= 100
         if self.failure is None and not self._closing.is_set() and not pictures:
@@ -145,10 +119,7 @@ class MessageRecorder:
             )
 
     def close(self) -> None:
-        """Write what waits and end the file.
-
-        `failure` states if that failed. Safe to call twice.
-        """
+        """Write what waits and end the file, see `failure`. Safe to call twice."""
         self._closing.set()
         self._thread.join()
 
@@ -184,11 +155,7 @@ class MessageRecorder:
         self._writer.write(stream, message, t_ns)
 
     def _look(self) -> None:
-        """End in time.
-
-        Raises:
-            RecordingError: No more room beside the reserve.
-        """
+        """End in time; RecordingError: no more room beside the reserve."""
         try:
             free = self._free(self._folder)
         except OSError as error:
@@ -219,10 +186,7 @@ class _Camera:
 
 
 class RawAsker:
-    """Requester of the raw frames of all cameras of one recording.
-
-    Over all its connections. Holds the state of each camera.
-    """
+    """Requester of the raw frames of all cameras of one recording."""
 
     def __init__(
         self,
@@ -232,14 +196,12 @@ class RawAsker:
         keep: Callable[[Health], None],
         period_s: float = 2.0,
     ) -> None:
-        """Nothing is asked yet.
+        """Ask nothing yet.
 
         Args:
             stem: Name of the recording of messages.
-            cameras: Those of its rigs.
-            say: Called with a line when something changes.
+            notify: Called with a line when something changes.
             keep: Given what a slave answers at beginning and end.
-            period_s: Time between two questions [s].
 
         Raises:
             RecordingError: A folder cannot have the name that follows from the stem.
@@ -265,20 +227,14 @@ class RawAsker:
             thread.start()
 
     def detach(self) -> None:
-        """Stop asking.
-
-        Raw recordings that are running end by themselves, unless another connection asks. Safe to call twice.
-        """
+        """Stop asking; raw recordings then end by themselves. Safe to call twice."""
         self._closing.set()
         for thread in self._threads:
             thread.join()
         self._threads = []
 
     def end(self, bus: Bus) -> None:
-        """End the raw recordings of all present cameras and print their state.
-
-        All at the same time.
-        """
+        """End the raw recordings of all present cameras together; print their state."""
         self.detach()
         there = [camera for camera in self._cameras if camera.begun and camera.here]
         threads = [threading.Thread(target=self._end, args=(camera, bus), daemon=True) for camera in there]
@@ -315,10 +271,7 @@ class RawAsker:
             self._keep(answer)
 
     def _refused(self, camera: _Camera, bus: Bus, error: BusError) -> None:
-        """Restart a camera's raw recording where it was away, or give up.
-
-        Restarts where the camera was away and its recording has ended; else the refusal is final.
-        """
+        """Restart where the camera was away and has ended; else the refusal is final."""
         if camera.begun and self._was_away(camera, bus):
             camera.begun, camera.number = False, camera.number + 1
             self._ask(camera, bus)
@@ -350,8 +303,5 @@ class RawAsker:
 
 
 def raw_text(stem: str, cameras: Sequence[str]) -> str:
-    """Return the cameras' raw folders as a recording of messages stores them.
-
-    A map of camera to name.
-    """
+    """Map each camera to its raw folder, as a recording of messages stores it."""
     return json.dumps({camera: raw_name(stem, camera) for camera in cameras})

@@ -1,17 +1,9 @@
 """Offline solver replays detection on frames, then solves the hands.
 
-Offline solver.
-
-Detections of every camera and a recording's calibration -> what a `Dispatcher` returns, scored.
-
+Slaves, as processes, detect in every camera's frames (and make a recording of videos or pictures before
+that); then all messages are pushed through a `Dispatcher` and scored against the truth, where there is one.
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.
-
-Replay of the slaves' detection on a recording.
-
-In every camera, as processes; then all cameras are solved together.
-
-Videos and pictures of other programs become a recording before that, by `phalanx-slave record --from`.
 """
 
 import heapq
@@ -77,16 +69,12 @@ def rigs_to_solve(
 ) -> list[RigCalibration]:
     """The rigs of a recording that are solved, those of markers first.
 
-    Args:
-        manifest: Of the recording.
-        names: Rigs that are wanted; none: all.
-        only: Of one kind alone.
-        solver_mode: Of the wrist rigs in place of their own.
-        solver: Of the marker rigs in place of their own.
+    `names`: rigs that are wanted, none: all; `only` of one kind. `solver_mode` replaces that of wrist rigs,
+    `solver` that of marker rigs.
 
     Raises:
         RecordingError: It has no such rig.
-        CalibrationError: A level for rigs of which none is of a wrist device, a solver for such as are of no markers.
+        CalibrationError: A solver mode where no rig is of a wrist device, a solver where none is of markers.
     """
     wanted = [manifest.rig_named(name) for name in names] or list(manifest.all_rigs)
     rigs = [rig for rig in wanted if only in (None, rig.kind)]
@@ -119,22 +107,19 @@ def solve_hands(
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, object]:
-    """Solve all hands and objects of a recording.
+    """Solve all hands and objects of a recording; return the first hand's summary.
 
-    Writes their results, and summary.json, into `out`.
-
-    That is poses.npz of the first hand, poses-HAND.npz and summary-HAND.json of the others, object_NAME.npz,
-    contact_HAND_NAME.npz and gestures.jsonl.
+    Writes into `out` poses.npz and summary.json of the first hand, with the objects, poses-HAND.npz and
+    summary-HAND.json of the others, object_NAME.npz, contact_HAND_NAME.npz and gestures.jsonl.
 
     Args:
-        recording: The raw frames' manifest; gives `continuous`, clicks and, where there are, the IMU and the truth.
+        recording: The raw frames' manifest; gives `continuous`, clicks and, where there are, the IMU and the
+            truth.
         setups: Of each hand rigs, cameras and hand: of markers, of a wrist device, or of both.
-        detections: Folder with detections_<camera>.npz of every camera, and tags_<camera>.npz where objects have tags.
+        detections: Folder with detections_<camera>.npz of every camera, and tags_<camera>.npz where objects
+            have tags.
         out: Existing folder for the results.
         progress: Called with how many of how many messages are done.
-
-    Returns:
-        The summary of the first hand and of the objects.
 
     Raises:
         RecordingError: A detections file is missing or broken, imu.csv is, or the results cannot be written.
@@ -191,10 +176,7 @@ def solve(
 
 @dataclass(slots=True)
 class _Output:
-    """Results of an offline solve.
-
-    For each hand its poses, for each object its own; and how fast the cameras ran.
-    """
+    """Poses of each hand and object of an offline solve, and how fast the cameras ran."""
 
     poses: dict[str, list[HandPose]]
     objects: dict[str, list[ObjectPose]] = field(default_factory=dict[str, list[ObjectPose]])
@@ -214,7 +196,7 @@ class _Output:
 def _object_scores(
     recording: FrameRecording, setup: RigSetup, poses: Mapping[str, Sequence[ObjectPose]]
 ) -> dict[str, dict[str, float]]:
-    """Of each object of this setup whose truth the recording carries."""
+    """Score each object of this setup whose truth the recording carries."""
     scores: dict[str, dict[str, float]] = {}
     for one in setup.objects:
         truth = load_object_truth(recording.folder, one.name)
@@ -238,10 +220,7 @@ def _summarise(
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
-    """Score a hand with markers.
-
-    In a recording of both kinds also where cameras lose what a wrist device sees.
-    """
+    """Score a hand with markers; of both kinds also where cameras lose what a wrist device sees."""
     found = np.isfinite(poses.markers_raw_m).all(axis=2).sum(axis=0)
     truth = load_truth(recording.folder, found == found.max())
     if truth is None:
@@ -255,10 +234,7 @@ def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> 
 def _score_wrist(
     recording: FrameRecording, setup: RigSetup, messages: Sequence[Detections], poses: Poses
 ) -> dict[str, float]:
-    """Score the observations of a wrist device.
-
-    For a hand without markers also the hand solved from them.
-    """
+    """Score the observations of a wrist device; without markers also the hand solved from them."""
     if setup.wrist is None:
         return {}
     exact = load_wrist_truth(recording, setup.wrist_cameras[0])
@@ -281,10 +257,7 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
 def _messages(
     recording: FrameRecording, setups: Sequence[RigSetup], folder: Path
 ) -> list[Detections | TagDetections]:
-    """Return all cameras' detections in the order of their capture times.
-
-    Ties are in the order of the cameras, tags last.
-    """
+    """Return all cameras' detections by capture time; ties in the order of the cameras, tags last."""
     shown = {name: len(rig.markers) for rig in recording.manifest.all_rigs for name in rig.cameras}
     messages: list[Detections | TagDetections] = []
     order: dict[str, int] = {}
@@ -304,10 +277,7 @@ def _messages(
 
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:
-    """Count the frames, or strobe cycles, that a camera skipped.
-
-    Lost before they were recorded, or none was made of them.
-    """
+    """Count the frames or strobe cycles lost before they were recorded, or of which none was made."""
     numbers = {
         name: FrameSequence(CYCLE_FRAMES if name in setup.wrist_cameras else 1) for name in setup.cameras
     }
@@ -323,8 +293,8 @@ def replay_recording(options: Namespace, notify: Notify) -> None:
     """Detect, and solve what was detected.
 
     Raises:
-        PhalanxError: The recording or a file is missing or broken, an option makes no sense for it, or a step failed
-            (its own message is on standard error).
+        PhalanxError: The recording or a file is missing or broken, an option makes no sense for it, or a step
+            failed (its own message is on standard error).
     """
     folder = _recording_of(options, notify)
     wanted = () if folder != _given(options) else options.rig
@@ -372,11 +342,7 @@ def _given(options: Namespace) -> Path | None:
 
 
 def _recording_of(options: Namespace, notify: Notify) -> Path:
-    """The recording, made of videos or pictures in OUT/recording if need be.
-
-    Raises:
-        RecordingError: Nothing is named, or the import failed.
-    """
+    """The recording, made of videos or pictures in OUT/recording if need be."""
     if not options.paths and not options.camera:
         raise RecordingError("replay: name a recording, or a video for each camera")
     if (given := _given(options)) is not None:

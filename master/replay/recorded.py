@@ -1,23 +1,14 @@
-"""Reader loads detections, tags and IMU samples of a recording.
+"""Reader loads detections, tags and IMU samples of a recording as messages.
 
-Reader of detections_<camera>.npz of a recording.
-
-Written by `phalanx-slave run -o`; returned as the messages of its rows.
-
-IMU data of a recording for one hand.
-
-With the setup that has the accuracy of these data.
-
-Reader of tags_<camera>.npz of a recording.
-
-Tag detections written by `phalanx-slave run -o`; returned as messages of its frames.
+`phalanx-slave run -o` writes detections_<camera>.npz and tags_<camera>.npz.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace as with_fields
 from math import isfinite
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from msgspec.structs import replace
@@ -33,6 +24,7 @@ from common.recording.recorded_files import read_npz
 from master.rig.setup import RigSetup
 from master.run.sequence import CYCLE_FRAMES
 
+DetectionsT = TypeVar("DetectionsT", MarkerDetections, WristDetections)
 # Sigma of detections that state none: of full quality, and added where it is 0.
 _CLEAR_PX, _POOR_PX = 0.1, 0.6
 
@@ -60,22 +52,8 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
             f"{path}: sigma_px and alt_uv have shapes {sigma.shape} and {alternative.shape}, expected {uv.shape[:2]}"
             f" and {uv.shape}: {fix}"
         )
-    for row in range(len(t_ns)):
-        try:
-            yield MarkerDetections(
-                camera=camera,
-                session=0,
-                seq=int(seq[row]),
-                t_ns=int(t_ns[row]),
-                ready_t_ns=int(t_ns[row]),
-                uv=uv[row],
-                area=area[row],
-                quality=quality[row],
-                sigma_px=sigma[row],
-                alt_uv=alternative[row],
-            )
-        except ValueError as error:
-            raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
+    columns = {"uv": uv, "area": area, "quality": quality, "sigma_px": sigma, "alt_uv": alternative}
+    yield from _rows(MarkerDetections, path, fix, camera, t_ns, seq, columns)
 
 
 def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
@@ -112,24 +90,29 @@ def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
     ):
         if array.shape != shape:
             raise RecordingError(f"{path}: {name} has shape {array.shape}, expected {shape}: {fix}")
-    for row in range(len(t_ns)):
+    columns = {"laser_uv": laser, "tip_uv": tip, **each}
+    yield from _rows(WristDetections, path, fix, camera, t_ns, seq, columns)
+
+
+def _rows(
+    message: Callable[..., DetectionsT],
+    path: Path,
+    fix: str,
+    camera: str,
+    t_ns: Int,
+    seq: Int,
+    columns: Mapping[str, Float],
+) -> Iterator[DetectionsT]:
+    """The message of each row of these columns."""
+    for row, (time_ns, number) in enumerate(zip(t_ns.tolist(), seq.tolist(), strict=True)):
+        values = {name: array[row] for name, array in columns.items()}
         try:
-            yield WristDetections(
-                camera=camera,
-                session=0,
-                seq=int(seq[row]),
-                t_ns=int(t_ns[row]),
-                ready_t_ns=int(t_ns[row]),
-                laser_uv=laser[row],
-                tip_uv=tip[row],
-                **{name: array[row] for name, array in each.items()},
-            )
+            yield message(camera=camera, session=0, seq=number, t_ns=time_ns, ready_t_ns=time_ns, **values)
         except ValueError as error:
             raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
 
 
 def _file_of(folder: Path, camera: str) -> tuple[Path, str]:
-    """The file, and what to do where it is missing or broken."""
     return folder / f"detections_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
 
 
@@ -146,12 +129,10 @@ def _where_seen(uv: Float, value: float) -> Float:
 
 
 def _sigma_of(uv: Float, quality: Float) -> Float:
-    """Return standard deviations (T, M) [px] of centroids from their quality.
+    """Return standard deviations (T, M) [px] of centroids from their quality (T, M), where a file states none.
 
-    For centroids whose file states none; the quality is (T, M).
-
-    A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap that
-    may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.
+    A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap
+    that may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.
     """
     quality_loss = 1.0 - np.clip(np.nan_to_num(quality, nan=0.0), 0.0, 1.0)
     return np.where(np.isnan(uv[..., 0]), np.nan, _CLEAR_PX + _POOR_PX * quality_loss)
@@ -165,12 +146,11 @@ _LOG = logging.getLogger(__name__)
 
 
 def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[ImuSample, ...], RigSetup]:
-    """Return the recording's IMU samples with orientation, and their setup.
+    """Return a recording's IMU samples with orientation, and their accuracy's setup.
 
-    The setup has the accuracy of these samples.
-
-    A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live slave makes
-    its orientation of them. The heading of that begins anywhere, whatever the rig's file states of it.
+    A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live
+    slave makes its orientation of them. The heading of that begins anywhere, whatever the rig's file states
+    of it.
 
     Raises:
         RecordingError: imu.csv is broken.
@@ -203,7 +183,6 @@ def _imu_of(setup: RigSetup) -> ImuCalibration | None:
 
 
 def _with_imu(setup: RigSetup, imu: ImuCalibration) -> RigSetup:
-    """Return the setup with the accuracy of its IMU replaced."""
     if setup.has_markers and setup.rig.imu is not None:
         return with_fields(setup, rig=replace(setup.rig, imu=imu))
     if setup.wrist is None or setup.wrist_rig is None:
@@ -219,8 +198,8 @@ _ARRAYS = ("t_ns", "seq", "ids", "uv", "sigma_px", "row")
 def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
     """The searched frames of tags_<camera>.npz.
 
-    It holds of T frames `t_ns` and `seq` (T,), and of N tags, frame by frame, `ids` (N,), `uv` (N, 4, 2), `sigma_px`
-    (N,) and `row` (N,), which of the frames each is of.
+    It holds of T frames `t_ns` and `seq` (T,), and of N tags, frame by frame, `ids` (N,), `uv` (N, 4, 2),
+    `sigma_px` (N,) and `row` (N,), which of the frames each is of.
 
     Raises:
         RecordingError: The file is missing or broken.

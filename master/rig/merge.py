@@ -1,23 +1,11 @@
 """Rigs of one hand merge in one frame, with their objects and volume.
 
-Rigs grouped by the hand that they observe.
-
-Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Objects are
-those of all of them together.
-
-Each pair of cameras is calibrated in a frame of its own; `T_world_rig` is where that lies in the one they share. What
-rigs of one hand specify twice must be specified alike: a silent choice between two filters would be nobody's.
-
-Objects and gestures of a rig.
-
-Their files, and what must fit between them and the rig.
-
-Test volume of a rig.
-
-The box, stated by the rig and in the rig frame, in which its accuracy was tested.
-
-Outside it a hand is tracked as well as the cameras see it, but how well is unknown. So a joint reports whether it lies
-inside; that it does not, alone makes no pose invalid.
+Several marker rigs of one hand become one of N cameras, and a rig of several hands becomes one for each. Each
+pair of cameras is calibrated in a frame of its own; `T_world_rig` is where that lies in the one they share.
+What rigs of one hand specify twice must be specified alike: a silent choice between two filters would be
+nobody's. The volume is the box in the rig frame in which the rig's accuracy was tested. Outside it a hand is
+tracked as well as the cameras see it, but how well is unknown: that a joint lies outside alone makes no pose
+invalid.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +16,7 @@ from msgspec.structs import replace
 
 from common.arrays import Bool, Float
 from common.calibration import ImuCalibration, Provenance, RigCalibration, Volume, load
-from common.calibration.files import Matrix4, Quaternion, Row4, Vector3
+from common.calibration.files import Matrix4, Row4, Vector3
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import check_places
@@ -40,17 +28,16 @@ _ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
 
 
 def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
-    """Merge marker rigs into one with the cameras of all of them.
+    """Merge marker rigs into one with all their cameras, in the frame they share.
 
-    In their order and in the frame that they share.
-
-    It triangulates by all of them, whatever law of two cameras each has (`depth_model` "stereo"). Its residual is that
-    of the rig that was measured worst. It states the first volume that a rig states, where that is a box along the axes
-    of the shared frame, and the first place of a tracking system and file of gestures.
+    It triangulates by all of them, whatever law of two cameras each has (`depth_model` "stereo"). Its
+    residual is that of the rig that was measured worst. It states the first volume that a rig states, where
+    that is a box along the axes of the shared frame, and the first place of a tracking system and file of
+    gestures.
 
     Raises:
-        CalibrationError: They share a camera, two cameras stand in
-            one place, or markers, filter, pairing or solver differ.
+        CalibrationError: They share a camera, two cameras stand in one place, or markers, filter, pairing or
+            solver differ.
     """
     placed = [in_world(rig) for rig in rigs]
     if len(placed) == 1:
@@ -97,9 +84,7 @@ def gestures_named(rigs: Sequence[RigCalibration]) -> str | None:
 
 
 def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
-    """Refuse rigs that share the name of a camera or an IMU.
-
-    A message identifies its sender by that name alone.
+    """Refuse rigs that share a camera or an IMU: messages have the name alone.
 
     Raises:
         CalibrationError: With both rigs and the name.
@@ -118,12 +103,10 @@ def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
 def rigs_by_hand(
     rig: RigCalibration, hands: Mapping[str, HandModel]
 ) -> list[tuple[str, RigCalibration, tuple[int, ...]]]:
-    """Split a rig by hand.
+    """Split a rig into (hand, the rig for that hand alone, its rows of the markers).
 
-    For each hand: its name, the rig as if it observed that hand alone, and which of the rig's markers those are.
-
-    A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free markers
-    and objects stay with its first hand.
+    A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free
+    markers and objects stay with its first hand.
 
     Raises:
         CalibrationError: A marker is mounted by none of the hands or by two, or a hand mounts none.
@@ -159,11 +142,10 @@ def rigs_by_hand(
 
 
 def in_world(rig: RigCalibration) -> RigCalibration:
-    """Return the marker rig in the frame that several rigs share.
+    """Return the marker rig in the frame that several rigs share (`T_world_rig`).
 
-    Transforms cameras, world of its IMU, tracking system, and volume; a rig without `T_world_rig` stays as it is.
-
-    A volume that the shared frame's axes turn away from is no box there, and is not stated any more.
+    Cameras, world of its IMU, tracking system and volume are moved. A volume that the shared frame's axes
+    turn away from is no box there, and is not stated any more.
     """
     if rig.T_world_rig is None:
         return rig
@@ -185,7 +167,7 @@ def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | Non
     if imu is None or imu.q_rig_world is None:
         return imu
     rotated = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
-    return replace(imu, q_rig_world=_quaternion(rotated))
+    return replace(imu, q_rig_world=_row(rotated))
 
 
 def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
@@ -197,10 +179,7 @@ def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:
 
 
 def _worst_places(rigs: Sequence[RigCalibration]) -> dict[str, Provenance]:
-    """Return the accuracy of the cameras' poses in the merged rig.
-
-    As good as that of the rig whose cameras are placed worst.
-    """
+    """Return the cameras' provenance of the rig whose cameras are placed worst."""
     key = "T_rig_camera"
     known = [rig.provenance[key] for rig in rigs if key in rig.provenance]
     return {} if not known else {key: max(known, key=lambda one: one.residual.get("rms_px", 0.0))}
@@ -214,10 +193,6 @@ def _matrix(pose: Float) -> Matrix4:
 def _row(row: Float) -> Row4:
     a, b, c, d = (float(value) for value in row)
     return a, b, c, d
-
-
-def _quaternion(q_wxyz: Float) -> Quaternion:
-    return _row(q_wxyz)
 
 
 def _vector(point: Float) -> Vector3:
@@ -255,7 +230,6 @@ def objects_of(rig: RigCalibration, objects: Mapping[str, ObjectProfile]) -> tup
 
 
 def _refuse_shared_features(rig: str, objects: Sequence[ObjectProfile]) -> None:
-    """Refuse objects that could be taken for each other."""
     owner: dict[str, str] = {}
     for one in objects:
         tags = (
@@ -271,12 +245,9 @@ def _refuse_shared_features(rig: str, objects: Sequence[ObjectProfile]) -> None:
 
 
 def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]) -> None:
-    """Refuse an object or a tracker that the rigs of two hands share.
+    """Refuse objects or trackers in the rigs of two hands: poses would come twice.
 
-    Its poses would come twice.
-
-    Args:
-        watched: Of each hand the name of its rig, and its objects.
+    `watched`: of each hand the name of its rig, and its objects.
 
     Raises:
         CalibrationError: With both rigs and the object.
@@ -298,9 +269,7 @@ def refuse_shared_objects(watched: Sequence[tuple[str, Sequence[ObjectProfile]]]
 def load_objects(
     calibration: Path | None, rigs: Sequence[RigCalibration], known: Mapping[str, ObjectProfile]
 ) -> dict[str, ObjectProfile]:
-    """Load the objects that these rigs name.
-
-    From `known`, else <calibration>/objects/<name>.json.
+    """Load the objects of these rigs, from `known`, else <calibration>/objects/.
 
     Raises:
         CalibrationError: One is in neither, or its file is broken.
@@ -336,7 +305,7 @@ def load_gestures(calibration: Path | None, name: str | None) -> GestureSettings
 
 
 def gestures_file(calibration: Path, name: str | None) -> Path:
-    """Where the gestures of a rig stand, that names them or does not."""
+    """The file of a rig's gestures; `name` None: default.json."""
     return calibration / "gestures" / f"{name or DEFAULT_GESTURES}.json"
 
 
@@ -344,11 +313,9 @@ _EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not 
 
 
 def inside(volume: Volume | None, points_m: Float) -> Bool:
-    """Return which of the points lie in the volume.
+    """Return (...) which points (..., 3) [m] of the rig frame lie in the volume.
 
-    Points (..., 3) [m] in the rig frame; the result is (...). The faces belong to the volume.
-
-    All do where the rig states none. A point that is NaN lies nowhere.
+    The faces belong to it. All lie in it where the rig states none; a point that is NaN lies nowhere.
     """
     if volume is None:
         return np.ones(points_m.shape[:-1], np.bool_)

@@ -1,7 +1,4 @@
-"""Pipeline construction from a rig's files.
-
-Joins the parts, for each kind of rig.
-"""
+"""Pipelines are constructed from a rig's files, for each kind of rig."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -37,12 +34,12 @@ _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mou
 
 
 class Pipeline(Protocol):
-    """Pipeline from the cameras of one rig to poses.
+    """Push machine from the cameras of a rig of either kind to poses of one hand."""
 
-    For either kind of rig: a push machine.
-    """
-
-    counts: Counter[str]
+    @property
+    def counts(self) -> Counter[str]:
+        """Events since the start."""
+        ...
 
     def push(self, message: Detections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
@@ -58,22 +55,17 @@ class Pipeline(Protocol):
 
 
 def _point_filter(setup: RigSetup) -> PointFilter:
-    """Return the point filter that this rig's file describes.
-
-    Along the mean viewing direction of its cameras and across it.
-    """
+    """Return the rig file's point filter, along the mean viewing direction of its cameras and across it."""
     poses = np.array([model.T_rig_camera for model in setup.models.values()])
     ahead = poses[:, :3, 2].sum(axis=0)
     across = cross(poses[0, :3, 1], ahead)
     view = np.stack([across, cross(ahead, across), ahead])
     return PointFilter(
-        OneEuroParameters.of(setup.rig.filter),
-        view / np.linalg.norm(view, axis=1, keepdims=True),
+        OneEuroParameters.of(setup.rig.filter), view / np.linalg.norm(view, axis=1, keepdims=True)
     )
 
 
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
-    """The filter of the solved hand, by the same settings."""
     # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
     blend_m_s = None if setup.wrist is None else 0.3
     hand = setup.hand if setup.wrist is None else loosened(setup.hand)
@@ -81,7 +73,7 @@ def _hand_filter(setup: RigSetup) -> HandOneEuro:
 
 
 def _rays(setup: RigSetup) -> RayTriangulator | None:
-    """Triangulation by the rays of all cameras; None: there is one."""
+    """Triangulation by the rays of all cameras; None: there is but one."""
     cameras = tuple(setup.models.values())
     if len(cameras) < 2:
         return None
@@ -100,10 +92,7 @@ def _estimator(
     settings: Settings | None = None,
     fused: bool = False,
 ) -> Estimator:
-    """Return the estimator of a rig's hand.
-
-    Arguments as of `Estimator`; `fused`: with the rows of a wrist device.
-    """
+    """Return the estimator of a rig's hand; `fused`: with the rows of a wrist device."""
     markers, wrist = setup.hand_markers, None
     if fused:
         assert setup.wrist is not None
@@ -123,10 +112,7 @@ def _estimator(
 def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> FabrikSolver:
     """The card's line of a marker rig.
 
-    Args:
-        setup: The rig.
-        stage: Measures the stages.
-        continuous: False: every frame is an unrelated pose; no filter, no memory.
+    `continuous` False: every frame is an unrelated pose; no filter, no memory.
 
     Raises:
         CalibrationError: The depth model does not fit the rig, or the estimator cannot start from it.
@@ -180,15 +166,9 @@ def build_pipeline(
 ) -> MarkerPipeline:
     """Build the pipeline that this marker rig's file describes.
 
-    Of a wrist device beside it nothing is used except through `side`.
-
-    Args:
-        setup: The rig.
-        stage: Measures the stages.
-        continuous: False: every frame is an unrelated pose; no filter, no memory.
-        side: Wrist device and IMU; None: there are none, or they are left out.
-        counts: Counted into; None: counts of its own.
-        shed: Asked for each epoch whether it is dropped; None: none is.
+    `continuous` False: every frame is an unrelated pose; no filter, no memory. `side` has wrist device and
+    IMU; None: there are none, or they are left out. `counts` None: counts of its own. `dropped_epochs` is
+    asked for each epoch whether it is dropped.
 
     Raises:
         CalibrationError: The depth model or the solver does not fit the rig, or it is no marker rig.
@@ -230,12 +210,10 @@ def pipeline_of(
     continuous: bool = True,
     dropped_epochs: Callable[[], bool] | None = None,
 ) -> Pipeline:
-    """Build the pipeline of a rig of either kind, or of both.
+    """Build the pipeline of a rig of either kind, or of both, as `build_pipeline`.
 
-    Arguments and errors as of `build_pipeline`.
-
-    What is pushed is of cameras of these rigs: the link refuses one that sends
-    what those of the other kind do.
+    What is pushed is of cameras of these rigs: the link refuses one that sends what those of the other kind
+    do.
     """
     if setup.wrist is None:
         return cast(

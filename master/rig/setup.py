@@ -1,12 +1,6 @@
 """Setup of one hand is read from the rig's files.
 
-Setup that observes one hand.
-
-A rig and all that its files refer to, checked, and the rigs of one hand joined.
-
-Reader of rigs from JSON.
-
-Reads rigs and what they name of a calibration folder; pipelines are made of what it returns.
+A rig and all that its files refer to, checked, and the rigs of one hand joined. Pipelines are made of it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,19 +34,19 @@ from master.rig.wrist import WristSetup
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSetup:
-    """Setup that observes one hand, with all files it refers to, checked.
-
-    A marker rig, a wrist device, or both.
+    """All that observes one hand, checked: a marker rig, a wrist device, or both.
 
     Attributes:
-        rig: The rig file; of several marker rigs what they are together; with markers and a wrist device the former.
+        rig: The rig file; of several marker rigs what they are together; with markers and a wrist device the
+            former.
         cameras: Camera files by name, in the order of the rigs.
         models: Those of `rig` as camera models, placed in its frame, which is that of the poses.
         hand: The hand model.
         wrist: Laser plane and palm of a wrist device; None: there is none.
         wrist_rig: The rig file of that device.
         rows: Camera -> which rows of its messages are `markers`, where it watches another hand as well.
-        objects: What else its marker cameras watch, in the order of the rig; of a rig of several hands with the first.
+        objects: What else its marker cameras watch, in the order of the rig; of a rig of several hands with
+            the first.
         gestures: What counts as a gesture of this hand.
         settings: Numbers of the estimator.
     """
@@ -132,18 +126,12 @@ class RigSetup:
         hand: HandModel,
         objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "RigSetup":
-        """Join the files of a rig that watches one hand.
-
-        Args:
-            rig: The rig.
-            cameras: Camera files by name; more than its own do not matter.
-            hand: The hand.
-            objects: Object files by name; None: its objects are left out, only the hand is wanted.
+        """Join the files of a rig that watches one hand; `objects` None: left out.
 
         Raises:
-            CalibrationError: A camera of the rig is missing or has no intrinsics; of a marker rig: fewer than two
-                cameras, several hands, a marker the hand does not mount and that is not free, or as of
-                `rig_objects.objects_of`; of a wrist device: no laser plane or no palm pose.
+            CalibrationError: A camera of the rig is missing or has no intrinsics; of a marker rig: fewer than
+                two cameras, several hands, a marker the hand does not mount and that is not free, or as of
+                `objects_of`; of a wrist device: no laser plane or no palm pose.
         """
         if rig.kind == "markers" and len(rig.cameras) < 2:
             raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
@@ -165,17 +153,15 @@ class RigSetup:
 
     @classmethod
     def joined(cls, setups: Sequence["RigSetup"]) -> "RigSetup":
-        """Join all setups that observe one hand.
+        """Join one or more setups that observe one hand.
 
-        Its marker rigs become one of N cameras in the frame that they share (`T_world_rig`), and its wrist device
-        stands beside them.
-
-        Args:
-            setups: One or more, of one hand.
+        Its marker rigs become one of N cameras in the frame that they share (`T_world_rig`), and its wrist
+        device stands beside them.
 
         Raises:
-            CalibrationError: They are of different hands, two are wrist devices, two have a camera or IMU of the same
-                name or two IMUs, name two files of gestures, or the marker rigs cannot be merged (`merged_rig`).
+            CalibrationError: They are of different hands, two are wrist devices, two have a camera or IMU of
+                the same name or two IMUs, name two files of gestures, or the marker rigs cannot be merged
+                (`merged_rig`).
         """
         marked = [setup for setup in setups if setup.has_markers]
         wrist_setups = [setup for setup in setups if not setup.has_markers]
@@ -203,11 +189,6 @@ class RigSetup:
 
 
 def _check_mounts(rig: RigCalibration, hand: HandModel) -> None:
-    """Refuse a marker that is neither the hand's nor free.
-
-    Raises:
-        CalibrationError: With its name.
-    """
     for name in rig.markers:
         if name not in rig.free_markers:
             try:
@@ -220,19 +201,11 @@ def _check_mounts(rig: RigCalibration, hand: HandModel) -> None:
 
 
 def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:
-    """Those of the rig that names a file, where one does."""
     named = (setup.gestures for setup in setups if setup.rig.gestures is not None)
     return next(named, setups[0].gestures)
 
 
 def _refuse_two(setups: Sequence[RigSetup], wrist_setups: Sequence[RigSetup]) -> None:
-    """Refuse rigs of different hands, or with conflicting parts.
-
-    Two rigs conflict where both claim what a hand has only once.
-
-    Raises:
-        CalibrationError: With both rigs.
-    """
     first = setups[0]
     for setup in setups:
         if setup.hand.profile != first.hand.profile:
@@ -259,23 +232,15 @@ def setups_of(
     objects: Mapping[str, ObjectProfile] | None = None,
     gestures_of: Callable[[str | None], GestureSettings] = lambda _name: default_gestures(),
 ) -> tuple[RigSetup, ...]:
-    """Return the setup of each hand of these rigs.
+    """Return the setup of each hand, in the order in which the rigs name the hands.
 
-    What observes each hand, in the order in which the rigs name the hands.
-
-    A marker rig with `other_hands` watches several: each of its markers is that of the hand that mounts it. Free
-    markers and objects stay with the rig's first hand.
-
-    Args:
-        rigs: One or more.
-        cameras: Camera files by name.
-        hand_named: The hand of a name.
-        objects: Object files by name; None: objects are left out.
-        gestures_of: What a rig's `gestures` stands for, or none.
+    A marker rig with `other_hands` watches several: each of its markers is that of the hand that mounts it.
+    Free markers and objects stay with the rig's first hand. `objects` None: they are left out. `gestures_of`:
+    what a rig's `gestures`, or none, stands for.
 
     Raises:
-        CalibrationError: As of `RigSetup.joined`; of a rig of several hands a marker is mounted by none or by two; two
-            hands' rigs have the same object.
+        CalibrationError: As of `RigSetup.joined`; of a rig of several hands a marker is mounted by none or by
+            two; two hands' rigs have the same object.
     """
     refuse_shared_senders(rigs)
     found: dict[str, list[RigSetup]] = {}
@@ -299,23 +264,19 @@ def load_setups(
 ) -> tuple[RigSetup, ...]:
     """Read a setup for each hand from a calib_json tree.
 
-    Reads rigs/<rig>.json of each rig, their cameras, hands, objects and gestures.
-
-    Args:
-        calibration: The tree.
-        rig_names: One or more.
-        hand_file: Profile of the hand, in place of that which the rigs name.
+    Reads rigs/<rig>.json of each rig, their cameras, hands, objects and gestures; `hand_file` is a hand in
+    place of that which the rigs name.
 
     Raises:
         CalibrationError: A file is missing, broken or contradicts another; as of `setups_of`.
     """
     rigs = [load(calibration / "rigs" / f"{name}.json", RigCalibration) for name in rig_names]
-    cameras = {
-        name: load(calibration / "cameras" / f"{name}.json", CameraCalibration)
-        for rig in rigs
-        for name in rig.cameras
-    }
-    return setups_with_hands(rigs, cameras, calibration, hand_file)
+    return setups_with_hands(rigs, _load_cameras(calibration, rigs), calibration, hand_file)
+
+
+def _load_cameras(calibration: Path, rigs: Sequence[RigCalibration]) -> dict[str, CameraCalibration]:
+    names = [name for rig in rigs for name in rig.cameras]
+    return {name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in names}
 
 
 def setups_with_hands(
@@ -327,12 +288,11 @@ def setups_with_hands(
 ) -> tuple[RigSetup, ...]:
     """Build setups as `setups_of`, loading hands, objects and gestures.
 
-    Each as `load_hand`, `load_objects` and `load_gestures` find it.
-
     `hand_file` is the hand of all rigs; `objects` are those of a recording, before those of the tree.
 
     Raises:
-        CalibrationError: As of all these; the rigs are of several hands and `hand_file` is one.
+        CalibrationError: As of `load_hand`, `load_objects`, `load_gestures`; the rigs are of several hands
+            and `hand_file` is one.
     """
     names = tuple(dict.fromkeys(name for rig in rigs for name in (rig.hand, *rig.other_hands)))
     if hand_file is not None and len(names) > 1:
@@ -345,18 +305,12 @@ def setups_with_hands(
 def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) -> RigSetup:
     """Read one rig's setup from a calib_json tree.
 
-    Reads rigs/<rig>.json, its cameras, hand, objects and gestures.
-
     Raises:
         CalibrationError: A file is missing, broken or contradicts another.
     """
     rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
-    cameras = {
-        name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in rig.cameras
-    }
-    setup = RigSetup.of(
-        rig, cameras, load_hand(calibration, rig.hand, hand_file), load_objects(calibration, [rig], {})
-    )
+    cameras, hand = _load_cameras(calibration, [rig]), load_hand(calibration, rig.hand, hand_file)
+    setup = RigSetup.of(rig, cameras, hand, load_objects(calibration, [rig], {}))
     return with_fields(setup, gestures=load_gestures(calibration, rig.gestures))
 
 
@@ -383,10 +337,7 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
 
 @dataclass(frozen=True, slots=True)
 class RigFiles:
-    """Where setups were read.
-
-    The arguments of `load_setups`, and parameters of the estimator that go with them.
-    """
+    """Where setups were read: arguments of `load_setups`, numbers of the estimator."""
 
     calibration: Path
     rigs: tuple[str, ...]

@@ -1,7 +1,4 @@
-"""What the master knows of one wrist device before the first message.
-
-Device and hand, its laser, and how to read it.
-"""
+"""Setup of one wrist device: device and hand, its laser, and how to read it."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -45,8 +42,8 @@ class WristSetup(WristDevice):
     def of(cls, rig: RigCalibration, camera: CameraCalibration, model: HandModel) -> "WristSetup":
         """Build and check.
 
-        Where the rig does not state where its laser is, it is put at the foot of the camera on its plane: the laser of
-        such a device sits beside the lens.
+        Where the rig does not state where its laser is, it is put at the foot of the camera on its plane: the
+        laser of such a device sits beside the lens.
 
         Raises:
             CalibrationError: As of `WristDevice.joined`.
@@ -73,10 +70,7 @@ class WristSetup(WristDevice):
         )
 
     def flexed(self, wrist_angles_rad: Float) -> "WristSetup":
-        """Return the setup with the palm of a flexed wrist.
-
-        The wrist is flexed by (2,) [rad] (`common.hand.wrist`); all else is the same.
-        """
+        """Return the setup with the wrist flexed by (2,) [rad] (`common.hand.wrist`)."""
         T = self.T_camera_palm.copy()
         T[:3, :3] = T[:3, :3] @ forearm_palm(wrist_angles_rad)
         return replace(self, T_camera_palm=T)

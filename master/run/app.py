@@ -1,12 +1,6 @@
 """Live loop takes messages to the sinks and counts and times a run.
 
-Live loop from messages to sinks, and the figures of a run.
-
-Messages in; hands, objects, contact and gestures out to every sink.
-
-Mean duration of each named stage.
-
-Shows where the time goes; measured from outside the pure code.
+Messages in; hands, objects, contact and gestures out to every sink. Times are measured outside the pure code.
 """
 
 import threading
@@ -41,17 +35,13 @@ _OBJECT_KEPT = 2_000  # and of objects, some seconds of each
 SeenT = TypeVar("SeenT", bound=Detections)
 SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
 SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
-AuxiliaryMessage: TypeAlias = (
-    TagDetections | ImuSample | TrackerPose
-)  # what comes beside the frames of cameras
+# What comes beside the frames of cameras.
+AuxiliaryMessage: TypeAlias = TagDetections | ImuSample | TrackerPose
 _AUXILIARY = (TagDetections, ImuSample, TrackerPose)
 
 
 class SolvedT(Protocol):
-    """Hand or object at one time, with the arrival time of its last frame.
-
-    That is when the last frame that contributed was handed to its slave [ns].
-    """
+    """Hand or object at one time."""
 
     @property
     def pose(self) -> HandPose | ObjectPose:
@@ -60,7 +50,7 @@ class SolvedT(Protocol):
 
     @property
     def ready_t_ns(self) -> int:
-        """When the last frame of it was there, master's clock."""
+        """When its last frame was handed to its slave [ns], master's clock."""
         ...
 
 
@@ -79,18 +69,12 @@ class Solver(Protocol[SeenT_contra]):
     """What is made of all that comes: the world of a master."""
 
     def push(self, message: SeenT_contra | AuxiliaryMessage) -> Iterable[Solved]:
-        """Take one message and yield what it completes.
-
-        Each result is out before the next is computed.
-        """
+        """Take one message; yield what it completes, each before the next is computed."""
         ...
 
 
 class RunFigures:
-    """Performance figures of a run.
-
-    Written by the loop, read by health reports and the summary.
-    """
+    """Performance figures of a run, written by the loop, read by reports and summary."""
 
     def __init__(self) -> None:
         self.poses = 0
@@ -122,11 +106,10 @@ class RunFigures:
         self.poses += 1
 
     def summary(self) -> dict[str, float]:
-        """Return the rate and latencies of the hand poses.
+        """Return rate and latencies of the hand poses, and latencies of tracked objects.
 
-        poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms: of hands.
-
-        Of objects that were tracked object_latency_p50_ms, object_latency_p99_ms.
+        poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms,
+        object_latency_p50_ms, object_latency_p99_ms.
         """
         span_s = (self._last_ns - self._first_ns) * 1e-9
         out = {"poses": float(self.poses)}
@@ -145,10 +128,7 @@ class RunFigures:
 
 
 class Observed(Generic[SeenT]):
-    """A solver, with measurements of the cameras' messages around it.
-
-    Rates are counted before it; `monitor` is called once all is out.
-    """
+    """A solver with camera rates counted before it, and `monitor` called after it."""
 
     def __init__(self, solver: Solver[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
         self._solver, self._rates, self._monitor = solver, rates, monitor
@@ -185,10 +165,7 @@ def run(
 
 
 def result_at(solved: Solved, t_ns: int) -> ResultMessage:
-    """Return the message that is published at `t_ns`.
-
-    A pose reports its latency.
-    """
+    """Return the message that is published at `t_ns`; a pose has its latency."""
     if isinstance(solved, Contact | Gesture):
         return solved
     return restamped(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
@@ -203,7 +180,8 @@ def health(
 ) -> Health:
     """Return the master's health report.
 
-    Metrics distinguish the rate at which a camera runs (camera_hz.NAME) from the rate of solved poses (poses_per_s).
+    Metrics distinguish the rate at which a camera runs (camera_hz.NAME) from the rate of solved poses
+    (poses_per_s).
     """
     metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
     # characters of a name in `Health`
@@ -218,15 +196,12 @@ class StageTimes:
     """Sums durations by stage name."""
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Measure with the clock `now_ns`.
-
-        Time that passes, or `time.thread_time_ns`, the processor time spent.
-        """
+        """Measure with the clock `now_ns`, such as `time.thread_time_ns` for processor time."""
         self._now_ns = now_ns
         self._stages: dict[str, StageTime] = {}
 
     def __call__(self, name: str) -> "StageTime":
-        """Return what measures passages through stage `name`."""
+        """What measures passages through stage `name`."""
         stage = self._stages.get(name)
         if stage is None:
             stage = self._stages[name] = StageTime(self._now_ns)
@@ -249,14 +224,11 @@ class StageTime:
     __slots__ = ("_began_ns", "_now_ns", "count", "total_ns")
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        """Begin with none."""
         self._now_ns, self._began_ns, self.count, self.total_ns = now_ns, 0, 0, 0
 
     def __enter__(self) -> None:
-        """Begin to measure."""
         self._began_ns = self._now_ns()
 
     def __exit__(self, *_: object) -> None:
-        """Add the time since."""
         self.total_ns += self._now_ns() - self._began_ns
         self.count += 1

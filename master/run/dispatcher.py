@@ -1,36 +1,23 @@
 """Dispatcher derives the poses of hands and objects from messages.
 
-Fusion of all sensors of one object into one stream of poses.
-
-What cameras see of it and a tracker on it become one row of poses.
-
-Cameras measure it in the rig's own frame, a tracker through its registration. So while cameras track it their poses
-are output, and the tracker's elsewhere; what cameras hold is not output while the tracker knows better. Time never
-goes back.
-
-Everything a master derives from its senders' messages, behind one push.
-
-The results are hands, objects, contact and gestures.
-
-In this order, because the hand is what is waited for: first the poses that a message completes, of every hand, then
-those of objects, then what the hands do. `push` is a generator: what it gave is out before the next is worked out.
-
-Objects belong to the marker rig that names them; a hand measured by markers has the same frame, so contact is made for
-each of those and every object. A wrist device alone has a frame of its own: its hand touches nothing that we know.
+First the poses that a message completes, of every hand, because these are waited for; then those of objects,
+then contact and gestures. `push` is a generator: what it gave is out before the next is worked out. Objects
+belong to the marker rig that names them; a hand measured by markers has the same frame, so contact is made
+for each of those and every object. A wrist device alone has a frame of its own: its hand touches nothing that
+we know. Cameras measure an object in the rig's frame, a tracker on it through its registration. While cameras
+track it their poses are output, and the tracker's elsewhere; what cameras hold is not output while the
+tracker knows better.
 """
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from math import inf, nan
-from typing import Protocol
+from math import inf
 
 import msgspec
 
-from common.arrays import Float
 from common.messages import (
     Contact,
-    Detections,
     Gesture,
     HandPose,
     ImuSample,
@@ -44,7 +31,7 @@ from master.gestures.poses import GestureRecogniser
 from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine, SolvedObject
 from master.objects.tracker import TrackerLine, registered
-from master.rig.pipeline import pipeline_of
+from master.rig.pipeline import Pipeline, pipeline_of
 from master.rig.setup import RigSetup
 from master.run.app import Solved, StageTimes
 from master.run.link_senders import SensorMessage
@@ -54,15 +41,10 @@ _NAME = 64  # characters of a name in `Health`
 
 
 class TrackedObject:
-    """Push machine that merges camera and tracker poses of one object.
-
-    Holds the lines of cameras and tracker, and when each last reported something.
-    """
+    """Push machine that merges one object's camera and tracker poses in time."""
 
     def __init__(self, setup: RigSetup, name: str, counts: Counter[str]) -> None:
-        """Build the lines of one of the setup's objects.
-
-        Their results are counted into `counts`.
+        """Build the lines of one of the setup's objects, which count into `counts`.
 
         Raises:
             CalibrationError: A bead is none of the rig's markers.
@@ -82,10 +64,7 @@ class TrackedObject:
         return self.tracker is not None and self._device is None
 
     def push(self, message: MarkerDetections | TagDetections) -> list[SolvedObject]:
-        """Take the detections of one camera and return the resulting poses.
-
-        They come oldest first.
-        """
+        """Take the detections of one camera; return the resulting poses, oldest first."""
         if self._line is None:
             return []
         if isinstance(message, MarkerDetections):
@@ -95,10 +74,7 @@ class TrackedObject:
         return self._of_cameras(self._line.push(message))
 
     def push_tracker(self, message: TrackerPose) -> list[SolvedObject]:
-        """Take a pose of the object's tracker and return the resulting poses.
-
-        They come oldest first.
-        """
+        """Take a pose of the object's tracker; return the resulting poses, oldest first."""
         if self._device is None:
             self._counts[f"tracker.{message.source}.unplaced"[:_NAME]] += 1
             return []
@@ -131,7 +107,6 @@ class TrackedObject:
         return out
 
     def _published(self, one: SolvedObject) -> list[SolvedObject]:
-        """It, if it is later than the last, and counted."""
         if one.pose.t_ns <= self._last_ns:
             return []
         self._last_ns = one.pose.t_ns
@@ -144,7 +119,6 @@ class TrackedObject:
         return [one]
 
 
-_DISPATCHER_NAME = 64  # characters of a name in `Health`
 _FRAMES = MarkerDetections, WristDetections
 
 
@@ -166,11 +140,7 @@ class _Auxiliary:
 
     @classmethod
     def of(cls, setups: Sequence[RigSetup], counts: Counter[str], *, gestures: bool) -> "_Auxiliary":
-        """Build all of it.
-
-        Raises:
-            CalibrationError: An object does not fit its rig.
-        """
+        """Build all of it; a CalibrationError where an object does not fit its rig."""
         objects: list[TrackedObject] = []
         shown: dict[str, list[TrackedObject]] = {}
         for setup in setups:
@@ -195,45 +165,15 @@ class _Auxiliary:
         )
 
 
-class Line(Protocol):
-    """What makes poses of one hand: the pipeline of its setup, or a `LivePipeline`."""
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Events since the start."""
-        ...
-
-    def push(self, message: Detections) -> list[SolvedPose]:
-        """Take one camera's detections; return the poses they complete, oldest first."""
-        ...
-
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take the orientation (4,) that the hand's IMU reports."""
-        ...
-
-    def flush(self) -> list[SolvedPose]:
-        """At the end of a recording: the poses that still wait for something."""
-        ...
-
-
 class Dispatcher:
-    """Push machine over all that comes.
-
-    Holds the line of each hand, what is beside them, and the gestures that have not ended.
-    """
+    """Push machine over all messages: the line of each hand, and what is beside them."""
 
     def __init__(
-        self, setups: Sequence[RigSetup], lines: Sequence[Line], stage: Stage, *, gestures: bool = True
+        self, setups: Sequence[RigSetup], lines: Sequence[Pipeline], stage: Stage, *, gestures: bool = True
     ) -> None:
-        """Join each hand's setup with its solver line and build the other stages.
+        """Join each hand's setup with its solver line and build what is beside the hands.
 
-        The other stages are what is beside the hands.
-
-        Args:
-            setups: Of each hand.
-            lines: What makes its poses.
-            stage: Measures the stages.
-            gestures: False: poses are unrelated, as of single pictures; there is no doing in them.
+        `gestures` False: poses are unrelated, as of single pictures; there are no gestures in them.
 
         Raises:
             CalibrationError: An object does not fit its rig.
@@ -258,20 +198,15 @@ class Dispatcher:
 
     @property
     def counts(self) -> Counter[str]:
-        """Return the event counts since the start.
+        """Event counts since the start; of several hands each under the hand's name.
 
-        Where there are several hands, the events of a hand are under its name.
-
-        Of objects object.NAME.poses, .tracked, .occluded; of gestures gesture.KIND, how many began; of trackers
-        tracker.NAME.lost, .leap, .late, .broken, and .unplaced where it is not registered.
+        Of objects object.NAME.poses, .tracked, .occluded; of gestures gesture.KIND, how many began; of
+        trackers tracker.NAME.lost, .leap, .late, .broken, and .unplaced where it is not registered.
         """
         # The loop may add a count meanwhile: a copy is made at once.
         each = [(setup.hand.profile.name, dict(line.counts)) for setup, line in self._hands]
         if len(each) > 1:
-            each = [
-                (hand, {f"{hand}.{event}"[:_DISPATCHER_NAME]: n for event, n in own.items()})
-                for hand, own in each
-            ]
+            each = [(hand, {f"{hand}.{event}"[:_NAME]: n for event, n in own.items()}) for hand, own in each]
         return Counter({event: n for _, own in each for event, n in own.items()} | dict(self._counts))
 
     @property
@@ -281,10 +216,7 @@ class Dispatcher:
 
     @property
     def unplaced(self) -> tuple[TrackedObject, ...]:
-        """Return the objects whose tracker is not registered.
-
-        What such a tracker reports is of no use.
-        """
+        """Objects whose tracker is not registered: what it reports is of no use."""
         return tuple(one for one in self._now.objects if one.unplaced)
 
     def push(self, message: SensorMessage) -> Iterator[Solved]:
@@ -316,9 +248,7 @@ class Dispatcher:
             yield from self._done(one.pose)
 
     def prepare(self, setups: Sequence[RigSetup]) -> Callable[[], None]:
-        """Build the stages beside the hands for changed files.
-
-        The function that is returned lets them take over with the next message.
+        """Build what is beside the hands for changed files; return the switch to it.
 
         From any thread but the loop's. What was known of objects and gestures begins anew.
 
@@ -336,7 +266,6 @@ class Dispatcher:
             yield msgspec.structs.replace(gesture, phase="end")
 
     def _seen(self, message: SensorMessage) -> Iterator[SolvedObject]:
-        """Poses of objects that a message completes."""
         if isinstance(message, TrackerPose):
             if (carried := self._now.trackers.get(message.source)) is not None:
                 yield from self._known(carried.push_tracker(message))
@@ -347,14 +276,13 @@ class Dispatcher:
                 yield from self._known(solved)
 
     def _known(self, solved: list[SolvedObject]) -> list[SolvedObject]:
-        """The same; hands know now where it is."""
+        """Pass these objects to the contact monitors of the hands; return them."""
         for one in solved:
             for contact in self._now.contacts.values():
                 contact.push_object(one.pose)
         return solved
 
     def _done(self, pose: HandPose) -> Iterator[Contact | Gesture]:
-        """What a hand does."""
         if (contact := self._now.contacts.get(pose.hand)) is not None:
             with self._stage("contact"):
                 near = contact.push(pose)
@@ -369,7 +297,7 @@ class Dispatcher:
     def _remember(self, gesture: Gesture) -> None:
         key = gesture.hand, gesture.kind, gesture.name
         if gesture.phase == "begin" or gesture.kind == "tap":
-            self._counts[f"gesture.{gesture.kind}"[:_DISPATCHER_NAME]] += 1
+            self._counts[f"gesture.{gesture.kind}"[:_NAME]] += 1
         if gesture.phase == "end":
             self._begun.pop(key, None)
         else:
@@ -377,7 +305,7 @@ class Dispatcher:
 
 
 def new_dispatcher(setups: Sequence[RigSetup]) -> Dispatcher:
-    """A world of these hands in its first state, of which nothing is measured.
+    """A dispatcher of these hands in its first state, of which nothing is measured.
 
     Raises:
         CalibrationError: As `Dispatcher`.

@@ -1,18 +1,9 @@
 """Ingest turns datagrams into a queue of detections and IMU samples.
 
-Queue of messages that arrived and were not taken yet.
-
-It is the one queue between the thread that reads the socket and the live loop.
-
-It drops the oldest, so a slow loop sees what is new. Frames, tags, samples of IMUs and poses of trackers have each
-their own room in it: none drives another out, and at overload all that is taken is of the same stretch of time.
-
-Conversion of datagrams to detections and IMU samples.
-
-They are decoded, checked, counted, and put on the master's clock.
-
-A socket around `master.run.link`: one thread reads, answers and repeats what has to be repeated; the live loop takes
-messages from a queue (`master.run.ingest`).
+A socket around `link`: one thread reads, answers and repeats what has to be repeated; the live loop takes
+messages from the queue, decoded, checked, counted, and on the master's clock. The queue drops the oldest, so
+a slow loop sees what is new. Frames, tags, IMU samples and tracker poses have each their own room in it: none
+drives another out, and at overload all that is taken is of the same stretch of time.
 """
 
 import os
@@ -38,12 +29,8 @@ from master.run.sequence import CameraCounts
 
 QUEUE = 64  # frames, or strobe cycles, that may wait, of one or two cameras
 QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
-CAPACITY = {
-    "frame": QUEUE,
-    "tags": QUEUE,
-    "imu": 16 * QUEUE,
-    "tracker": 16 * QUEUE,
-}  # what comes while so many frames do
+# What comes while so many frames do.
+CAPACITY = {"frame": QUEUE, "tags": QUEUE, "imu": 16 * QUEUE, "tracker": 16 * QUEUE}
 # Whose room in the queue a message takes.
 _KIND: dict[type[SensorMessage], str] = {
     MarkerDetections: "frame",
@@ -55,10 +42,7 @@ _KIND: dict[type[SensorMessage], str] = {
 
 
 class Span(NamedTuple):
-    """Capture times of the oldest and of the newest waiting frame of a camera.
-
-    [ns], master's clock.
-    """
+    """Times [ns] of a camera's oldest and newest waiting frame, master's clock."""
 
     oldest_ns: int
     newest_ns: int
@@ -67,14 +51,11 @@ class Span(NamedTuple):
 class MessageQueue:
     """Messages in the order in which they came. Safe to use from several threads.
 
-    Holds them, and the times of those of each kind and sender.
-
     Attributes:
         overflowed: Messages that were dropped, as there was no more room.
     """
 
     def __init__(self, cameras: int) -> None:
-        """Have room for what so many cameras send."""
         self.overflowed = 0
         self._queue: deque[SensorMessage] = deque()
         self._has_capacity = capacity(cameras)
@@ -85,17 +66,11 @@ class MessageQueue:
 
     @property
     def frames(self) -> int:
-        """Return the number of waiting frames of all cameras.
-
-        Strobe cycles count as frames do.
-        """
+        """Number of waiting frames of all cameras; strobe cycles count as frames do."""
         return self._waiting["frame"]
 
     def frame_spans(self) -> dict[str, Span]:
-        """Return the time span of each camera's waiting frames.
-
-        Camera -> span; strobe cycles count as frames do. Only cameras that have a waiting frame are included.
-        """
+        """Return the time span of the waiting frames, of each camera that has any."""
         if not self._waiting["frame"]:
             return {}
         with self._changed:
@@ -108,8 +83,8 @@ class MessageQueue:
     def put(self, messages: Sequence[SensorMessage]) -> None:
         """Let them wait, and wake who waits for them: once for all that came together.
 
-        Where there is no more room for a kind, the oldest of the sender goes of which most wait: who sends too much
-        loses his own.
+        Where there is no more room for a kind, the oldest of the sender goes of which most wait: who sends
+        too much loses his own.
         """
         with self._changed:
             for message in messages:
@@ -123,10 +98,7 @@ class MessageQueue:
             self._changed.notify()
 
     def get(self, timeout_s: float) -> SensorMessage | None:
-        """Return the oldest waiting message.
-
-        None after `timeout_s`, or once closed and empty.
-        """
+        """Return the oldest message; None after `timeout_s`, or once closed and empty."""
         with self._changed:
             if not self._queue:
                 self._changed.wait_for(lambda: self._queue or self._closed, timeout_s)
@@ -151,7 +123,6 @@ class MessageQueue:
                 return
 
     def _left(self, message: SensorMessage) -> None:
-        """It waits no more; it was the oldest of its kind and sender."""
         kind = _KIND[type(message)]
         self._waiting[kind] -= 1
         self._times[kind, sender_of(message)].popleft()
@@ -164,13 +135,7 @@ def capacity(cameras: int) -> dict[str, int]:
 
 
 class Ingest:
-    """Receiver of all slaves of one rig, on one UDP port.
-
-    Holds the socket, its thread, and the link's state behind a lock.
-
-    Attributes:
-        queue: What came and was not taken yet.
-    """
+    """Receiver of all slaves of one rig, on one UDP port; `queue` has what came."""
 
     def __init__(
         self,
@@ -190,7 +155,7 @@ class Ingest:
         """Begin to call the slaves.
 
         Args:
-            cameras: Names that may take part; any other slave is refused.
+            cameras, imus, trackers: Names that may take part; any other slave is refused.
             key: Rig key (32 bytes), alone or with the root of the secrets of devices.
             clock: The clock that every time is moved to.
             beacon: Where beacons go: a broadcast address and the slaves' beacon port.
@@ -198,15 +163,13 @@ class Ingest:
             zenoh_endpoint: Where this master's bus listens, sent to the slaves; may be empty.
             start_timeout_s: How long the first slave waits for the others.
             random: Source of nonces.
-            imus: Names of IMUs that may take part.
             wrists: Those of `cameras` that belong to a wrist device.
-            trackers: Names of devices that track themselves and may take part.
-            limits: What files state of each sender (`admission.limits_of`); without, only what its messages can be.
+            limits: What files state of each sender (`link_senders.limits_of`); else only what its messages
+                can be.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
-            ValueError: Key of wrong length, no camera, too many senders, one name for two, or a wrist's camera that is
-                none of the cameras.
+            ValueError: As of `MasterLink`.
         """
         _check_address(beacon[0])
         self._clock = clock
@@ -248,18 +211,12 @@ class Ingest:
 
     @property
     def lost(self) -> int:
-        """Return the number of sent frames of all cameras that never arrived.
-
-        Strobe cycles count as frames do.
-        """
+        """Number of frames or strobe cycles of all cameras that were sent and never came."""
         return sum(self.counts_of(camera).lost for camera in self._cameras)
 
     @property
     def skipped(self) -> int:
-        """Return the number of frames of all cameras that were never sent.
-
-        Strobe cycles count as frames do. Camera or slave had no time for them.
-        """
+        """Number of frames or strobe cycles that camera or slave had no time for."""
         return sum(self.counts_of(camera).skipped for camera in self._cameras)
 
     @property
@@ -295,7 +252,7 @@ class Ingest:
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def limit(self, limits: Mapping[str, SenderLimits]) -> None:
-        """Accept from each sender what its files state now (`admission.limits_of`)."""
+        """Accept from each sender what its files state now (`link_senders.limits_of`)."""
         with self._lock:
             self._link.limit(limits)
 
@@ -311,10 +268,9 @@ class Ingest:
     def rejected_peers(
         self,
     ) -> tuple[dict[str, RejectedPeer], dict[str, RejectedPeer], dict[str, RejectedPeer]]:
-        """Return the recently rejected peers by sender, in three mappings.
+        """Return who was rejected lately, by sender.
 
-        The first has where a second process of the sender's name was rejected lately; the second where it speaks
-        another version; the third where somebody sends a hello without its secret.
+        First second processes of a name, then speakers of another version, then hellos without the secret.
         """
         t_ns = self._clock.now_ns()
         with self._lock:
@@ -322,10 +278,7 @@ class Ingest:
             return rejected.duplicates(t_ns), rejected.versions(t_ns), rejected.secrets(t_ns)
 
     def marker_counts(self) -> dict[str, MarkerCounts]:
-        """Camera -> how many markers its slave sent lately and its rig has here.
-
-        Of those cameras alone where the two differ.
-        """
+        """Camera -> how many markers it sent and its rig has, where these differ."""
         t_ns = self._clock.now_ns()
         with self._lock:
             return self._link.rejected_peers.marker_counts(t_ns)
@@ -340,10 +293,7 @@ class Ingest:
             return self._link.clock_of(camera)
 
     def get(self, timeout_s: float) -> SensorMessage | None:
-        """Return the oldest waiting message; None after `timeout_s`.
-
-        Its times are on the master's clock.
-        """
+        """Return the oldest message, on the master's clock; None after `timeout_s`."""
         return self.queue.get(timeout_s)
 
     def close(self) -> None:
@@ -376,10 +326,7 @@ class Ingest:
                 self.queue.put(messages)
 
     def _pending(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
-        """Yield the datagrams that have arrived, at most `AT_ONCE`.
-
-        So under a flood the periodic duties are not checked for each datagram.
-        """
+        """Yield at most 64 datagrams that have arrived: what is due is not looked at for each of a flood."""
         if first is None:
             return
         yield first
@@ -391,10 +338,7 @@ class Ingest:
 
 
 def _check_address(host: str) -> None:
-    """Refuse a host name.
-
-    Looking it up would stop the thread that reads, at every beacon.
-    """
+    """Refuse a host name: looking it up would stop the thread that reads, at every beacon."""
     try:
         IPv4Address(host)
     except AddressValueError as error:

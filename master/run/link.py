@@ -1,23 +1,21 @@
-"""The master's side of the datagram link.
+"""Link of the master: datagrams in, messages on its clock and replies out.
 
-It has the sessions of all slaves, as a push machine without a socket.
-
-`common.link.handshake.RULES` defines what follows from each event; this file classifies datagrams as events.
-- A hello makes a *pending* session; it replaces the live one only when its slave has sealed
-  something with the new keys. So a replayed or late hello never ends a live session.
-- A hello counts only with the proof that its sender has the secret of its name: a stolen device of the rig begins no
-  session in another's name, and takes no room of it.
-- A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns. Who was
-  silent for longer is replaced by whoever sends a hello.
-- A message whose time is yet to come, older than a second, or not after the last is not taken: the slave's clock was
-  stepped, and the echoes will measure how far.
-- A message counts in the session of the process that sent the hello, within the bounds of its type and of the sender's
-  files (`master.run.link_senders`). One that makes something fail costs its sender a pause (`master.run.link_senders`).
+A push machine without a socket. `common.link.handshake.RULES` states what follows from each event; this file
+classifies datagrams as events.
+- A hello makes a *pending* session; it replaces the live one only when its slave has sealed something with
+  the new keys. So a replayed or late hello never ends a live session.
+- A hello counts only with the proof that its sender has the secret of its name: a stolen device of the rig
+  begins no session in another's name, and takes no room of it.
+- A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns.
+  Who was silent for longer is replaced by whoever sends a hello.
+- A message is taken in the session of the process that sent the hello, within the bounds of its type, of the
+  sender's files and of time (`link_senders`: not ahead, not older than a second, not before the last, as
+  after a step of the slave's clock, which the echoes then measure). One that makes something fail costs its
+  sender a pause.
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
-- The start is sent when every camera is in a session whose clock is known, or a timeout after the
-  first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
-- A camera sends markers and, when it searched, tags; that of a wrist device its strobe cycles, an IMU samples, a
-  tracker poses. Each kind of message has numbers of its own.
+- The start is sent when every camera is in a session whose clock is known, or a timeout after the first one;
+  then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
+- Each kind of message (markers, tags, strobe cycles, IMU samples, tracker poses) has numbers of its own.
 - Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
 
@@ -80,12 +78,7 @@ SILENT_NS = 1_000_000_000
 
 
 class MasterLink:
-    """Datagram link of the master.
-
-    Takes datagrams, returns their contents on the master's clock, and the replies to send.
-
-    Holds the sessions of the rig's cameras, IMUs and trackers, the moment of the start, the counters of refusals.
-    """
+    """Sessions of the rig's senders, the moment of the start, counts of refusals."""
 
     def __init__(
         self,
@@ -103,13 +96,13 @@ class MasterLink:
     ) -> None:
         """Begin a new life of the master, with a nonce from `random`.
 
-        `imus` and `trackers` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a
-        wrist device: they send strobe cycles, the others markers and tags. `limits` is what the files state of each
-        sender; one that is not in it has the bounds of its messages alone.
+        `imus` and `trackers` may take part, and nobody waits for them. `wrists` are those of `cameras` that
+        belong to a wrist device: they send strobe cycles, the others markers and tags. `limits` is what the
+        files state of each sender; one that is not in it has the bounds of its messages alone.
 
         Raises:
-            ValueError: Key of wrong length, no camera, more than 32 senders, one name for two kinds of sender, or a
-                wrist's camera that is none of the cameras.
+            ValueError: Key of wrong length, no camera, more than 32 senders, one name for two kinds of
+                sender, or a wrist's camera that is none of the cameras.
         """
         everybody = {*cameras, *imus, *trackers}
         if not cameras or not len(everybody) <= MAX_CAMERAS:
@@ -157,10 +150,7 @@ class MasterLink:
         self.rejected_peers = RejectedPeers(self._keys, self._senders)
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> SensorMessage | None:
-        """Take one datagram that arrived from `address` at `t_ns`.
-
-        Returns what it brought.
-        """
+        """Take a datagram that arrived from `address` at `t_ns`; return what it brought."""
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             result = header
@@ -225,15 +215,12 @@ class MasterLink:
         return None if live is None else live.clock.estimate()
 
     def clock_steps_of(self, sender: str) -> int:
-        """Return how often the clock of `sender` was seen to jump.
-
-        The count is since this master began.
-        """
+        """Return how often the clock of `sender` has jumped since this master began."""
         of = self._senders[sender]
         return of.steps_before + (0 if of.live is None else of.live.clock.steps)
 
     def restarts_of(self, sender: str) -> int:
-        """Return how often another process took over as `sender` since this master began."""
+        """Return how often another process took over as `sender`."""
         return self._senders[sender].restarts
 
     def limit(self, limits: Mapping[str, SenderLimits]) -> None:
@@ -242,7 +229,7 @@ class MasterLink:
             sender.limit(limits.get(name, SenderLimits()))
 
     def refused_of(self, sender: str) -> int:
-        """Return how many datagrams that `sender` sealed in its sessions were refused."""
+        """Return how many datagrams were refused that `sender` sealed in its sessions."""
         return self._senders[sender].refused
 
     def counts_of(self, sender: str) -> CameraCounts:
@@ -252,10 +239,7 @@ class MasterLink:
         return replace(counts, lost=lost, skipped=counts.lost - lost)
 
     def tag_counts_of(self, camera: str) -> CameraCounts | None:
-        """Return the counts of the tags of `camera`.
-
-        None of the tags is ever missing. None: the camera sends no tags.
-        """
+        """Return the counts of a camera's tags, none ever missing; None: it sends none."""
         kind = self._senders[camera].kinds.get(TagDetections)
         return None if kind is None else kind.sequence.counts
 

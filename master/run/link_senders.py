@@ -1,31 +1,13 @@
-"""Master's link admits senders, rejects them or silences them for a while.
+"""Link of the master admits senders, rejects them or silences them for a while.
 
-Bounds on what a sender may report, given the files of its rig.
-
-The message alone does not know these bounds. `common.messages` refuses what no sensor can measure. Here the
-picture's size, the number of markers and the rate are those of the sender's own files, and times are compared
-with the clock.
-
-Sessions and senders as the master's link keeps them.
-
-Besides, whether it takes a message of a sender.
-
-Who was rejected lately, by name.
-
-Second processes under one name, slaves of another wire version, slaves whose secret is not the one that the
-master has for their name, and slaves whose rig has other markers.
-
-A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
-the rig, and forgotten `LATELY_NS` after the last time.
-
-Silence senders for a while whose messages made the solver fail.
-
-Each failure is counted, and logged once with its cause.
-
-Bounds keep out what cannot be (`common.messages`, `master.run.link_senders`). What passes them and still makes
-something raise
-is a fault of this program; it costs the sender a pause, and the others nothing. The pause doubles with each fault from
-`FIRST_NS` to `LONGEST_NS`, and begins anew after a sender was well for `LONGEST_NS`.
+- Limits: `common.messages` refuses what no sensor can measure; here picture size, number of markers and rate
+  are those of the sender's own files, and times are compared with the clock.
+- `RejectedPeers`: who was rejected lately (second process, other wire version, wrong secret, other markers),
+  for the checklist; bounded by the names of the rig, forgotten 1.5 s after the last time.
+- `Quarantine`: what passes all bounds and still makes something raise is a fault of this program. It costs
+  the sender a pause, and the others nothing. The pause doubles with each fault from `FIRST_NS` to
+  `LONGEST_NS`, and begins anew after a sender was well for `LONGEST_NS`. Each failure is counted, and logged
+  once with its cause.
 """
 
 import logging
@@ -56,14 +38,12 @@ from master.run.sequence import CYCLE_FRAMES, Counted, Sequence
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
 
-Sensed = Detections | TagDetections | ImuSample | TrackerPose
+SensorMessage: TypeAlias = Detections | TagDetections | ImuSample | TrackerPose
 
 
 @dataclass(frozen=True, slots=True)
 class SenderLimits:
-    """Limits that the files state for one camera, IMU or tracker.
-
-    What is None is not known and not checked.
+    """Limits that the files state for one camera, IMU or tracker; None: not checked.
 
     Attributes:
         picture_px: Width and height.
@@ -77,10 +57,7 @@ class SenderLimits:
 
 
 def bucket_of(rate_hz: float | None) -> TokenBucket:
-    """How many messages of one kind may come from a sender.
-
-    `rate_hz` is that of its files; None: they state none.
-    """
+    """How many messages of a kind a sender may send; `rate_hz` of its files, or None."""
     # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
     faster = 2.0
     any_hz = 10_000.0  # where no file states a rate
@@ -91,7 +68,7 @@ def bucket_of(rate_hz: float | None) -> TokenBucket:
     return TokenBucket(per_s, per_s * burst_s)
 
 
-def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
+def refused(message: SensorMessage, limits: SenderLimits) -> Refusal | None:
     """Why a message cannot be of a sender with these files; None: it can."""
     if isinstance(message, (ImuSample, TrackerPose)):  # a tuple: a union would be made anew for each message
         return None
@@ -105,10 +82,7 @@ def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
 
 
 def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
-    """Return the limits of all senders of these rigs.
-
-    Sender -> what its files state, of all cameras, IMUs and trackers of these rigs.
-    """
+    """Return the limits of all cameras, IMUs and trackers of these rigs, by name."""
     limits: dict[str, SenderLimits] = {}
     for setup in setups:
         for name, camera in setup.cameras.items():
@@ -137,10 +111,7 @@ def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
 
 
 def _outside(uv: Float, size: tuple[int, int]) -> bool:
-    """Whether any point (..., 2) is far outside of a picture of this size [px].
-
-    Far: further out than one picture's size. NaN is not.
-    """
+    """Whether any point (..., 2) is further out of a picture than its size [px]. NaN is not."""
     width, height = size
     points: list[list[float]] = uv.reshape(-1, 2).tolist()
     return any(u < -width or u > 2 * width or v < -height or v > 2 * height for u, v in points)
@@ -148,8 +119,6 @@ def _outside(uv: Float, size: tuple[int, int]) -> bool:
 
 OLD_NONCES = 64
 ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
-
-SensorMessage: TypeAlias = Sensed
 
 
 @dataclass(slots=True)
@@ -175,10 +144,7 @@ class Session:
 
 @dataclass(slots=True)
 class Sender:
-    """What is kept of one camera, IMU or tracker.
-
-    `kinds` are the kinds of message that it sends, the main one first.
-    """
+    """One camera, IMU or tracker, with its `kinds` of message, the main one first."""
 
     kinds: dict[type[SensorMessage], Counted]
     limits: SenderLimits
@@ -192,10 +158,7 @@ class Sender:
 
     @classmethod
     def of(cls, steps: Mapping[type[SensorMessage], int | None], limits: SenderLimits) -> "Sender":
-        """A sender of these kinds of message, within these limits.
-
-        The number of each kind rises by the step in `steps` from one message to the next.
-        """
+        """A sender of the kinds in `steps`: how much each number rises per message."""
         kinds = {kind: Counted(Sequence(step)) for kind, step in steps.items()}
         return cls(kinds, limits, {kind: bucket_of(limits.rate_hz) for kind in kinds})
 
@@ -210,20 +173,14 @@ class Sender:
         return next(iter(self.kinds.values()))
 
     def fill(self, counter: int, own: Counted | None = None) -> None:
-        """Take note of a datagram that came late.
-
-        It is of kind `own` or of none: in the gaps of other kinds it is no loss.
-        """
+        """Note a late datagram: in the gaps of other kinds than `own` it is no loss."""
         for kind in self.kinds.values():
             if kind is not own:
                 kind.losses.late(counter, 0)
 
 
 def not_admitted(message: SensorMessage, session: Session, sender: Sender, now_ns: int) -> Refusal | None:
-    """Why a message that came at `now_ns` [ns] is not taken of this sender.
-
-    None: it is taken.
-    """
+    """Why a message that came at `now_ns` is not taken of this sender; None: it is."""
     kind = type(message)
     if message.session != session.hello.process:
         return Refusal.FOREIGN_SESSION
@@ -239,9 +196,10 @@ def on_master_clock(
 ) -> SensorMessage | None:
     """The message with its times on the master's clock; None where they cannot be.
 
-    They cannot while the clock is not known (data before the start), nor where the time is more than `AHEAD_NS` after
-    `now_ns`, is older than `OLD_NS`, or is not after the last of its kind. Nothing was measured after it came: what is
-    ahead by less is of now, and its standard deviation is as large as the error that this shows.
+    They cannot while the clock is not known (data before the start), nor where the time is more than 50 ms
+    after `now_ns`, is older than `OLD_NS`, or is not after the last of its kind. Nothing was measured after
+    it came: what is ahead by less is of now, and its standard deviation is as large as the error that this
+    shows.
     """
     if clock is None:
         return None
@@ -282,13 +240,9 @@ class MarkerCounts(NamedTuple):
 
 
 class RejectedPeers:
-    """Record of rejected senders of the rig.
-
-    Push machine. Holds for each sender when it was last rejected, and from where.
-    """
+    """Push machine: when each sender was last rejected, and from where."""
 
     def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
-        """Nobody was, yet; `names` are those of the rig."""
         self._keys, self._names = keys, frozenset(names)
         self._duplicates: dict[str, tuple[int, RejectedPeer]] = {}
         self._versions: dict[str, tuple[int, RejectedPeer]] = {}
@@ -297,31 +251,19 @@ class RejectedPeers:
         self._next_ns: int | None = None
 
     def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Record a duplicate sender `name`, which sent a hello at `t_ns` [ns].
-
-        A second process under this name, while the first one was well.
-        """
+        """Record a second process under `name`, at `t_ns`, while the first one was well."""
         self._duplicates[name] = t_ns, RejectedPeer(host, version)
 
     def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
-        """Record a hello at `t_ns` [ns] as `name` without that device's secret.
-
-        The sender is at `host`.
-        """
+        """Record a hello as `name` without that device's secret."""
         self._unproven[name] = t_ns, RejectedPeer(host, version)
 
     def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
-        """The slave `name` sent another number of markers than its rig has here.
-
-        It sent `sent` at `t_ns` [ns]; the rig has `expected`.
-        """
+        """Record that `name` sent another number of markers than its rig has here."""
         self._markers[name] = t_ns, MarkerCounts(sent, expected)
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
-        """Take a datagram of another wire version.
-
-        What is not a rightly sealed hello of this rig is ignored.
-        """
+        """Record a datagram of another wire version, if it is a sealed hello of this rig."""
         if len(datagram) < HEADER.size or (self._next_ns is not None and t_ns < self._next_ns):
             return
         magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
@@ -342,17 +284,11 @@ class RejectedPeers:
         return _lately(self._versions, t_ns)
 
     def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
-        """Return where senders send a hello without their secret, as of `t_ns` [ns].
-
-        A mapping from name to where.
-        """
+        """Name -> where hellos without its secret come from, as of `t_ns` [ns]."""
         return _lately(self._unproven, t_ns)
 
     def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:
-        """Name -> how many markers its slave sent lately and its rig has here.
-
-        Of those names alone where the two differ, as of `t_ns` [ns].
-        """
+        """Name -> how many markers it sent and has here, where these differ."""
         return _lately(self._markers, t_ns)
 
 
@@ -374,15 +310,9 @@ class _Silence:
 
 
 class Quarantine:
-    """Push machine over faults.
-
-    Holds how often each sender's message failed, and until when it is silenced.
-
-    `fault` and `holds` may be called on several threads.
-    """
+    """Push machine over faults; `fault` and `holds` may be called on several threads."""
 
     def __init__(self) -> None:
-        """Nobody is silenced."""
         self._silences: dict[str, _Silence] = {}
         self._causes: set[tuple[str, str]] = set()
         self.faults: Counter[str] = Counter()
@@ -414,10 +344,7 @@ class Quarantine:
 
 
 def _place(error: Exception) -> str:
-    """Kind and place of an error, by which a fault is known.
-
-    The same fault again is not news, whatever numbers its text has.
-    """
+    """Kind and place of an error, by which a fault is known, whatever numbers its text has."""
     frames = traceback.extract_tb(error.__traceback__)
     return (
         f"{type(error).__name__} {frames[-1].filename}:{frames[-1].lineno}" if frames else repr(type(error))

@@ -1,6 +1,6 @@
-"""A live master.
+"""Live master opens bus, ingest and sinks, runs the loop and writes the summary.
 
-It opens bus, ingest and sinks, runs the loop, reports once a second, and writes the summary.
+Threads beside the loop report health and the checklist once a second.
 """
 
 import gc
@@ -19,7 +19,7 @@ from master.checklist.files import FileMonitor
 from master.checklist.publisher import ChecklistPublisher
 from master.commands.summary import write_summary
 from master.monitor.clocks import ClockMonitor
-from master.monitor.report import ExtrinsicsMonitor, MonitoredLoop, Reporter, cameras_line, unplaced_line
+from master.monitor.report import ExtrinsicsMonitor, MonitoredLoop, Reporter, unplaced_line
 from master.outputs.bus import BusSink, DevicePoses, Sink
 from master.outputs.poses import RunFiles
 from master.recording.probe import Probe, RecorderProcess, Tapped
@@ -32,8 +32,6 @@ from master.run.process import host_bus
 from master.run.solver_supervisor import LoadShedding, Shedding, SolverSupervisor
 from master.run.tuning import LivePipeline, RigTuning, renew
 
-__all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
@@ -44,9 +42,8 @@ class LiveSettings:
         bind: Own UDP address and port for data (0: any).
         bus: Endpoint on which the zenoh bus listens, for example tls/0.0.0.0:47802.
         start_timeout_s: How long the first slave waits for the others.
-        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and objects,
-            contact and gestures in its folder.
-        summary: Where to write the summary, or None.
+        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and
+            objects, contact and gestures in its folder.
         files: Where the setups were read: what changes there is used at once. None: they stay as they are.
         record: Where to record all that is received and published (MCAP), or None; needs `files`.
     """
@@ -61,7 +58,6 @@ class LiveSettings:
     record: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a recording without the files that it carries."""
         if self.record is not None and self.files is None:
             raise ValueError("record: a recording carries the files of its rigs: give files, too")
 
@@ -73,17 +69,10 @@ def run_live(
     stop: threading.Event,
     notify: Callable[[str], None],
 ) -> dict[str, object]:
-    """Track until `stop` is set.
+    """Track until `stop` is set (signal, or command "stop"); return the summary.
 
-    Args:
-        setups: Of each hand its rigs, cameras and model.
-        key: Rig key, alone or with the root of the secrets of devices.
-        settings: Addresses and files.
-        stop: Set by a signal handler, or by the command "stop" on the bus.
-        say: Called with one line when a state changes.
-
-    Returns:
-        The summary.
+    `key` is the rig key, alone or with the root of the secrets of devices; `notify` is called with one line
+    when a state changes.
 
     Raises:
         BusError: An address cannot be bound.
@@ -168,8 +157,7 @@ def run_live(
         probe.drain()
         stop.set()
         for thread in threads:
-            join_s = 2.0  # a report that hangs on the bus does not keep the run from ending
-            thread.join(join_s)
+            thread.join(2.0)  # a report that hangs on the bus does not keep the run from ending
         summary: dict[str, object] = {
             **figures.summary(),
             "camera_hz": figures.rates.camera_hz,
@@ -185,10 +173,6 @@ def run_live(
 
 
 def _sinks(setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus) -> list[Sink]:
-    """Return the sinks of the results.
-
-    Results go to the bus, and to files where that is requested.
-    """
     sinks: list[Sink] = [BusSink(bus)]
     if settings.poses is not None:
         counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
@@ -216,9 +200,7 @@ def devices_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
 def ingest_of(
     setups: Sequence[RigSetup], key: LinkKey | bytes, clock: Clock, settings: LiveSettings
 ) -> Ingest:
-    """Return the receiver of all senders of these hands and objects.
-
-    The senders are cameras, IMUs and trackers.
+    """Return the receiver of all cameras, IMUs and trackers of these setups.
 
     Raises:
         BusError: The address cannot be bound, or the beacon's is no IPv4 address.

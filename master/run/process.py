@@ -1,12 +1,6 @@
 """Process of the PC joins the bus, and stops on a signal.
 
-Access of the PC's programs to the bus.
-
 A master listens, all others join it, each with its own certificate.
-
-Ctrl-C and a stop by the system as an event.
-
-For commands that run until they are asked to end.
 """
 
 import os
@@ -20,9 +14,7 @@ from common.errors import BusError
 
 
 def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
-    """Join the bus as the master at `endpoint` sees it.
-
-    Where a router is at the endpoint, it is what is published of `site`.
+    """Join the bus as the master at `endpoint` sees it; at a router, that of `site`.
 
     Raises:
         BusError: Nobody listens there, or refuses this program's certificate; the endpoint is malformed.
@@ -31,11 +23,9 @@ def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
 
 
 def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
-    """The bus of a master, which listens at `endpoint`.
+    """The bus of a master, which listens at `endpoint`; `devices` may connect.
 
-    Args:
-        endpoint: As `tls/0.0.0.0:47802`.
-        devices: Names of cameras, IMUs and trackers that may connect, beside those whose keys are in the keys folder.
+    So may those whose keys are in the keys folder.
 
     Raises:
         BusError: The address is taken; keys are missing; the endpoint is malformed.
@@ -46,9 +36,7 @@ def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
 def bus_of_master(
     endpoint: str, stop: threading.Event, waiting: Callable[[BusError], None], site: str | None = None
 ) -> ZenohBus | None:
-    """Return the bus, once a master listens at `endpoint`; None when stopped before.
-
-    A router for `site` will do too.
+    """Return the bus, once a master or router listens; None when stopped before.
 
     `waiting` is called once with why not yet.
 
@@ -65,8 +53,7 @@ def bus_of_master(
             if not notified:
                 waiting(error)
             notified = True
-            try_again_s = 0.3
-            stop.wait(try_again_s)
+            stop.wait(0.3)
     return None
 
 

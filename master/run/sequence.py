@@ -1,15 +1,15 @@
-"""Frame counts of one camera.
-
-Frames received, lost, skipped, late, duplicate, reordered on the way.
+"""Frame counts of one camera, by frame numbers and counters of datagrams.
 
 A frame is *lost* when it was sent and never came, *skipped* when nothing was sent under its number: numbers
-alone cannot distinguish, so `Sequence` counts both as lost and `Losses` parts them by counters of the datagrams. It is
-*late* when it came after a newer one, and is dropped then, because the newer one was used already. So received + lost +
-skipped + late is the number of frames between the first and the last. A restarted slave is a new sequence.
+alone cannot distinguish, so `Sequence` counts both as lost and `Losses` parts them by counters of the
+datagrams. It is *late* when it came after a newer one, and is dropped then, because the newer one was used
+already. So received + lost + skipped + late is the number of frames between the first and the last. A
+restarted slave is a new sequence.
 
-The camera of a wrist device sends one message for three frames, numbered by its laser frame. There all of this counts
-strobe cycles: numbers three apart miss nothing, and one more or less, after a slipped frame, neither. Tags are looked
-for in some frames only: their numbers rise as they like, and nothing is missing between two.
+The camera of a wrist device sends one message for three frames, numbered by its laser frame. There all of
+this counts strobe cycles: numbers three apart miss nothing, and one more or less, after a slipped frame,
+neither. Tags are looked for in some frames only: their numbers rise as they like, and nothing is missing
+between two.
 """
 
 from collections import OrderedDict, deque
@@ -43,9 +43,7 @@ class CameraCounts:
 
 
 class Sequence:
-    """Counter of frame numbers.
-
-    Push machine. Holds the counts, the last number, and the newest skipped ones (<= 1024).
+    """Push machine that counts frame numbers; holds the newest 1024 missing ones.
 
     Attributes:
         lost: Numbers that have not come so far.
@@ -55,9 +53,8 @@ class Sequence:
     def __init__(self, step: int | None = 1) -> None:
         """Start with nothing received.
 
-        `step` is how much the number rises from one message to the next.
-
-        None: as it likes, and nothing is ever missing.
+        `step` is how much the number rises from one message to the next; None: as it likes, and nothing is
+        ever missing.
         """
         self.lost = 0
         self._received = self._late = self._duplicate = self._reordered = 0
@@ -120,10 +117,7 @@ class Sequence:
 
 @dataclass(slots=True)
 class _Gap:
-    """Gap between two messages that came, by the counters of their datagrams.
-
-    How many numbers and datagrams did not come.
-    """
+    """Gap between the datagrams `after` and `before` that came: what did not come between."""
 
     after: int
     before: int
@@ -139,11 +133,9 @@ class _Gap:
 class Losses:
     """Count of messages lost on the way, separate from those never sent.
 
-    Although datagrams of other kinds are lost beside them.
-
-    A message that was lost left a hole in the counters of its session between the messages around it. So a lost tag
-    or echo is no lost frame, unless a frame was never sent in the same gap. Holds the newest gaps of the session
-    (<= 1024), since what is late fills them, and the sum.
+    A message that was lost left a hole in the counters of its session between the messages around it. So a
+    lost tag or echo is no lost frame, unless a frame was never sent in the same gap. Holds the newest gaps of
+    the session (<= 1024), since what is late fills them, and the sum.
     """
 
     def __init__(self) -> None:
@@ -151,18 +143,12 @@ class Losses:
         self._gaps: deque[_Gap] = deque(maxlen=REMEMBERED)
 
     def gap(self, after: int, before: int, numbers: int, datagrams: int) -> None:
-        """Record a gap between datagrams `after` and `before`.
-
-        `numbers` is how many numbers were missed, `datagrams` how many datagrams did not come.
-        """
+        """Record how many numbers and datagrams are missing between `after` and `before`."""
         self._gaps.append(new := _Gap(after, before, numbers, datagrams))
         self.lost += new.lost
 
     def late(self, counter: int, numbers: int) -> None:
-        """Record a datagram that came after later ones.
-
-        It was `numbers` (1 or 0) of those that were missed.
-        """
+        """Record a datagram that came late: `numbers` (1 or 0) of those that were missed."""
         for gap in reversed(self._gaps):
             if gap.after < counter < gap.before:
                 was = gap.lost
@@ -179,8 +165,6 @@ class Losses:
 class Counted:
     """One kind of message of a sender: its `sequence`, and its `losses`.
 
-    Holds the counter of the newest datagram, when the last message came, and by how much numbers may rise at once.
-
     Attributes:
         newest_ns: Time of the newest message that is used in this session of the link [ns], master's clock.
     """
@@ -196,8 +180,8 @@ class Counted:
     def plausible(self, session: int, seq: int, t_ns: int) -> bool:
         """Whether a sender can have got to message `seq` when it came at `t_ns` [ns].
 
-        The first of a session may have any number: while this machine slept its clock stood still, and the sender
-        went on. Nothing is counted as missing then.
+        The first of a session may have any number: while this machine slept its clock stood still, and the
+        sender went on. Nothing is counted as missing then.
         """
         begins, self._begins = self._begins, False
         seq_per_s = 10_000.0  # numbers rise by no more: at once, and with time besides
@@ -212,15 +196,9 @@ class Counted:
         return True
 
     def take(self, session: int, seq: int, counter: int, missing: Callable[[int, int], int]) -> bool:
-        """Count message `seq` of the process `session`, from datagram `counter`.
+        """Count message `seq` of `session` from datagram `counter`; whether to use it.
 
-        Returns whether the message is to be used.
-
-        Args:
-            session: Of the message.
-            seq: Of the message.
-            counter: Of the datagram, in its session of the link.
-            missing: How many datagrams between two that came did not (`Opener.missing_between`).
+        `missing`: how many datagrams between two that came did not (`Opener.missing_between`).
         """
         before = self.sequence.lost
         used = self.sequence.take(session, seq)

@@ -1,33 +1,22 @@
 """Supervisor guards the solver against failing messages and overload.
 
-Guard the solver: a message that makes it raise does not end the master.
-
-It costs its sender a pause.
-
 A message that gets past all bounds and still makes something raise is a fault of this program. Then
-
-- the sender of the message is silenced for a while (`master.run.link_senders`), and the master goes on with
-the next message;
+- the sender of the message is silenced for a while (`link_senders`), and the master goes on with the next
+  message;
 - the solvers that it feeds are replaced by new ones, for their state may be broken;
-- the last messages are solved again, on a thread beside, without those of each sender in turn: the sender without whom
-  nothing raises is to blame, and is silenced instead. So a camera is not punished for being the one whose frame
-  completed what another one broke.
+- the last messages are solved again, on a thread beside, without those of each sender in turn: the sender
+  without whom nothing raises is to blame, and is silenced instead. So a camera is not punished for being the
+  one whose frame completed what another one broke. Meanwhile further faults are counted and nobody else is
+  silenced.
 
-While that goes on, further faults are counted and nobody else is silenced.
-
-Load shedding of a master that falls behind.
-
-It solves the newest epoch, and no message is lost for it.
-
-An epoch is dropped (*shed*, counted as `instants_shed`) when what waits already completes a newer one of the same
-hand: where the hand was then interests nobody any more. All messages are taken, for a camera's past shows where its
-markers are at every epoch. A newer epoch waits when the leading camera, the first of the rig, has a frame in the
-queue, and every other camera has one there that is not older. So what is dropped is a period of the cameras older than
-what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
+Load shedding: an epoch is dropped (*shed*, counted as `instants_shed`) when what waits already completes a
+newer one of the same hand. All messages are taken, for a camera's past shows where its markers are at every
+epoch. A newer epoch waits when the leading camera, the first of the rig, has a frame in the queue, and every
+other camera has one there that is not older. So what is dropped is a period of the cameras older than what is
+solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
-
-How much waits is looked at once for each message, and nothing but `LoadShedding.skip` comes of it: with the
-messages and that number, what is solved can be solved again bit for bit (`master.recording`).
+Nothing but `LoadShedding.skip` comes of how much waits: with the messages and that number, what is solved can
+be solved again bit for bit (`master.recording`).
 """
 
 import threading
@@ -62,10 +51,7 @@ class Replayed(Solving, Protocol):
 
 
 class SolverSupervisor:
-    """Push machine before a solver.
-
-    Holds the last messages, and the thread that replaces what is broken.
-    """
+    """Push machine before a solver; a thread of its own replaces what is broken."""
 
     def __init__(
         self,
@@ -77,12 +63,8 @@ class SolverSupervisor:
     ) -> None:
         """Guard `solver`.
 
-        Args:
-            solver: What messages are pushed into.
-            quarantine: Who is silenced.
-            clock: The master's.
-            renew: Lets new solvers take over from those that a sender feeds; may take its time.
-            fresh: Builds a solver of what a sender feeds, in its first state.
+        `renew` lets new solvers take over from those that a sender feeds, and may take its time; `fresh`
+        builds a solver of what a sender feeds, in its first state.
         """
         self._solver, self._quarantine, self._clock = solver, quarantine, clock
         self._renew, self._fresh = renew, fresh
@@ -91,10 +73,7 @@ class SolverSupervisor:
         self._repair: threading.Thread | None = None
 
     def push(self, message: SensorMessage) -> Iterator[Solved]:
-        """Take one message; give what it completes.
-
-        That is nothing where its sender is silenced or it cannot be used.
-        """
+        """Take one message; give what it completes, nothing of a silenced sender."""
         sender = sender_of(message)
         if self._quarantine.holds(sender, self._clock.now_ns()):
             return
@@ -130,10 +109,7 @@ class SolverSupervisor:
 
 
 def culprit(messages: Sequence[SensorMessage], fresh: Callable[[], Replayed]) -> str | None:
-    """The sender without whose messages nothing raises.
-
-    None: there is no such one, or more than one.
-    """
+    """The one sender without whose messages nothing raises; None: there is none such."""
     senders = dict.fromkeys(sender_of(message) for message in messages)
     if len(senders) < 2 or not _raises(messages, fresh()):
         return None
@@ -187,12 +163,9 @@ class Cameras:
         return cls(dict.fromkeys(names, 0) | centre_ns, round(silent_periods * 1e9 / slowest_hz))
 
     def newer_waits(self, waiting: Mapping[str, Span], newest_ns: Mapping[str, int], t_ns: int) -> bool:
-        """Check whether the waiting messages complete an epoch.
+        """Whether what waits completes an epoch newer than the frame of `t_ns` [ns].
 
-        Args:
-            waiting: Camera -> when its frames are that wait [ns].
-            newest_ns: Camera -> when its last frame is that was taken [ns].
-            t_ns: When the frame is that is taken now [ns].
+        `newest_ns` is when each camera's last frame is that was taken [ns].
         """
         received = [
             name
@@ -206,7 +179,7 @@ class Cameras:
 
 
 class LoadShedding:
-    """Whether a master is behind. Holds the time of the last frame of each camera.
+    """Whether a master is behind.
 
     Attributes:
         waiting: Camera -> when its frames are that have come and were not taken yet [ns].
@@ -214,10 +187,7 @@ class LoadShedding:
     """
 
     def __init__(self, setups: Sequence[RigSetup] = ()) -> None:
-        """Initialise for a master of these hands that is not behind.
-
-        Without hands it is as far behind as it is set.
-        """
+        """Begin not behind; without hands it is as far behind as it is set."""
         self.waiting: Callable[[], Mapping[str, Span]] = dict[str, Span]
         self.skip = 0
         self._newest_ns: dict[str, int] = {}
@@ -230,10 +200,7 @@ class LoadShedding:
                     self._cameras.setdefault(name, []).append(Cameras.of(setup, names))
 
     def look(self, message: Message) -> None:
-        """Take a message and check what waits behind it.
-
-        Only with a frame it changes what is skipped.
-        """
+        """Check what waits behind a message; only a frame changes what is skipped."""
         if not isinstance(message, Detections):
             return
         waiting, monitored = self.waiting(), self._cameras.get(message.camera)
@@ -245,17 +212,13 @@ class LoadShedding:
 
 
 class Shedding:
-    """Decision for each epoch of one hand whether it is skipped.
-
-    Holds how many in a row were.
-    """
+    """Decision for each epoch of one hand whether it is skipped."""
 
     def __init__(self, load_shedding: LoadShedding) -> None:
-        """Skip epochs as `load_shedding` states."""
         self._load_shedding = load_shedding
         self._in_a_row = 0
 
     def __call__(self) -> bool:
-        """Return whether the next epoch is skipped."""
+        """Whether the next epoch is skipped."""
         self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._load_shedding.skip else 0
         return self._in_a_row > 0

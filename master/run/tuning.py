@@ -1,18 +1,10 @@
 """Tuning changes the setup while the master tracks, or asks for a restart.
 
-Changes of a rig's files that a running master cannot follow.
-
-They concern what slaves, files and viewers were started with.
-
-Live changes of the setup while the master tracks.
-
-Other geometry, depth model, filter, hand, object or gestures: a new pipeline replaces the old one.
-
-Each hand has a pipeline; only those change whose files did; objects and gestures change together
-(`master.run.dispatcher`).
-
-The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
-it takes over, between two messages. An epoch is never solved twice: poses go on with rising times.
+What slaves, files and viewers were started with cannot change. Other geometry, depth model, filter, hand,
+object or gestures: a new pipeline replaces the old one. It is built on another thread and shown the last
+messages, so that its tracks, filter and hand stand when it takes over, between two messages. An epoch is
+never solved twice: poses go on with rising times. Each hand has a pipeline of its own; objects and gestures
+change together (`dispatcher`).
 """
 
 import threading
@@ -40,11 +32,7 @@ _MASTER = "restart the master"
 
 
 def refuse_other_hands(old: Sequence[RigSetup], new: Sequence[RigSetup]) -> None:
-    """Refuse other hands than those that are solved.
-
-    Raises:
-        CalibrationError: With both lists.
-    """
+    """Refuse other hands than those that are solved, by a CalibrationError with both."""
     was, now = (tuple(setup.hand.profile.name for setup in setups) for setups in (old, new))
     if was != now:
         raise _refusal(f"rig {new[0].rig.name!r}: hand", was, now, _MASTER)
@@ -91,18 +79,13 @@ _ROUNDS = 20
 
 
 class FilterTrial(Part, frozen=True):
-    """Body of the command "filter".
-
-    It names the rig, and gives its filter as the rig file would have it.
-    """
+    """Body of the command "filter": a rig, and its filter as the rig file has it."""
 
     rig: Name
     filter: FilterCalibration
 
 
 class _WhenOpen:
-    """A `Stage` that measures nothing until it is opened."""
-
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self.open = False
@@ -113,10 +96,7 @@ class _WhenOpen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _OrientationSample:
-    """One orientation measurement of an IMU.
-
-    Its fields are the arguments of `Pipeline.push_orientation`.
-    """
+    """One orientation measurement of an IMU: the arguments of `Pipeline.push_orientation`."""
 
     t_ns: int
     orientation_wxyz: Float
@@ -124,18 +104,15 @@ class _OrientationSample:
 
 
 class LivePipeline:
-    """The pipeline of one hand in use.
-
-    Holds it, its setup, what it was passed last, and the one that is to take over with the next message.
-    """
+    """The pipeline of one hand in use, its last messages, and the one to take over."""
 
     def __init__(
         self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
     ) -> None:
         """Begin with the pipeline of `setup`.
 
-        `stage` measures the stages of whichever pipeline is in use; `dropped_epochs` is asked for each of its epochs
-        whether it is rejected.
+        `stage` measures the stages of whichever pipeline is in use; `dropped_epochs` is asked for each of its
+        epochs whether it is dropped.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.
@@ -180,18 +157,13 @@ class LivePipeline:
         return self._now.flush()
 
     def renew(self) -> None:
-        """Let a new pipeline of the same setup take over.
-
-        It has seen nothing of what came until now.
-        """
+        """Let a new pipeline of the same setup take over, which has seen nothing so far."""
         take = self.prepare(self._setup)
         self._recent.clear()
         take()
 
     def change(self, setup: RigSetup) -> None:
-        """Replace the running pipeline by one of `setup`.
-
-        May be called from any thread but the loop's; takes as long as it takes to build a pipeline.
+        """Replace the running pipeline by one of `setup`, from any thread but the loop's.
 
         Raises:
             CalibrationError: The depth model does not fit the rig; nothing has changed.
@@ -199,9 +171,7 @@ class LivePipeline:
         self.prepare(setup)()
 
     def prepare(self, setup: RigSetup) -> Callable[[], None]:
-        """Build a pipeline of `setup` and return the function that switches to it.
-
-        The returned function shows it the last messages and lets it take over.
+        """Build a pipeline of `setup`; return what warms it up and switches to it.
 
         Raises:
             CalibrationError: As `change`.
@@ -224,7 +194,7 @@ class LivePipeline:
         return take
 
     def _warm(self, new: Pipeline) -> int:
-        """Show it the last messages; the number of the last one."""
+        """Show it the last messages; return the number of the last one."""
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
             waiting = [(number, sample) for number, sample in list(self._recent) if number > shown]
@@ -236,10 +206,7 @@ class LivePipeline:
         return shown
 
     def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
-        """Switch to the new pipeline and return its new poses.
-
-        It is shown the samples that it has not seen yet; only its poses that are later than the last one are taken.
-        """
+        """Switch to the new pipeline, show it the rest, and return its poses later than the last."""
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)
@@ -251,12 +218,7 @@ class LivePipeline:
 
 
 class RigTuning:
-    """Follower of the files of all rigs.
-
-    Holds the setups in use, and how often a change was applied and refused.
-
-    Its methods are called on several threads and take turns.
-    """
+    """Follower of the files of all rigs; methods may be called on several threads."""
 
     def __init__(
         self,
@@ -266,11 +228,10 @@ class RigTuning:
         notify: Callable[[str], None],
         dispatcher: Dispatcher | None = None,
     ) -> None:
-        """Follow the calibration files and change the pipelines with them.
+        """Follow `files`, which hold the `setups`, and change the pipelines with them.
 
-        `files` hold the `setups`, `pipelines` are changed; `notify` gets one line for each change.
-
-        Objects and gestures are those of `dispatcher`; None: nobody asks for any.
+        `notify` gets one line for each change. `dispatcher` has objects and gestures; None: nobody asks for
+        any.
         """
         self._files, self._notify, self._dispatcher = files, notify, dispatcher
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
@@ -288,10 +249,7 @@ class RigTuning:
         return {"reload.applied": self._applied, "reload.refused": self._refused}
 
     def look(self) -> None:
-        """Apply the files if they were changed.
-
-        Where that fails, this is reported once and the old setups stay in use.
-        """
+        """Apply the files if they changed; a failure is reported and changes nothing."""
         with self._lock:
             changed = self._monitored.changed(self._files.paths(self._setups))
         if not changed:
@@ -305,7 +263,8 @@ class RigTuning:
         """Use the files as they are now, those of all hands or none.
 
         Raises:
-            CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
+            CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has
+                changed.
         """
         with self._lock:
             changed = self._use(self._files.load)
@@ -313,11 +272,10 @@ class RigTuning:
             self._notify("changed files are in use")
 
     def try_filter(self, body: str) -> None:
-        """Use another 1 € filter for one rig.
+        """Use another 1 € filter for a rig until its files change (a `FilterTrial`).
 
-        It stays until the rig's files change or `reload` (body: `FilterTrial`).
-
-        What has changed in the files until now is used first: the next look does not take the trial back for that.
+        What has changed in the files until now is used first: the next look does not take the trial back for
+        that.
 
         Raises:
             CalibrationError: The body is none, or of a rig that does not run. Nothing has changed.
@@ -333,7 +291,7 @@ class RigTuning:
             renew(self._setups, self._pipelines, self._dispatcher, sender)
 
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
-        """Have these setups in use, all or none; False if they were."""
+        """Use these setups, all or none; False if they were in use."""
         try:
             setups = tuple(get())
             refuse_other_hands(self._setups, setups)
@@ -361,15 +319,10 @@ class RigTuning:
 def renew(
     setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
 ) -> None:
-    """Replace all solvers that `sender` feeds by new ones.
+    """Replace all solvers that `sender` feeds: the state of the old may be broken.
 
-    The state of the old ones may be broken.
-
-    Args:
-        setups: Of each hand, as they are in use.
-        pipelines: Of each setup.
-        world: What is made beside the hands; None: nothing is.
-        sender: A camera, an IMU or a tracker.
+    `setups` and `pipelines` are those of each hand; `dispatcher` makes what is beside the hands; None:
+    nothing is.
     """
     for setup, pipeline in zip(setups, pipelines, strict=True):
         if sender in setup.senders:
@@ -379,11 +332,6 @@ def renew(
 
 
 def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:
-    """These setups with another filter for one rig.
-
-    Raises:
-        CalibrationError: None of them is of that rig.
-    """
     names = [setup.rig.name for setup in setups]
     if trial.rig not in names:
         raise CalibrationError(f"filter: rig: {trial.rig!r} does not run here; there are {', '.join(names)}")
@@ -396,10 +344,7 @@ def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetu
 
 
 def _messages_per_frame(setup: RigSetup) -> int:
-    """Estimate the messages per frame of the slowest camera.
-
-    The approximate number of messages of all cameras and of the IMU that come with each such frame.
-    """
+    """Messages of all cameras and the IMU per frame of the slowest camera, about."""
     slowest_hz = min(camera.frame_rate_hz for camera in setup.cameras.values())
     imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
     samples = max((imu.rate_hz for imu in imus), default=0.0) / slowest_hz
@@ -407,7 +352,6 @@ def _messages_per_frame(setup: RigSetup) -> int:
 
 
 def _show(pipeline: Pipeline, sample: Detections | _OrientationSample) -> list[SolvedPose]:
-    """Push one sample into a pipeline and return the poses that it completes."""
     if isinstance(sample, _OrientationSample):
         pipeline.push_orientation(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
         return []

@@ -3,8 +3,9 @@
 The camera of a wrist device has a monochrome sensor. Its values are linear in the light, which differences of frames
 (Kim et al. 2012) and the fall-off of the LEDs need, and they stay so: the highest 8 bits are taken, black level and
 saturation stay where the sensor has them. Byte orders are those of the kernel's documentation (media/uapi/v4l,
-pixfmt-yuv-luma): Y10 and Y12 in the low bits of a 16-bit word, little-endian; Y10P and Y12P four pixels in five bytes,
-two in three, first the highest 8 bits of each; Y16 with the sensor's bits on top, as Raspberry Pi's receivers put them.
+pixfmt-yuv-luma): Y10 and Y12 in the low bits of a 16-bit word, little-endian; Y10P and Y12P four pixels in five
+bytes, two in three, first the highest 8 bits of each; Y16 with the sensor's bits on top, as Raspberry Pi's receivers
+put them.
 
 A colour camera without an infrared filter can stand in, by name: its luma. That is coded for screens, so it is *not*
 linear, and behind each pixel stands the mosaic of several. The mosaic itself is never taken for a grey image.
@@ -22,10 +23,7 @@ from common.recording.frame_recording import Illumination
 
 
 class Pixels(StrEnum):
-    """Pixel format that a slave requests of its camera.
-
-    (H, W, 3) BGR; (H, W) of a monochrome sensor; (H, W) luma of colours.
-    """
+    """Frames: (H, W, 3) BGR; (H, W) of a monochrome sensor; (H, W) luma of colours."""
 
     COLOUR = "colour"
     GREY = "grey"
@@ -38,10 +36,8 @@ class Pixels(StrEnum):
 
 
 _DEPTH = {"Y10": 10, "Y12": 12, "Y16": 16}  # bits, in words of two bytes
-_PACKED = {
-    "Y10P": (5, 4),
-    "Y12P": (3, 2),
-}  # bytes of a group; its first ones, each the highest 8 bits of a pixel
+# bytes of a group; its first ones, each the highest 8 bits of a pixel
+_PACKED = {"Y10P": (5, 4), "Y12P": (3, 2)}
 _LUMA = {
     "NV12": (1, 0),
     "YU12": (1, 0),
@@ -57,15 +53,9 @@ _FULL_RANGE = np.clip(np.round((np.arange(256) - 16.0) * _LIMITED), 0, 255).asty
 
 
 def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: int) -> Image | None:
-    """Make a new grey image (H, W) from the bytes of one frame.
+    """New grey image (H, W) from the bytes (N,) of one frame; None: truncated.
 
-    None for a frame that is truncated.
-
-    Args:
-        data: (N,) the bytes of the frame.
-        name: Four letters of the format, one of `GREY_FORMATS`.
-        size: Width and height [px].
-        stride: Bytes from row to row.
+    `name` of `GREY_FORMATS`; `size`: width and height [px]; `stride`: bytes from row to row.
 
     Raises:
         CameraError: Its words of 16 bits hold fewer, in their low ends.
@@ -97,16 +87,9 @@ def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: 
 def luma(
     data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: int, *, full_range: bool
 ) -> Image | None:
-    """New image (H, W) of the luma of a colour format.
+    """New image (H, W) of the luma of a colour format, 0 to 255; None: truncated.
 
-    Black is 0 and white 255. None for a frame that is cut.
-
-    Args:
-        data: (N,) the bytes of the frame.
-        name: Four letters of the format, one of `LUMA_FORMATS`.
-        size: Width and height [px].
-        stride: Bytes from row to row.
-        full_range: Whether it is coded as 0 to 255, and not as 16 to 235.
+    Arguments as of `grey`, `name` of `LUMA_FORMATS`; `full_range`: coded as 0 to 255, and not as 16 to 235.
     """
     width, height = size
     step, first = _LUMA[name]
@@ -118,14 +101,9 @@ def luma(
 
 
 def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
-    """Refuse words (H, W) that hold fewer bits in their low ends.
-
-    As bytes they would be nearly black.
+    """Refuse words (H, W) that hold fewer bits in their low ends: nearly black.
 
     The kernel lets a driver call them Y16 and does not state at which end they lie. Values on top end with zeros.
-
-    Raises:
-        CameraError: They are such.
     """
     row = words[len(words) // 2]
     used = int(np.bitwise_or.reduce(row))
@@ -137,10 +115,7 @@ def _refuse_low(words: npt.NDArray[np.uint16]) -> None:
 
 
 def _rows(data: npt.NDArray[np.uint8], height: int, stride: int, used: int) -> Image | None:
-    """Return the bytes (height, used) of the rows without their padding.
-
-    None where there are too few.
-    """
+    """The bytes (height, used) of the rows without padding; None: too few."""
     if stride < used or data.size < stride * (height - 1) + used:
         return None
     return np.lib.stride_tricks.as_strided(data, (height, used), (stride, data.strides[0]), writeable=False)

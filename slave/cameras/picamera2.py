@@ -1,16 +1,10 @@
-"""Raspberry Pi camera.
+"""Raspberry Pi camera: settings are read back from captured frames and compared.
 
-All settings are fixed before the start, read back from captured frames and compared.
-
-Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
-it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
-those of the camera file. Image and metadata always come from the same captured request, which is released whatever
-happens. When a frame was taken, its number, and whether cameras run in step, are in `picamera2_timing`; modes and
-streams in `picamera2_streams`.
-
-Exposure, gains and rate can be changed while frames are read: another thread writes the controls and watches the
-metadata of the frames that the loop reads, until three in a row show them. The mode stays, so a rate may not be above
-what that can do; and cameras that run in step keep their rate, which is that of all of them.
+Settings are part of the configuration, so the first frames already have them; exposure, gains, frame duration and
+focus of three frames in a row must be those of the camera file. Image and metadata come from the same captured
+request, which is released whatever happens. Later, another thread may write exposure, gains and rate, and watches the
+metadata of the frames that the loop reads. The mode stays, so a rate may not be above what that can do; cameras that
+run in step keep their rate. Whatever fails raises `CameraError`, which states what to do.
 """
 
 import contextlib
@@ -48,10 +42,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Picamera2Camera:
-    """A `FrameSource` of a Raspberry Pi camera.
-
-    Holds the open camera, the timeline of its frames, and metadata and small image of the last.
-    """
+    """A `FrameSource` of a Raspberry Pi camera."""
 
     def __init__(
         self,
@@ -60,20 +51,7 @@ class Picamera2Camera:
         clock: Clock,
         stop: threading.Event | None = None,
     ) -> None:
-        """Open, configure and start the camera, check it and wait for synchronisation.
-
-        The check compares what the camera really does.
-
-        Args:
-            calibration: The camera file: mode, exposure, gains.
-            options: The rest.
-            clock: The slave's clock.
-            stop: Set when the slave is to end, which also ends the wait for synchronisation.
-
-        Raises:
-            CameraError: No picamera2, no such camera or mode, a setting was refused or not taken, no frames, or
-                nobody to synchronise with. The text names what is wrong and what to do.
-        """
+        """Open, configure and start the camera, check its frames, wait to be in step."""
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (picamera2:{options.index})"
         self._timeline = Timeline(calibration.frame_rate_hz, clock)
@@ -96,18 +74,11 @@ class Picamera2Camera:
 
     @property
     def lores(self) -> Image | None:
-        """Return the small image of the frame read last.
-
-        (3 h / 2, w) planar YUV420 (I420), or None where not asked for.
-        """
+        """Small image of the last frame: (3 h / 2, w) planar YUV420 (I420), if asked for."""
         return self._lores
 
     def read(self) -> Frame | None:
-        """Wait for the next frame; None once closed.
-
-        Raises:
-            CameraError: No frame for 2 s (cable, power), or the library failed.
-        """
+        """Wait for the next frame; None once closed."""
         while not self._closed:
             metadata, image, lores = self._capture(with_image=True)
             self._metadata.put(metadata)
@@ -132,11 +103,7 @@ class Picamera2Camera:
         return None
 
     def close(self) -> None:
-        """Give the camera back. Safe to call twice.
-
-        Raises:
-            CameraError: libcamera does not let the camera go; only a new process can open it again.
-        """
+        """Give the camera back. Safe to call twice."""
         if self._closed:
             return
         self._closed = True
@@ -160,13 +127,7 @@ class Picamera2Camera:
             raise CameraError(f"{self._where}: could not be closed: {failure[0]}") from failure[0]
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change exposure, gains and rate while another thread reads frames.
-
-        See `Tunable`.
-
-        Raises:
-            CameraError: Out of range, not taken, no frames are read, or another rate where it runs in step with others.
-        """
+        """Change exposure, gains and rate while another thread reads; see `Tunable`."""
         if self._sync is not None and camera.frame_rate_hz != self._calibration.frame_rate_hz:
             raise CameraError(
                 f"{self._where}: frame_rate_hz: {self._calibration.frame_rate_hz:g} cannot become "
@@ -177,10 +138,7 @@ class Picamera2Camera:
         self._calibration = camera
 
     def metrics(self) -> dict[str, float]:
-        """Return the settings in the metadata of the last frame.
-
-        They include whether the camera runs in step.
-        """
+        """The settings in the metadata of the last frame, and whether it is in step."""
         metadata = self._metadata.newest
         found = {} if metadata is None else read_figures(metadata)
         return found if self._sync is None else found | self._sync.metrics()
@@ -190,7 +148,7 @@ class Picamera2Camera:
         return {} if self._sync is None else {"camera.out_of_step": self._sync.lost}
 
     def _apply(self, camera: CameraCalibration) -> None:
-        """Write the settings that can change, and wait until the frames show all of them."""
+        """Write the settings that can change, and wait until the frames show them."""
         available = self._library.camera_controls
         try:
             asked = controls(camera, self._options, self._enums, available)
@@ -202,9 +160,7 @@ class Picamera2Camera:
         self._settle(camera, self._insist(live))
 
     def _insist(self, live: Mapping[str, Any]) -> Iterator[Mapping[str, object]]:
-        """Write controls repeatedly and yield the metadata of the frames meanwhile.
-
-        They are written again some frames later.
+        """Write controls every 20 frames; the metadata of the frames meanwhile.
 
         picamera2 loses controls that another thread writes while it recycles a request (`CompletedRequest.release`
         takes the controls, then makes an empty set of them).
@@ -242,15 +198,7 @@ class Picamera2Camera:
         _LOG.info("%s: %s, mode %s", self._where, model, view_text(mode, modes))
 
     def _settle(self, camera: CameraCalibration, frames: Iterable[Mapping[str, object]]) -> None:
-        """Wait until some frames in a row have every setting of `camera`.
-
-        Args:
-            camera: What was asked for.
-            frames: Metadata of frames, as many as may pass until then.
-
-        Raises:
-            CameraError: They do not; every setting that differs is named.
-        """
+        """Wait until some `frames` (metadata) in a row have every setting of `camera`."""
         wanted = wanted_settings(camera, self._library.camera_controls, self._options.pixels)
         good, metadata = 0, dict[str, object]()
         good_frames = 3
@@ -277,13 +225,7 @@ class Picamera2Camera:
         )
 
     def _capture(self, with_image: bool) -> tuple[dict[str, object], Image, Image | None]:
-        """Capture one request and return its metadata, image and small image.
-
-        Images are empty where not asked for.
-
-        Raises:
-            CameraError: No frame came, or the library failed.
-        """
+        """Metadata, image and small image of one request; no images where not asked for."""
         empty = np.empty((0, 0, 3), np.uint8)
         try:
             request = self._library.capture_request(wait=TIMEOUT_S)

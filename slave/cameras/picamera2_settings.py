@@ -1,23 +1,16 @@
-"""Map a camera file to the settings of libcamera and its library.
+"""Map a camera file to libcamera's controls, and import picamera2.
 
-Interface of picamera2 and libcamera as far as Phalanx uses it.
-
-It is given as types; this is the one place that imports them.
-
-Both come with the Raspberry Pi's system, not from the package registry, so they are imported when a camera is
-opened and their absence is an error that states how to install them. The names and meanings below were read in
+picamera2 and libcamera come with the Raspberry Pi's system, not from the package registry, so they are imported when
+a camera is opened and their absence is an error that states how to install them. Names and meanings were read in
 picamera2 0.3.38 (picamera2.py, request.py, controls.py) and in libcamera's control_ids_*.yaml.
-
-Mapping of a camera file to libcamera settings.
-
-The controls to write, and the values that must be read back.
 
 Tolerances. libcamera programs exposure and frame duration in whole rows, rounding down, so one row is allowed. It
 programs the analogue gain in codes of the sensor: OV5647 has steps of 1/16, IMX219 has 256 / (256 - code), that is
 steps of gain² / 256, the others are finer (libcamera, src/ipa/rpi/cam_helper). What rounding takes away it gives back
 as digital gain behind the sensor, which may therefore exceed 1 by as much, and not by more. Colour gains come back as
 they were written, but for the fixed point of the image processor. A lens moves in steps of about 0.03 dioptres
-(IMX708: 480 steps for 15 dioptres).
+(IMX708: 480 steps for 15 dioptres). What cannot be used, is out of range or missing raises `CameraError`, which
+states what to do.
 """
 
 import importlib
@@ -39,16 +32,10 @@ INSTALL = (
 
 
 class Request(Protocol):
-    """One captured frame (`CompletedRequest`).
-
-    Its buffers go back to the camera when it is released.
-    """
+    """One captured frame (`CompletedRequest`); released, its buffers go back."""
 
     def make_array(self, name: str) -> npt.NDArray[Any]:
-        """Copy the stream `name`.
-
-        The padding of rows is cut off for RGB, not for YUV420.
-        """
+        """Copy the stream `name`; rows of RGB come without padding, of YUV420 with it."""
         ...
 
     def get_metadata(self) -> Mapping[str, object]:
@@ -79,10 +66,7 @@ class Library(Protocol):
         ...
 
     def create_video_configuration(self, **parts: Any) -> dict[str, Any]:
-        """Make a camera configuration for video.
-
-        It is made from `main`, `lores`, `raw`, `sensor`, `controls`, `buffer_count`.
-        """
+        """Configuration of `main`, `lores`, `raw`, `sensor`, `controls` and more."""
         ...
 
     def configure(self, camera_config: dict[str, Any]) -> None:
@@ -90,10 +74,7 @@ class Library(Protocol):
         ...
 
     def camera_configuration(self) -> Mapping[str, Any]:
-        """Return the configuration as the camera took it.
-
-        It has size, format and stride of each stream.
-        """
+        """The configuration as the camera took it: size, format, stride of each stream."""
         ...
 
     def start(self) -> None:
@@ -101,10 +82,7 @@ class Library(Protocol):
         ...
 
     def set_controls(self, controls: Mapping[str, Any]) -> None:
-        """Change controls of the running camera, from any thread.
-
-        Frames show the change some frames later.
-        """
+        """Change controls of the running camera, from any thread; shown frames later."""
         ...
 
     def capture_request(self, wait: float) -> Request:
@@ -122,10 +100,7 @@ class Library(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Enums:
-    """Values of libcamera's enumerations.
-
-    None where this version of libcamera lacks them.
-    """
+    """Values of libcamera's enumerations; None where this version lacks them."""
 
     noise_reduction_off: object
     af_manual: object
@@ -134,11 +109,7 @@ class Enums:
 
 
 def open_library(index: int) -> tuple[Library, Enums]:
-    """Open the camera with number `index`.
-
-    Raises:
-        CameraError: No picamera2, no such camera, or another program has it. The text states what to do.
-    """
+    """Open the camera with number `index`."""
     try:
         picamera2 = cast(Any, importlib.import_module("picamera2"))
         controls = cast(Any, importlib.import_module("libcamera")).controls
@@ -180,37 +151,19 @@ RATE_CONTROL = "FrameDurationLimits"  # and this one where cameras run free
 
 @dataclass(frozen=True, slots=True)
 class Picamera2Options:
-    """What is not in the camera file.
+    """What is not in the camera file."""
 
-    Attributes:
-        index: Number of the camera on this Pi.
-        sync: Whether frames follow another camera's ("client"), lead ("server") or run free.
-        sync_timeout_s: How long to wait for the others [s].
-        lores: Width and height of a second, small YUV420 image of each frame [px], or None.
-        pixels: What the frames are to be.
-    """
-
-    index: int = 0
-    sync: Sync = "off"
-    sync_timeout_s: float = 60.0
-    lores: tuple[int, int] | None = None
+    index: int = 0  # number of the camera on this Pi
+    sync: Sync = "off"  # whether frames follow another camera's ("client"), lead ("server") or run free
+    sync_timeout_s: float = 60.0  # how long to wait for the others [s]
+    lores: tuple[int, int] | None = None  # of a second, small YUV420 image of each frame: width, height [px]
     pixels: Pixels = Pixels.COLOUR
 
 
 def controls(
     camera: CameraCalibration, options: Picamera2Options, enums: Enums, available: Mapping[str, object]
 ) -> dict[str, Any]:
-    """Controls of the configuration, by libcamera's names.
-
-    Args:
-        camera: Exposure, gains, rate and focus.
-        options: Synchronisation.
-        enums: Values of libcamera's enumerations.
-        available: Controls that this camera has.
-
-    Raises:
-        CameraError: The camera lacks a control that is needed, or the options do not fit the camera.
-    """
+    """Controls of the configuration, by libcamera's names; `available`: what it has."""
     period_us = round(1e6 / camera.frame_rate_hz)
     if camera.exposure_us >= period_us:
         raise CameraError(
@@ -272,15 +225,7 @@ def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, objec
 
 
 def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, Any, Any]]) -> None:
-    """Refuse what libcamera would clip.
-
-    Args:
-        asked: Control -> value.
-        available: Control -> (lowest, highest, default) in the mode that is configured.
-
-    Raises:
-        CameraError: A value is out of range; every such control is named with its range.
-    """
+    """Refuse what libcamera would clip: not within (lowest, highest, default)."""
     wrong: list[str] = []
     for name in ("ExposureTime", "AnalogueGain", "ColourGains", "FrameDurationLimits", "LensPosition"):
         if name not in asked:
@@ -300,10 +245,7 @@ def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, An
 def wanted_settings(
     camera: CameraCalibration, available: Mapping[str, object], pixels: Pixels = Pixels.COLOUR
 ) -> tuple[Setting, ...]:
-    """Return the values that the metadata of a captured frame must have.
-
-    Tolerances are as in the text above.
-    """
+    """The values that the metadata of a frame must have, with tolerances as above."""
     # where the camera file states 0: no official sensor needs longer for a row at video rates
     global_shutter_row_us = 30.0
     row_us = camera.row_time_us if camera.row_time_us > 0.0 else global_shutter_row_us
@@ -328,10 +270,7 @@ def wanted_settings(
 
 
 def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
-    """Read the settings and more from the metadata of a frame.
-
-    The names are those of `common.calibration.camera_settings`.
-    """
+    """Settings in the metadata, by the names of `common.calibration.camera_settings`."""
     found: dict[str, float] = {}
     for name, metrics in (
         ("ExposureTime", ("exposure_us",)),

@@ -1,17 +1,15 @@
 """Choose mode and streams of a Pi camera, and take the image of a request.
 
 A sensor offers a few modes, each with its own crop of the pixel array and its own highest rate. Faster modes often
-see less: the same lens then has a longer focal length in pixels, and a calibration made in another mode is wrong.
-So the widest view wins, and how much of the array it shows is logged at every start.
+see less: the same lens then has a longer focal length in pixels, and a calibration made in another mode is wrong. So
+the widest view wins. Where no mode or stream fits, `CameraError` lists what there is.
 
 Colour frames come through the image processor, as `main`, in BGR. Grey ones are the *raw* stream of a monochrome
-sensor: `main` has gone through gamma, denoising and sharpening of the tuning file, after which a difference of two
-frames is no light. libcamera makes no other size of a raw stream than the mode's, and picamera2 asks for a `main`
-beside it, which nobody reads.
-
-Names of libcamera (formats.yaml) and what picamera2 hands out (`Helpers._make_array_shared`, 0.3.38): raw streams are
-(H, stride) bytes with the padding. Up to Pi 4 a mode of 10 bits comes as it is asked for, `R10`, in the low bits of
-words; a Pi 5 makes `R16` of it, the sensor's bits on top. Modes of 8 bits are `R8` on both.
+sensor: `main` has gone through gamma, denoising and sharpening, after which a difference of two frames is no light.
+libcamera makes no other size of a raw stream than the mode's, and picamera2 asks for a `main` beside it, which nobody
+reads. Raw streams are (H, stride) bytes with the padding (formats.yaml; `Helpers._make_array_shared`, picamera2
+0.3.38). Up to Pi 4 a mode of 10 bits comes as `R10`, in the low bits of words; a Pi 5 makes `R16` of it, the sensor's
+bits on top. Modes of 8 bits are `R8` on both.
 """
 
 import re
@@ -40,21 +38,13 @@ FACTS = (
 
 @dataclass(frozen=True, slots=True)
 class SensorMode:
-    """One mode.
+    """One mode of the sensor."""
 
-    Attributes:
-        size: Width and height of what the sensor delivers [px].
-        bit_depth: Bits of one raw value.
-        rate_hz: Highest frame rate [Hz].
-        crop: x, y, width and height on the pixel array [px of the array].
-        mono: Whether the sensor has no colour filters.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # width and height of what the sensor delivers [px]
     bit_depth: int
-    rate_hz: float
-    crop: tuple[int, int, int, int]
-    mono: bool = False
+    rate_hz: float  # highest frame rate [Hz]
+    crop: tuple[int, int, int, int]  # x, y, width and height on the pixel array [px of the array]
+    mono: bool = False  # whether the sensor has no colour filters
 
     @property
     def area(self) -> int:
@@ -84,14 +74,10 @@ def read_modes(modes: Sequence[Mapping[str, Any]]) -> tuple[SensorMode, ...]:
 
 
 def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
-    """Mode with the widest view among those fast and large enough.
+    """Mode with the widest view among those fast enough and not smaller than `size`.
 
     Of modes with the same view the one with the fewest pixels is taken (binned: less noise, less to read out), then
-    the one with the most bits. Where every fast enough mode is smaller than `size` the image would be blown up, so
-    that is an error as well.
-
-    Raises:
-        CameraError: No mode is fast and large enough; the text lists the modes.
+    the one with the most bits.
     """
     if not modes:
         raise CameraError(
@@ -117,11 +103,8 @@ def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, in
 def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
     """Mode of a monochrome sensor of exactly this size [px], and fast enough.
 
-    Of modes with the widest view that of fewest bits, but no fewer than 8: a frame has 8 bits, and the rest would be
-    read out for nothing.
-
-    Raises:
-        CameraError: The sensor has colour filters, or no such mode; the text lists the modes.
+    Of modes with the widest view that of fewest bits, but no fewer than 8: a frame has 8 bits, the rest would be read
+    out for nothing.
     """
     if modes and not any(mode.mono for mode in modes):
         raise CameraError(
@@ -156,20 +139,13 @@ _MAIN = {Pixels.COLOUR: "RGB888", Pixels.GREY: "YUV420", Pixels.LUMA: "YUV420"} 
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """What is asked for, and what came of it.
+    """What is asked for, and what came of it."""
 
-    Attributes:
-        pixels: What the frames are to be.
-        size: Width and height of the frames [px].
-        mode: Mode of the sensor.
-        lores: Width and height of the small image [px], or None.
-        raw: Name and bytes per row of the raw stream as the camera makes it, once it is known.
-    """
-
-    pixels: Pixels
-    size: tuple[int, int]
+    pixels: Pixels  # what the frames are to be
+    size: tuple[int, int]  # width and height of the frames [px]
     mode: SensorMode
     lores: tuple[int, int] | None
+    # name and bytes per row of the raw stream as the camera makes it, once it is known
     raw: tuple[str, int] | None = None
 
     def parts(self) -> dict[str, Any]:
@@ -185,11 +161,7 @@ class Streams:
         return parts
 
     def taken(self, configuration: Mapping[str, Any]) -> "Streams":
-        """The same with what the camera made of it; libcamera adjusts what it cannot do.
-
-        Raises:
-            CameraError: Another size or format: such frames were not calibrated.
-        """
+        """The same with what the camera made of it; libcamera adjusts what it cannot do."""
         expected: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
             "main": (self.size, (_MAIN[self.pixels],))
         }
@@ -209,12 +181,7 @@ class Streams:
         return Streams(self.pixels, self.size, self.mode, self.lores, named)
 
     def image(self, request: Request) -> Image:
-        """The frame: (H, W, 3) BGR, or (H, W) grey.
-
-        Raises:
-            RuntimeError: It is not of the size or depth that was configured.
-            CameraError: As of `grey`.
-        """
+        """The frame: (H, W, 3) BGR, or (H, W) grey; `RuntimeError`: of another size."""
         width, height = self.size
         if self.pixels is Pixels.COLOUR:
             image = np.asarray(request.make_array("main"))

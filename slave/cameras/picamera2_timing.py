@@ -7,25 +7,23 @@ of the exposure of row 0 is `SensorTimestamp` - `ExposureTime` / 2. `FrameWallCl
 regression from the boot clock to the wall clock (libcamera's ClockRecovery); it follows a stepped wall clock only
 slowly, and is used only where there is no `SensorTimestamp`.
 
-How far a stamp scatters. Between the interrupt and the reading of the clock lies the interrupt's latency: under load
-up to 50 to 200 us on a Pi with the usual kernel, mostly 10 to 30 us; and the first byte leaves the sensor within two
-rows (some 40 us) of the end of the exposure. 50 us cover both. The regression behind `FrameWallClock` follows the wall
-clock to about a millisecond.
-
-The library has no frame number that counts what the sensor dropped. Frames come at a fixed duration, so the number
-follows from the time.
+Scatter of a stamp: the interrupt's latency, under load up to 50 to 200 us on a Pi with the usual kernel, mostly 10 to
+30 us, and the first byte leaves the sensor within two rows (some 40 us) of the end of the exposure: 50 us cover both.
+The regression behind `FrameWallClock` follows the wall clock to about a millisecond. The library has no frame number
+that counts what the sensor dropped; frames come at a fixed duration, so the number follows from the time.
 
 In step (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server sends when one of its frames began and when
-all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer by that much;
-less it leaves alone. `SyncReady` shows that the agreed moment has passed, and stays; `SyncTimer` is the time from the
-frame to that moment. After it the timer does not measure the lag: the server reckons the moment back over all frames
-since, so its error grows with their number. The evidence is
+all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer by that
+much. `SyncReady` shows that the agreed moment has passed, and stays; `SyncTimer` is the time from the frame to that
+moment, after which it does not measure the lag: the server reckons the moment back over all frames since. The
+evidence is
 
     that the server is received  the agreed moment, FrameWallClock + SyncTimer, is recomputed with every message, and
                                  stands still without any
     how far the client was off   the frame it made shorter or longer: FrameDuration against that of its neighbours
 
-A server knows nothing of its clients: it is in step when it is ready.
+A server knows nothing of its clients: it is in step when it is ready. Stamps on no known clock, and cameras that are
+not in step in time, raise `CameraError`.
 """
 
 import logging
@@ -42,13 +40,9 @@ MICROSECONDS_BELOW = 10**17  # wall clock: such a number of ns would be 1973, so
 
 
 class Timeline:
-    """Number and time of each frame from its metadata.
-
-    Holds the conversion of the camera's clock, and number and time of the last frame.
-    """
+    """Number and time of each frame from its metadata."""
 
     def __init__(self, frame_rate_hz: float, clock: Clock) -> None:
-        """Begin with number 0; times are on `clock`."""
         self._rate_hz = frame_rate_hz
         self._clock = clock
         self._stamps: tuple[str, ForeignClock] | None = None  # of which key in the metadata
@@ -60,13 +54,7 @@ class Timeline:
         return 0.0 if self._stamps is None else hypot(SIGMA_NS[self._stamps[0]], self._stamps[1].sigma_ns)
 
     def place(self, metadata: Mapping[str, object]) -> tuple[int, int] | None:
-        """Number, and middle of the exposure of row 0 [ns], of the next frame.
-
-        None for a frame without a time.
-
-        Raises:
-            CameraError: Its time is on no clock of this machine.
-        """
+        """Number and mid-exposure of row 0 [ns] of the next frame; None: without a time."""
         t_ns = self._row_zero_ns(metadata)
         if t_ns is None:
             return None
@@ -101,21 +89,16 @@ class Timeline:
 
 
 PERIOD_FRAMES = 30  # from message to message
-SILENT_FRAMES = (
-    10 * PERIOD_FRAMES
-)  # some are lost on a wireless network; crystals drift 0.25 ms in 300 frames
+# some are lost on a wireless network; crystals drift 0.25 ms in 300 frames
+SILENT_FRAMES = 10 * PERIOD_FRAMES
 MOST_OFF_US = 1000.0  # further off in one correction, and it had not been in step
 _LOG = logging.getLogger(__name__)
 
 
 class SyncMonitor:
-    """Push machine for a camera's metadata: whether it is in step.
-
-    Holds that, and how far off the last message found it.
-    """
+    """Watches a camera's metadata for whether it is in step."""
 
     def __init__(self, where: str, *, client: bool) -> None:
-        """Watch a client, or the server. `where` names the camera in the log."""
         self._where, self._client = where, client
         self._ready_us: int | None = None  # the agreed moment, wall clock
         self._silent = 0  # frames since it was reckoned anew
@@ -145,10 +128,7 @@ class SyncMonitor:
         self._was_locked = self.locked
 
     def metrics(self) -> dict[str, float]:
-        """`sync_locked` 0 or 1; of a client also `sync_error_us`.
-
-        That is the last correction: 0 is below 50 us.
-        """
+        """`sync_locked` 0 or 1; of a client the last correction; 0 is below 50 us."""
         found = {"sync_locked": float(self.locked)}
         return found | {"sync_error_us": self.error_us} if self._client else found
 
@@ -193,27 +173,14 @@ def wait_in_step(
     clock: Clock,
     stopped: Callable[[], bool],
 ) -> None:
-    """Read frames until libcamera reports that all cameras are in step.
-
-    Args:
-        capture: The metadata of the next frame.
-        where: Names the camera.
-        role: "server" or "client".
-        timeout_s: How long to wait [s] of `clock`.
-        clock: The slave's clock.
-        stopped: Whether the slave is to end.
-
-    Raises:
-        CameraError: They are not within the time, or the slave was to stop before.
-    """
+    """Read metadata until all cameras are in step; `role` is "server" or "client"."""
     other = "clients" if role == "server" else "the server"
     end_ns = clock.now_ns() + round(timeout_s * 1e9)
     count = 0
     while True:
         metadata = capture()
-        timer = metadata.get(
-            "SyncTimer"
-        )  # us until the agreed moment; a client that received from no server has none
+        # us until the agreed moment; a client that received from no server has none
+        timer = metadata.get("SyncTimer")
         if metadata.get("SyncReady"):
             wall = metadata.get("FrameWallClock", "unknown")
             _LOG.info("%s: in step, %s us off; first frame at wall clock %s ns", where, timer, wall)

@@ -1,6 +1,6 @@
-"""Playback of recorded raw frames as a camera.
+"""Play recorded raw frames as a camera, in their own time or as fast as possible.
 
-It runs in the recording's own time, or as fast as possible.
+A broken recording or picture raises `CameraError`, which names the file.
 """
 
 import time
@@ -19,17 +19,12 @@ from slave.sources import Frame
 class ReplayCamera:
     """A `FrameSource` that reads the pictures of a recording.
 
-    Holds the list of frames and the next index. Paced, the first frame comes at once and each further one when
-    as much time has passed as in the recording, a gap of more than ten minutes left out; its `t_ns` is on the
-    slave's clock then. Unpaced, `t_ns` is the recording's.
+    Paced, the first frame comes at once and each further one when as much time has passed as in the recording, a gap
+    of more than ten minutes left out; its `t_ns` is on the slave's clock then. Unpaced, `t_ns` is the recording's.
     """
 
     def __init__(self, folder: Path, camera: str, paced: bool, clock: Clock) -> None:
-        """Open the recording; images are read one by one.
-
-        Raises:
-            CameraError: The recording is broken, or has no frame of `camera`. The text names the file.
-        """
+        """Open the recording; images are read one by one."""
         try:
             recording = open_recording(folder)
             self._rows = recording.frames_of(camera)
@@ -49,11 +44,7 @@ class ReplayCamera:
         self._shift_ns: int | None = None
 
     def read(self) -> Frame | None:
-        """Next frame in the order of time, or None after the last.
-
-        Raises:
-            CameraError: A picture is missing, broken or of another size than the camera file states.
-        """
+        """Next frame in the order of time, or None after the last."""
         if self._next >= len(self._rows):
             return None
         row = self._rows[self._next]
@@ -74,11 +65,7 @@ class ReplayCamera:
         self._next = len(self._rows)
 
     def tune(self, camera: CameraCalibration) -> None:
-        """What was recorded stays as it was exposed.
-
-        Raises:
-            CameraError: The settings are not those of the recording.
-        """
+        """What was recorded stays as it was exposed."""
         if same_exposed(camera, self._calibration):
             return
         raise CameraError(
@@ -107,25 +94,13 @@ class ReplayCamera:
 
 
 def is_grey(manifest: Manifest, camera: str) -> bool:
-    """Return whether a camera of a recording belongs to a wrist device.
-
-    The frames of such a camera are grey.
-    """
+    """Whether a camera of a recording belongs to a wrist device: its frames are grey."""
     rigs = (manifest.rig, *manifest.rigs)
     return any(rig is not None and rig.kind == "wrist" and camera in rig.cameras for rig in rigs)
 
 
 def read_png(path: Path, size: tuple[int, int], *, grey: bool = False) -> Image:
-    """Read one frame as (H, W, 3) BGR uint8, or as (H, W).
-
-    Args:
-        path: PNG file.
-        size: Height and width by the camera file.
-        grey: Whether one channel is wanted.
-
-    Raises:
-        CameraError: Missing, no image, or of another size; the text names the file.
-    """
+    """Read a frame as (H, W, 3) BGR uint8 or grey (H, W); `size` is height and width."""
     try:
         return decode(read_picture(path), (size[1], size[0]), grey=grey)
     except OSError as error:

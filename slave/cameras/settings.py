@@ -1,9 +1,9 @@
 """Compare the settings of a camera with what was asked for.
 
-A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value
-read back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted,
-got and what to do; nothing is taken on trust. What changes settings of a running camera watches its frames go by
-(`FrameObserver`), without holding them up.
+A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value read
+back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted, got and
+what to do. What changes settings of a running camera watches its frames go by (`FrameObserver`), without holding them
+up.
 """
 
 import threading
@@ -17,21 +17,13 @@ from common.errors import CameraError
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One quantity that the camera must have.
+    """One quantity that the camera must have."""
 
-    Attributes:
-        name: As the camera calls it.
-        wanted: Values, one or several (a pair of colour gains).
-        tolerance: Largest allowed distance of each value, in its unit.
-        unit: For the text of errors; may be empty.
-        source: Where the wanted value comes from, for the text of errors.
-    """
-
-    name: str
-    wanted: tuple[float, ...]
-    tolerance: float
-    unit: str
-    source: str
+    name: str  # as the camera calls it
+    wanted: tuple[float, ...]  # values, one or several (a pair of colour gains)
+    tolerance: float  # largest allowed distance of each value, in its unit
+    unit: str  # for the text of errors; may be empty
+    source: str  # where the wanted value comes from, for the text of errors
 
 
 def as_values(value: object) -> tuple[float, ...] | None:
@@ -42,10 +34,7 @@ def as_values(value: object) -> tuple[float, ...] | None:
 
 
 def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[str]:
-    """What is not as wanted, one sentence each; empty if all is well.
-
-    A setting that was not read back at all is a difference: nothing is known about it.
-    """
+    """What is not as wanted, or was not read back, one sentence each."""
     found: list[str] = []
     for setting in wanted:
         if setting.name not in got:
@@ -69,11 +58,7 @@ def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[st
 
 
 def demand(where: str, wanted: Iterable[Setting], got: Mapping[str, object], fix: str) -> None:
-    """Raise unless the camera has everything.
-
-    Raises:
-        CameraError: With `where`, every setting that differs, and `fix`.
-    """
+    """Raise unless the camera has everything."""
     found = differences(wanted, got)
     if found:
         raise CameraError(f"{where} did not take its settings: {'; '.join(found)}. {fix}")
@@ -84,10 +69,7 @@ def change(
 ) -> None:
     """Have `new` applied; if that fails, `old`, and see that it came back.
 
-    Args:
-        apply: Writes the settings of a camera file, reads them back and raises `CameraError` at a difference.
-        old: What the camera has.
-        new: What it is to have.
+    `apply` writes the settings of a camera file, reads them back and raises `CameraError` at a difference.
 
     Raises:
         CameraError: `new` was not taken; the text states so, and what became of `old`.
@@ -121,7 +103,6 @@ class FrameObserver(Generic[T]):
     """Holds the newest of what went by, and how many there were."""
 
     def __init__(self) -> None:
-        """Nothing went by yet."""
         self._changed = threading.Condition()
         self._newest: T | None = None
         self._count = 0
@@ -139,13 +120,7 @@ class FrameObserver(Generic[T]):
             self._changed.notify_all()
 
     def following(self, count: int, timeout_s: float) -> Iterator[T]:
-        """Wait for `count` items that go by from now on.
-
-        A watcher who is late misses some; those do not count.
-
-        Raises:
-            CameraError: None came for `timeout_s` [s].
-        """
+        """Wait for `count` further items; `CameraError`: none came for `timeout_s` [s]."""
         return self._after(self._count, count, timeout_s)
 
     def _after(self, last: int, count: int, timeout_s: float) -> Iterator[T]:

@@ -1,27 +1,14 @@
 """Open a camera that looks at the simulated scene, with faults on request.
 
-Camera that looks at the simulated scene in real time.
+Frame k is exposed when the slave's (perhaps skewed) clock reads `epoch + start offset + k periods`, until the rate is
+changed, and handed over when a real sensor would have read out its last row. A process too slow for its rate loses
+frames, of a strobe whole cycles, seen as gaps in `seq` and in `skipped`, and never works off a backlog. The camera of
+a wrist device takes what its lights had on while it exposed (`slave.lights.strobed`); without lights it switches them
+itself, frame k by k modulo 3. The lamp of the simulated room is such that the camera file of the scene exposes it
+well; other settings make the picture brighter or darker against that.
 
-It is the first-class stand-in for hardware.
-
-Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, reads
-`epoch + start offset + k periods`, until the rate is changed. It is handed over when a real sensor would have read out
-its last row. The picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame
-rate loses frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
-
-The camera of a wrist device takes what its lights had on while it exposed (`slave.lights.strobed`). Without lights
-it is a camera that switches them itself, frame k by k modulo 3. Either way a slow process loses whole cycles,
-for of a strobe whose single frames are lost no cycle would ever be whole.
-
-The lamp of the simulated room is such that the settings in the camera file of the scene expose it well. Other exposure
-and gains, at the start or later, make the picture brighter or darker against that, and the exposure smears as long.
-
-Simulated camera with faults that come and go, for checklist rehearsals.
-
-The faults are in a JSON file that is read again whenever it changes (`phalanx-slave run --camera synthetic --faults
-FILE`, docs/checklist.md).
-
-The pictures, settings and times are those of the camera inside; here they are spoiled as a real one spoils them.
+Faults that come and go, for checklist rehearsals, are in a JSON file that is read again whenever it changes
+(`--faults FILE`, docs/checklist.md). Settings that no real camera could take raise `CameraError`.
 """
 
 import logging
@@ -55,24 +42,19 @@ from slave.sources import Frame
 
 @dataclass(frozen=True, slots=True)
 class _Pace:
-    """Exposure times of the frames.
-
-    Frame `seq` is exposed at `t_ns` [ns], the others at this rate before and after.
-    """
+    """Exposure times: frame `seq` at `t_ns` [ns], the others at this rate."""
 
     seq: int
     t_ns: int
     rate_hz: float
 
     def exposed_ns(self, seq: int) -> int:
+        """Middle of the exposure of row 0 of frame `seq`, own clock [ns]."""
         return self.t_ns + round((seq - self.seq) * 1e9 / self.rate_hz)
 
 
 class SyntheticCamera:
-    """A `FrameSource` that renders its frames.
-
-    Holds its settings, the number of the next frame and how many were skipped.
-    """
+    """A `FrameSource` that renders its frames."""
 
     def __init__(
         self,
@@ -87,25 +69,17 @@ class SyntheticCamera:
         *,
         live: bool = False,
     ) -> None:
-        """Prepare the renderer.
-
-        The camera may join at any time: `seq` counts from the epoch.
+        """Prepare the renderer. It may join at any time: `seq` counts from the epoch.
 
         Args:
-            scene: What it looks at.
-            camera: A camera of the scene's rig: its name, or a file of it that states how it is set. The files of the
-                scene state what lens it has, and how it would be set well.
-            epoch_ns: Scene time 0, on the true clock [ns].
-            clock: The slave's clock; stamps are on it, and its rate is that of the camera.
-            start_offset_ns: How much later than the epoch frame 0 is taken [ns].
-            true_clock: The clock of the scene.
-            sleep: Waits so many seconds.
+            scene: What it looks at; its files state what lens the camera has, and how it would be set well.
+            camera: A camera of the scene's rig: its name, or a file of it that states how it is set.
+            epoch_ns: Scene time 0, on the true clock [ns]; frame 0 is taken `start_offset_ns` later.
             lights: What lights a wrist device, on `clock`; None: this camera switches its lights itself.
             live: The scene does not wait for who draws it, so that is done as fast as looks right.
 
         Raises:
             CalibrationError: The scene has no such camera, or one of another size, or a marker without a colour.
-            CameraError: The exposure does not fit into a frame.
         """
         name = camera if isinstance(camera, str) else camera.name
         self._renderer = renderer_of(scene, name, live=live)
@@ -131,7 +105,7 @@ class SyntheticCamera:
         if self._closed:
             return None
         seq = self._due_next()
-        t_ns = self._exposed_ns(seq)
+        t_ns = self._pace.exposed_ns(seq)
         image, lit = self._draw(seq, t_ns)
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
@@ -145,11 +119,7 @@ class SyntheticCamera:
         self._closed = True
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Take other exposure, gains and rate from the next frame on.
-
-        Raises:
-            CameraError: The exposure does not fit into a frame, or the rows cannot be read out so often.
-        """
+        """Take other exposure, gains and rate from the next frame on."""
         rate_hz = camera.frame_rate_hz
         if camera.exposure_us >= 1e6 / rate_hz:
             raise CameraError(
@@ -162,7 +132,7 @@ class SyntheticCamera:
                 f"us, so at most {1e9 / self._rows_ns:.4g}; the settings before are still in use"
             )
         if rate_hz != self._pace.rate_hz:  # the frame that is next comes when it would have come anyway
-            self._pace = _Pace(seq := self._next, self._exposed_ns(seq), rate_hz)
+            self._pace = _Pace(seq := self._next, self._pace.exposed_ns(seq), rate_hz)
         gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
         self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
 
@@ -171,10 +141,7 @@ class SyntheticCamera:
         return figures(self._camera)
 
     def counts(self) -> dict[str, int]:
-        """Return the count `camera.skipped`.
-
-        It counts frames that this process was too slow to draw; they count as dropped, too.
-        """
+        """`camera.skipped`: frames it was too slow to draw, which count as dropped, too."""
         return {"camera.skipped": self.skipped}
 
     def _draw(self, seq: int, t_ns: int) -> tuple[Image, Illumination]:
@@ -193,10 +160,7 @@ class SyntheticCamera:
     def _draw_lit(
         self, renderer: WristRenderer, t_s: float, t_ns: int, lights: SimulatedStrobe
     ) -> tuple[Image, Illumination]:
-        """Draw the frame with the lights that were on during the exposure.
-
-        A light that was on for a part of it adds that part.
-        """
+        """Add each light by the part of the exposure that it was on."""
         half_ns = round(self._camera.exposure_us * 500.0)
         lit = lights.during(t_ns - half_ns, t_ns + half_ns)
         shares = {Illumination.LASER: lit.laser, Illumination.LED: lit.led}
@@ -216,13 +180,8 @@ class SyntheticCamera:
         return round(self._camera.exposure_us * 500.0 + self._rows_ns)
 
     def _due_next(self) -> int:
-        """Return the number of the next frame.
-
-        It is the one after the last, or the first that is not yet read out.
-
-        A cycle of a strobe that has begun is brought to its end, late or not.
-        """
-        late_ns = self._clock.now_ns() - self._readout_ns - self._exposed_ns(self._next)
+        """The next frame, or the first that is not yet read out; a strobe cycle is ended."""
+        late_ns = self._clock.now_ns() - self._readout_ns - self._pace.exposed_ns(self._next)
         period_ns = 1e9 / self._pace.rate_hz
         begun = self._started and self._next % self._cycle != 0
         if begun or late_ns <= (0.5 * period_ns if self._started else 0.0):
@@ -234,10 +193,6 @@ class SyntheticCamera:
             self.skipped += seq - self._next
         self._started = True
         return seq
-
-    def _exposed_ns(self, seq: int) -> int:
-        """Middle of the exposure of row 0 of frame `seq`, own clock [ns]."""
-        return self._pace.exposed_ns(seq)
 
     def _own(self, t_ns: int) -> int:
         return self._clock.from_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
@@ -256,10 +211,7 @@ def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> No
 
 
 def _sensitivity(camera: CameraCalibration) -> Float:
-    """Return the sensitivity to blue, green and red light (3,) under the settings.
-
-    It is the exposure [us] times the gains of each channel.
-    """
+    """Exposure [us] times the gains of blue, green and red (3,)."""
     red, blue = camera.colour_gains
     return camera.exposure_us * camera.analogue_gain * np.array([blue, 1.0, red])
 
@@ -269,10 +221,7 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
 class Patch(Struct, frozen=True, forbid_unknown_fields=True):
-    """A disc of one colour before the camera.
-
-    Its centre and radius are in [px], its colour in sRGB, blue first.
-    """
+    """A disc of one colour before the camera: centre, radius [px], sRGB, blue first."""
 
     uv: tuple[float, float]
     radius_px: Annotated[float, Meta(gt=0.0, le=1000.0)]
@@ -280,37 +229,27 @@ class Patch(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Faults(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is wrong with the camera; by default nothing.
+    """What is wrong with the camera; by default nothing."""
 
-    Attributes:
-        exposes: How many times as long as it was set it exposes: an automatic that was not switched off.
-        moved_px: How far the picture has moved since the calibration: somebody turned the camera a little.
-        patches: Things before the camera that the scene does not have.
-        keep_one_in: Of so many frames one is delivered: a camera, or a cable, that is too slow.
-        swap_every: Of so many frames two come in the wrong order: the strobe of a wrist device slips. 0: none.
-        unplugged: It is not there: lost while it runs, and not to be opened.
-        raises: Its driver raises an error that is none of ours at the next frame.
-        frozen: It sends one picture again and again, with new stamps, also after it was opened again.
-    """
-
+    # how many times as long as it was set it exposes: an automatic that was not switched off
     exposes: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    # how far the picture has moved since the calibration: somebody turned the camera a little
     moved_px: tuple[float, float] = (0.0, 0.0)
-    patches: tuple[Patch, ...] = ()
+    patches: tuple[Patch, ...] = ()  # things before the camera that the scene does not have
+    # of so many frames one is delivered: a camera, or a cable, that is too slow
     keep_one_in: Annotated[int, Meta(ge=1, le=100)] = 1
+    # Of so many frames two come in the wrong order: the strobe of a wrist device slips. 0: none
     swap_every: Annotated[int, Meta(ge=0, le=1000)] = 0
-    unplugged: bool = False
-    raises: bool = False
+    unplugged: bool = False  # it is not there: lost while it runs, and not to be opened
+    raises: bool = False  # its driver raises an error that is none of ours at the next frame
+    # it sends one picture again and again, with new stamps, also after it was opened again
     frozen: bool = False
 
 
 class Frozen:
-    """The one picture of a frozen camera, kept while it is opened again.
-
-    Holds it while the camera is frozen.
-    """
+    """The one picture of a frozen camera, kept while it is opened again."""
 
     def __init__(self) -> None:
-        """It is not."""
         self._image: Image | None = None
 
     def shown(self, image: Image, frozen: bool) -> Image:
@@ -324,23 +263,12 @@ class Frozen:
 
 
 class FaultyCamera:
-    """A `FrameSource` and `Tunable` that adds faults to a simulated camera.
-
-    Holds the faults, and the settings that the camera was last given.
-    """
+    """A `FrameSource` and `Tunable` that adds faults to a simulated camera."""
 
     def __init__(
         self, source: SyntheticCamera, camera: CameraCalibration, path: Path, frozen: Frozen | None = None
     ) -> None:
-        """Load the faults from the file `path`.
-
-        The file need not exist yet.
-
-        `frozen` is the same for every opening of one camera.
-
-        Raises:
-            CameraError: The file is broken, or states that the camera is unplugged.
-        """
+        """Load the faults from the file `path`, which need not exist yet."""
         self._source, self._camera, self._path = source, camera, path
         self._faults = Faults()
         self._stat: tuple[int, int] | None = None
@@ -352,12 +280,7 @@ class FaultyCamera:
         self._refuse_unplugged()
 
     def read(self) -> Frame | None:
-        """The next frame, spoiled.
-
-        Raises:
-            CameraError: The camera was unplugged.
-            RuntimeError: Its driver is to raise something that no driver of ours raises.
-        """
+        """The next frame, spoiled; `RuntimeError`: what no driver of ours raises."""
         while (frame := self._source.read()) is not None:
             if frame.ready_t_ns - self._looked_ns >= 100_000_000:  # the file is looked at ten times a second
                 self._looked_ns = frame.ready_t_ns
@@ -382,19 +305,12 @@ class FaultyCamera:
         self._source.close()
 
     def tune(self, camera: CameraCalibration) -> None:
-        """As of the camera inside.
-
-        Raises:
-            CameraError: As there.
-        """
+        """As of the camera inside."""
         self._source.tune(self._exposed(camera, self._faults))
         self._camera = camera
 
     def metrics(self) -> dict[str, float]:
-        """Return the actual settings of the camera.
-
-        They differ from the commanded ones where it exposes by itself.
-        """
+        """The actual settings: not the commanded ones where it exposes by itself."""
         return self._source.metrics()
 
     def counts(self) -> dict[str, int]:
@@ -406,11 +322,7 @@ class FaultyCamera:
             raise CameraError(f"camera {self._camera.name!r} is unplugged, as set in {self._path}")
 
     def _look(self) -> None:
-        """Read the file if it was changed.
-
-        Raises:
-            CameraError: It is broken; the faults stay as they were.
-        """
+        """Read the file if it was changed; if it is broken, the faults stay as they were."""
         try:
             status = self._path.stat()
             stat, raw = (status.st_mtime_ns, status.st_ino), None

@@ -1,23 +1,20 @@
-"""USB camera, or any other single-planar V4L2 camera.
-
-It is controlled, stamped and counted by the kernel.
+"""USB camera, or any other single-planar V4L2 camera, stamped by the kernel.
 
 Frames come in four mapped buffers. Each is decoded into an image of its own before its buffer goes back, so nobody
-ever writes to a frame that was handed over. A slave that is late takes the newest frame and leaves the others; one that
+writes to a frame that was handed over. A slave that is late takes the newest frame and leaves the others; one that
 did not read at all (while it waited for the master) finds all buffers full of old frames, which are thrown away.
 
-When a frame was taken. The kernel stamps each buffer and states on which clock and at which event: the start of the
-exposure (USB: reckoned from the camera's own clock where it has one), or the end of the frame, that is the last row's
-read-out. From there it is half an exposure forward, or all rows and half an exposure back. `sequence` counts every
-frame of the camera, so a gap in it is a dropped one; a frame that arrived damaged is one, too.
+The kernel stamps each buffer and states on which clock and at which event: the start of the exposure (USB: reckoned
+from the camera's own clock where it has one), or the end of the frame, that is the last row's read-out. From there it
+is half an exposure forward, or all rows and half an exposure back. `sequence` counts every frame of the camera, so a
+gap in it is a dropped one; a frame that arrived damaged is one, too.
 
-How far a stamp scatters. A driver that stamps in its interrupt: 50 us, the latency of an interrupt under load. uvcvideo
-reads the clock when it sees the first packet, and it sees packets when their transfer is over: of up to 32 microframes
-of 125 us, so anywhere within 4 ms, 1.2 ms as standard deviation. With `hwtimestamps=1` it follows the camera's own
-clock by USB's frame numbers, one per ms: 0.3 ms. How late *all* frames are, by exposure and by what the camera keeps,
-is no scatter and unknown here: `phalanx calibrate time` measures it.
-
-Its settings, which another thread may change while frames are read, are in `v4l2_settings`.
+Scatter of a stamp: a driver that stamps in its interrupt 50 us, the latency of an interrupt under load. uvcvideo
+reads the clock when it sees the first packet, and it sees packets when their transfer is over: of up to 32
+microframes of 125 us, so anywhere within 4 ms, 1.2 ms as standard deviation. With `hwtimestamps=1` it follows the
+camera's own clock by USB's frame numbers, one per ms: 0.3 ms. How late *all* frames are, by exposure and by what the
+camera keeps, is no scatter and unknown here: `phalanx calibrate time` measures it. Whatever fails raises
+`CameraError`, which states what to do; its settings are in `v4l2_controls`.
 """
 
 import ctypes as c
@@ -45,27 +42,21 @@ from slave.clocks import ForeignClock, clock_of, system_clock
 from slave.sources import Frame
 
 BUFFERS = 4
-RATE_SHARE = (
-    0.1  # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
-)
+# a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
+RATE_SHARE = 0.1
 USB_CLOCK = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class V4l2Options:
-    """What is not in the camera file.
+    """What is not in the camera file."""
 
-    Attributes:
-        path: Device; a path below /dev/v4l/by-id stays the same when the camera is plugged in anew.
-        controls: Control -> value, in codes of the maker.
-        allow_missing: Which of exposure, gain, white_balance the camera may lack.
-        pixels: What its frames are to be.
-    """
-
+    # device; a path below /dev/v4l/by-id stays the same when the camera is plugged in anew
     path: Path = Path("/dev/video0")
+    # control -> value, in codes of the maker
     controls: Mapping[str, int] = field(default_factory=dict[str, int])
-    allow_missing: tuple[str, ...] = ()
+    allow_missing: tuple[str, ...] = ()  # which of exposure, gain, white_balance the camera may lack
     pixels: Pixels = Pixels.COLOUR
 
 
@@ -75,10 +66,7 @@ def device_path(place: str) -> Path:
 
 
 class V4l2Camera:
-    """A `FrameSource` of a V4L2 camera.
-
-    Holds the device, its buffers and the last number; `broken` counts damaged frames.
-    """
+    """A `FrameSource` of a V4L2 camera; `broken` counts damaged frames."""
 
     def __init__(
         self,
@@ -87,19 +75,7 @@ class V4l2Camera:
         clock: Clock,
         open_device: Callable[[Path], abi.Device] = abi.KernelDevice,
     ) -> None:
-        """Open and configure the camera, start it and check what it really does.
-
-        Configuring sets format, rate and controls.
-
-        Args:
-            calibration: The camera file: size, rate, exposure.
-            options: The rest.
-            clock: The slave's clock.
-            open_device: Opens a path.
-
-        Raises:
-            CameraError: No such device, format or control, a setting was refused or not taken, or no frames come.
-        """
+        """Open and configure the camera, start it and check what it really does."""
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (v4l2:{options.path})"
         self._foreign: ForeignClock | None = None
@@ -125,11 +101,7 @@ class V4l2Camera:
             raise CameraError(f"{self._where}: cannot be started: {error.strerror}") from error
 
     def read(self) -> Frame | None:
-        """Wait for the newest frame; None once closed.
-
-        Raises:
-            CameraError: The device is gone, or no frame came for 2 s.
-        """
+        """Wait for the newest frame; None once closed."""
         while self._device is not None:
             try:
                 image, buffer = self._next(self._device)
@@ -170,11 +142,7 @@ class V4l2Camera:
         device.close()
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change exposure and rate while another thread reads frames; see `Tunable`.
-
-        Raises:
-            CameraError: See `V4l2Settings.tune`; or its driver changes no rate while frames come, as UVC's.
-        """
+        """Change exposure and rate while another thread reads frames; see `Tunable`."""
         period_us = 1e6 / camera.frame_rate_hz
         if camera.exposure_us >= period_us:
             raise CameraError(
@@ -199,11 +167,7 @@ class V4l2Camera:
         self._calibration = camera  # its exposure is in the time of every frame from now on
 
     def _step_back(self, old: CameraCalibration, failed: CameraError) -> None:
-        """Have `old` again where the first of two steps was taken.
-
-        Raises:
-            CameraError: It does not come back.
-        """
+        """Have `old` again where the first of two steps was taken."""
         if self._calibration is old:
             return
         try:
@@ -214,10 +178,7 @@ class V4l2Camera:
             ) from error
 
     def metrics(self) -> dict[str, float]:
-        """Return the current settings of the camera and its measured rate.
-
-        The rate was measured at the start; the result is empty where the camera is gone.
-        """
+        """Its settings and the rate measured at the start; nothing where it is gone."""
         found = {} if self._settings is None else self._settings.metrics()
         return found | {"frame_rate_hz": self._rate_hz} if found else found
 
@@ -268,10 +229,7 @@ class V4l2Camera:
         return name
 
     def _retime(self, camera: CameraCalibration) -> None:
-        """Change the frame rate to that of `camera` and check it.
-
-        The loop goes on reading the frames meanwhile.
-        """
+        """Change the frame rate and check it, while the loop goes on reading."""
         settings = self._settings
         assert settings is not None  # the constructor opened it
         settings.ask(lambda device: self._set_rate(device, camera))
@@ -303,7 +261,6 @@ class V4l2Camera:
             raise CameraError(f"frame_rate_hz: wanted {rate_hz:g}, the driver set {got_hz:.4g}")
 
     def _stream(self, device: abi.Device) -> None:
-        """Map the buffers, hand them to the driver and start."""
         request = abi.RequestBuffers(count=BUFFERS, type=abi.V4L2.capture, memory=abi.V4L2.mmap)
         device.ioctl(abi.REQBUFS, request)
         for index in range(int(request.count)):
@@ -315,11 +272,7 @@ class V4l2Camera:
         self._streaming = True
 
     def _settle(self, device: abi.Device) -> None:
-        """Take some frames, and see that they come at the rate that was asked for.
-
-        Raises:
-            CameraError: They come at another rate, or the driver stamps them on no known clock.
-        """
+        """Take some frames, and see that they come at the rate that was asked for."""
         times: list[tuple[int, int]] = []
         for _ in range(SETTLE_FRAMES):
             _, buffer = self._next(device)
@@ -357,21 +310,14 @@ class V4l2Camera:
                 return image, done
 
     def _count(self, sequence: int) -> None:
-        """Update the frame number from the driver's 32-bit number.
-
-        For a driver that does not count, one is added.
-        """
+        """Update the frame number from the driver's 32-bit number, if it counts."""
         step = 1 if self._sequence is None else (sequence - self._sequence) % 2**32
         # A step of half the 32-bit range or more runs backwards
         self._seq += step if 0 < step < 2**31 else 1
         self._sequence = sequence
 
     def _row_zero_ns(self, buffer: abi.Buffer) -> int:
-        """Middle of the exposure of row 0 [ns], slave's clock.
-
-        Raises:
-            CameraError: The stamp is on no clock of this machine.
-        """
+        """Middle of the exposure of row 0 [ns], slave's clock."""
         stamp_ns = int(buffer.tv_sec) * 10**9 + int(buffer.tv_usec) * 1000
         if self._foreign is None:
             monotonic = buffer.flags & abi.V4L2.stamp_clock == abi.V4L2.stamp_monotonic
@@ -387,10 +333,7 @@ class V4l2Camera:
 
 
 def _steps(old: CameraCalibration, new: CameraCalibration) -> list[CameraCalibration]:
-    """Return the steps of settings from `old` to `new`.
-
-    Rate and exposure change one after the other, so that the exposure always fits into a frame.
-    """
+    """Steps of settings from `old` to `new`: the exposure always fits into a frame."""
     retimed = structs.replace(old, frame_rate_hz=new.frame_rate_hz)
     exposed = structs.replace(new, frame_rate_hz=old.frame_rate_hz)
     if same_exposed(retimed, new) or same_exposed(exposed, new):
@@ -405,10 +348,7 @@ def _rate_of(times: Sequence[tuple[int, int]]) -> float:
 
 
 def _usb_clock_is_used() -> bool:
-    """Return whether uvcvideo derives its time stamps from the cameras' own clocks.
-
-    It does so only if configured to.
-    """
+    """Whether uvcvideo is configured to stamp by the cameras' own clocks."""
     try:
         return int(USB_CLOCK.read_text()) != 0
     except (OSError, ValueError):

@@ -1,6 +1,4 @@
-"""The kernel's V4L2 interface as far as a camera needs it.
-
-Structures, request numbers, and an open device.
+"""Declare the kernel's V4L2 interface as far as a camera needs it.
 
 Layouts and numbers are those of linux/videodev2.h on 64-bit machines, where x86-64 and aarch64 agree; the tests hold
 them against sizes and numbers that a C compiler gave. Only single-planar memory-mapped capture is here. No library is
@@ -56,7 +54,6 @@ V4L2 = V4l2()
 
 
 def _words(*names: str) -> list[tuple[str, type[c.c_uint32]]]:
-    """Fields of 32 bits."""
     return [(name, c.c_uint32) for name in names]
 
 
@@ -85,10 +82,7 @@ class FormatDescription(c.Structure):
 
 
 class FrameSizes(c.Structure):
-    """struct v4l2_frmsizeenum.
-
-    `size` is width, height, or min, max, step of width, then of height.
-    """
+    """struct v4l2_frmsizeenum; width, height, or min, max, step of each."""
 
     _fields_ = [
         *_words("index", "pixel_format", "type"),
@@ -146,10 +140,7 @@ class RequestBuffers(c.Structure):
 
 
 class Buffer(c.Structure):
-    """struct v4l2_buffer.
-
-    `offset` is the first member of the union m, which is a pointer wide.
-    """
+    """struct v4l2_buffer; `offset` is of the union m, which is a pointer wide."""
 
     _fields_ = [
         *_words("index", "type", "bytesused", "flags", "field"),
@@ -255,14 +246,9 @@ class Device(Protocol):
 
 
 class KernelDevice:
-    """A `Device` of the running kernel. Holds the file and the mapped buffers."""
+    """A `Device` of the running kernel."""
 
     def __init__(self, path: Path) -> None:
-        """Open without blocking.
-
-        Raises:
-            OSError: It is not there, busy, or not for this user.
-        """
         self._file: int | None = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         self._maps: list[mmap.mmap] = []
 
@@ -295,10 +281,7 @@ class KernelDevice:
 
 
 def fourcc(text: str) -> int:
-    """Return the code of a pixel format such as "YUYV" or "Y10".
-
-    The fourth letter of "Y10" is a space.
-    """
+    """Code of a pixel format such as "YUYV" or "Y10", whose fourth letter is a space."""
     return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 

@@ -1,22 +1,12 @@
 """Set and read back the controls of an open V4L2 camera by name.
 
-Settings of a V4L2 camera by name.
-
-Every automatic is switched off, every value written, read back and compared.
-
-Names are those of v4l2-ctl and current kernels ("White Balance, Automatic" is `white_balance_automatic`); standard
-controls are recognised by their number, since kernels have renamed them. Only exposure has a physical unit (100 us).
-Gain, colour balance and focus are codes of the maker, which no camera file can hold for all cameras: where the camera
-has such a control its value must be given (`--control gain=32`), because whatever an automatic left there would
-otherwise be kept. Where it lacks a setting that the camera file names, that must be allowed (`--allow-missing gain`).
-Nothing is ignored silently.
-
-Settings of one open V4L2 camera.
-
-They are written and checked at the start; the exposure is changed while frames are read.
-
-A change comes from another thread than the loop's. It writes the control, lets some frames pass and reads everything
-back. Gain and white balance are codes of the camera's maker, given by `--control`: they stay as they are.
+Every automatic is switched off, every value written, read back and compared. Names are those of v4l2-ctl and current
+kernels; standard controls are recognised by their number, since kernels have renamed them. Only exposure has a
+physical unit (100 us), and only it changes while frames are read. Gain, colour balance and focus are codes of the
+maker: where the camera has such a control its value must be given (`--control gain=32`), because whatever an
+automatic left there would otherwise be kept. A setting of the camera file that it lacks must be allowed
+(`--allow-missing gain`). What is unknown, refused, out of range or not taken raises `CameraError`, which states what
+to write; a device that is gone, at the start, `OSError`.
 """
 
 import ctypes as c
@@ -29,20 +19,9 @@ from typing import TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
+from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import Pixels
 from slave.cameras.settings import FrameObserver, Setting, change, demand, differences
-from slave.cameras.v4l2_abi import (
-    G_EXT_CTRLS,
-    QUERY_EXT_CTRL,
-    QUERYMENU,
-    S_EXT_CTRLS,
-    ControlValue,
-    ControlValues,
-    Device,
-    QueryControl,
-    QueryMenu,
-)
-from slave.cameras.v4l2_abi import V4L2 as V4L2_ABI
 
 EXPOSURE = "exposure_time_absolute"
 EXPOSURE_UNIT_US = 100.0
@@ -92,36 +71,26 @@ NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 FILE_KEYS = {"exposure": "exposure_us", "gain": "analogue_gain", "white_balance": "colour_gains"}
 NUMERIC = {
-    V4L2_ABI.type_integer,
-    V4L2_ABI.type_boolean,
-    V4L2_ABI.type_menu,
-    V4L2_ABI.type_integer64,
-    V4L2_ABI.type_bitmask,
-    V4L2_ABI.type_integer_menu,
+    abi.V4L2.type_integer,
+    abi.V4L2.type_boolean,
+    abi.V4L2.type_menu,
+    abi.V4L2.type_integer64,
+    abi.V4L2.type_bitmask,
+    abi.V4L2.type_integer_menu,
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """One control of the camera.
+    """One control of the camera."""
 
-    Attributes:
-        number: Its id in the kernel.
-        name: As v4l2-ctl calls it.
-        type: One of `NUMERIC`.
-        low: Lowest value.
-        high: Highest value.
-        step: Distance of allowed values, at least 1.
-        menu: Value -> its name, for a menu; menus have holes.
-    """
-
-    number: int
-    name: str
-    type: int
+    number: int  # its id in the kernel
+    name: str  # as v4l2-ctl calls it
+    type: int  # one of `NUMERIC`
     low: int
     high: int
-    step: int
-    menu: Mapping[int, str] | None = None
+    step: int  # distance of allowed values, at least 1
+    menu: Mapping[int, str] | None = None  # value -> its name, for a menu; menus have holes
 
     def text(self) -> str:
         """Name and range in words."""
@@ -141,42 +110,42 @@ class Control:
         return self.low + round(steps) * self.step
 
 
-def read_controls(device: Device) -> dict[str, Control]:
-    """All controls with a number as value that can be written and read back, by name."""
+def read_controls(device: abi.Device) -> dict[str, Control]:
+    """All controls with a number that can be written and read back, by name."""
     found: dict[str, Control] = {}
     number = 0
     while True:
-        query = QueryControl(id=number | V4L2_ABI.ctrl_next)
+        query = abi.QueryControl(id=number | abi.V4L2.ctrl_next)
         try:
-            device.ioctl(QUERY_EXT_CTRL, query)
+            device.ioctl(abi.QUERY_EXT_CTRL, query)
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOTTY):
                 return found
             raise
         number = int(query.id)
         useless = (
-            V4L2_ABI.ctrl_disabled
-            | V4L2_ABI.ctrl_read_only
-            | V4L2_ABI.ctrl_write_only
-            | V4L2_ABI.ctrl_has_payload
+            abi.V4L2.ctrl_disabled
+            | abi.V4L2.ctrl_read_only
+            | abi.V4L2.ctrl_write_only
+            | abi.V4L2.ctrl_has_payload
         )
         if query.type in NUMERIC and not query.flags & useless:
             name = NAMES.get(number) or plain_name(query.name.decode("ascii", "replace"))
             menu = (
                 _menu(device, query)
-                if query.type in (V4L2_ABI.type_menu, V4L2_ABI.type_integer_menu)
+                if query.type in (abi.V4L2.type_menu, abi.V4L2.type_integer_menu)
                 else None
             )
             low, high, step = int(query.minimum), int(query.maximum), max(int(query.step), 1)
             found[name] = Control(number, name, int(query.type), low, high, step, menu)
 
 
-def _menu(device: Device, query: QueryControl) -> dict[int, str]:
+def _menu(device: abi.Device, query: abi.QueryControl) -> dict[int, str]:
     found: dict[int, str] = {}
     for index in range(int(query.minimum), int(query.maximum) + 1):
-        entry = QueryMenu(id=query.id, index=index)
+        entry = abi.QueryMenu(id=query.id, index=index)
         try:
-            device.ioctl(QUERYMENU, entry)
+            device.ioctl(abi.QUERYMENU, entry)
         except OSError as error:
             if error.errno == errno.EINVAL:  # a hole
                 continue
@@ -185,17 +154,14 @@ def _menu(device: Device, query: QueryControl) -> dict[int, str]:
         number = str(int.from_bytes(label[:8], "little", signed=True))
         found[index] = (
             number
-            if query.type == V4L2_ABI.type_integer_menu
+            if query.type == abi.V4L2.type_integer_menu
             else label.split(b"\0")[0].decode("ascii", "replace")
         )
     return found
 
 
 def plain_name(name: str) -> str:
-    """Return the kernel's control name as v4l2-ctl writes it.
-
-    It is in lower case, with everything else as one underscore.
-    """
+    """The control's name as v4l2-ctl writes it: lower case, single underscores."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
@@ -206,19 +172,10 @@ def plan(
     missing: Iterable[str],
     pixels: Pixels = Pixels.COLOUR,
 ) -> tuple[Setting, ...]:
-    """Plan which settings to write, in this order, and to read back.
+    """Settings to write, in this order: automatics off, exposure, the `given` ones.
 
-    Automatics off, exposure, then the given settings.
-
-    Args:
-        camera: The camera file; its exposure is used as it is.
-        controls: What the camera has.
-        given: Control -> value, from the command line.
-        missing: Which of exposure, gain, white_balance the camera may lack.
-        pixels: What its frames are; without colours it may lack a white balance, but none that it has is left alone.
-
-    Raises:
-        CameraError: A control is unknown, out of range, or needed and not given. The text states what to write.
+    `given` is control -> value, from the command line; `missing`: which of exposure, gain, white_balance it may lack.
+    Without colours it may lack a white balance, but none that it has is left alone.
     """
     allowed = set(missing)
     if wrong := sorted(allowed - set(NEEDS)):
@@ -248,10 +205,7 @@ def plan(
 
 
 def _exposure(camera: CameraCalibration, control: Control) -> Setting:
-    """Return the exposure setting in units of 100 us, on the nearest step.
-
-    It may differ from the camera file by half a step.
-    """
+    """Exposure in units of 100 us, up to half a step from the camera file."""
     wanted = camera.exposure_us / EXPOSURE_UNIT_US
     if not control.low - 0.5 <= wanted <= control.high + 0.5:
         raise CameraError(
@@ -262,7 +216,7 @@ def _exposure(camera: CameraCalibration, control: Control) -> Setting:
 
 
 def _check_needs(controls: Mapping[str, Control], given: Mapping[str, int], allowed: set[str]) -> None:
-    """Every value that the image depends on is known, or its absence was allowed."""
+    """Refuse what the image depends on and is not known, unless it may be missing."""
     notes: list[str] = []
     for need, ways in NEEDS.items():
         have = [way for way in ways if all(name in controls for name in way)]
@@ -284,22 +238,18 @@ def _check_needs(controls: Mapping[str, Control], given: Mapping[str, int], allo
         raise CameraError("; ".join(notes))
 
 
-def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:
-    """Write all settings, in order.
-
-    Raises:
-        CameraError: The camera refuses one; the text names it and states why.
-    """
+def write(device: abi.Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:
+    """Write all settings, in order."""
     for setting in settings:
         control = controls[setting.name]
         value = control.nearest(setting.wanted[0])
         values, one = _one(control)
-        if control.type == V4L2_ABI.type_integer64:
+        if control.type == abi.V4L2.type_integer64:
             one.of.value64 = value
         else:
             one.of.value = value
         try:
-            device.ioctl(S_EXT_CTRLS, values)
+            device.ioctl(abi.S_EXT_CTRLS, values)
         except OSError as error:
             why = {
                 errno.EBUSY: "another program is using it",
@@ -311,20 +261,22 @@ def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Se
             ) from error
 
 
-def read_back(device: Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> dict[str, int]:
+def read_back(
+    device: abi.Device, controls: Mapping[str, Control], settings: Iterable[Setting]
+) -> dict[str, int]:
     """Present values of the controls of `settings`, by name."""
     found: dict[str, int] = {}
     for setting in settings:
         control = controls[setting.name]
         values, one = _one(control)
-        device.ioctl(G_EXT_CTRLS, values)
-        found[setting.name] = int(one.of.value64 if control.type == V4L2_ABI.type_integer64 else one.of.value)
+        device.ioctl(abi.G_EXT_CTRLS, values)
+        found[setting.name] = int(one.of.value64 if control.type == abi.V4L2.type_integer64 else one.of.value)
     return found
 
 
-def _one(control: Control) -> tuple[ControlValues, ControlValue]:
-    one = ControlValue(id=control.number)
-    return ControlValues(which=0, count=1, controls=c.pointer(one)), one
+def _one(control: Control) -> tuple[abi.ControlValues, abi.ControlValue]:
+    one = abi.ControlValue(id=control.number)
+    return abi.ControlValues(which=0, count=1, controls=c.pointer(one)), one
 
 
 TIMEOUT_S = 2.0
@@ -334,30 +286,18 @@ T = TypeVar("T")
 
 
 class V4l2Settings:
-    """Holds the device until `end`, its controls, and what they are to be."""
+    """Controls of the device until `end`, and what they are to be."""
 
     def __init__(
         self,
-        device: Device,
+        device: abi.Device,
         camera: CameraCalibration,
         given: Mapping[str, int],
         missing: Iterable[str],
         pixels: Pixels = Pixels.COLOUR,
     ) -> None:
-        """Write all settings, before the stream starts.
-
-        Args:
-            device: Open.
-            camera: The camera file.
-            given: Control -> value, from the command line.
-            missing: Which of exposure, gain, white_balance the camera may lack.
-            pixels: What its frames are.
-
-        Raises:
-            CameraError: A control is unknown, out of range, refused, or needed and not given.
-            OSError: The device is gone.
-        """
-        self._device: Device | None = device
+        """Write all settings, before the stream starts; arguments as of `plan`."""
+        self._device: abi.Device | None = device
         self._given, self._missing, self._pixels = given, tuple(missing), pixels
         self._controls = read_controls(device)
         self._wanted = plan(camera, self._controls, given, self._missing, pixels)
@@ -365,21 +305,10 @@ class V4l2Settings:
         write(device, self._controls, self._wanted)
 
     def __len__(self) -> int:
-        """How many settings there are."""
         return len(self._wanted)
 
     def check(self, settle: Callable[[], None]) -> None:
-        """Compare all settings once the stream runs.
-
-        A camera that fell back to its own values gets them once more.
-
-        Args:
-            settle: Lets some frames pass.
-
-        Raises:
-            CameraError: A setting differs; it is named with wanted and got.
-            OSError: The device is gone.
-        """
+        """Compare all settings once the stream runs; one that fell back is written again."""
         assert self._device is not None  # `end` comes later
         if differences(self._wanted, read_back(self._device, self._controls, self._wanted)):
             write(self._device, self._controls, self._wanted)
@@ -389,16 +318,7 @@ class V4l2Settings:
     def tune(
         self, old: CameraCalibration, new: CameraCalibration, frames: FrameObserver[tuple[int, int]]
     ) -> None:
-        """Change the exposure of the running camera; see `Tunable.tune`.
-
-        Args:
-            old: The settings it has.
-            new: Those it is to have.
-            frames: What the loop reads meanwhile.
-
-        Raises:
-            CameraError: It cannot, did not take it, or no frames are read; or `new` has another gain or white balance.
-        """
+        """Change the exposure while the loop reads `frames`; see `Tunable.tune`."""
         fixed = [FILE_KEYS["gain"], FILE_KEYS["white_balance"]]
         if changed := [key for key in fixed if getattr(new, key) != getattr(old, key)]:
             raise CameraError(
@@ -441,12 +361,8 @@ class V4l2Settings:
         demand("it", wanted, self.ask(lambda device: read_back(device, controls, wanted)), FIX)
         self._wanted = wanted
 
-    def ask(self, question: Callable[[Device], T]) -> T:
-        """What the open device answers, from any thread.
-
-        Raises:
-            CameraError: It is closed or gone, or what the question raises.
-        """
+    def ask(self, question: Callable[[abi.Device], T]) -> T:
+        """What the open device answers, from any thread."""
         with self._asking:
             if self._device is None:
                 raise CameraError("it was closed meanwhile")

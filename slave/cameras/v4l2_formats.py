@@ -1,10 +1,9 @@
-"""Image formats of a V4L2 camera.
-
-What the camera offers, which offer is chosen, and how its bytes become an image.
+"""Choose an image format of a V4L2 camera, and make images of its bytes.
 
 Uncompressed formats are preferred because JPEG moves colours at the edges of the markers; it is taken where only it
-reaches size and rate, as with most USB 2 cameras above 640x480 at 30 Hz. The size must be offered exactly and the rate
-to 1 %: a camera that rounds silently would deliver frames that were never calibrated.
+reaches size and rate, as with most USB 2 cameras above 640x480 at 30 Hz. The size must be offered exactly and the
+rate to 1 %: a camera that rounds silently would deliver frames that were never calibrated. What is not offered or not
+taken raises `CameraError`, which lists what there is.
 """
 
 import errno
@@ -18,21 +17,8 @@ import numpy as np
 from common.arrays import Image
 from common.errors import CameraError, PictureError
 from common.recording.pictures import decode
+from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma
-from slave.cameras.v4l2_abi import (
-    ENUM_FMT,
-    ENUM_FRAMEINTERVALS,
-    ENUM_FRAMESIZES,
-    S_FMT,
-    Device,
-    Format,
-    FormatDescription,
-    FrameIntervals,
-    FrameSizes,
-    fourcc,
-    fourcc_text,
-)
-from slave.cameras.v4l2_abi import V4L2 as V4L2_ABI
 
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
@@ -46,31 +32,21 @@ _WHY_NOT = {
     Pixels.LUMA: "which hold no luma",
 }
 
-EntryT = TypeVar("EntryT", FormatDescription, FrameSizes, FrameIntervals)
+EntryT = TypeVar("EntryT", abi.FormatDescription, abi.FrameSizes, abi.FrameIntervals)
 
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """One format in one size.
-
-    Attributes:
-        pixel_format: Number of the format.
-        size: Width and height [px].
-        rates_hz: Frame rates [Hz], rising; of a camera with a continuous range its ends; empty where the driver does
-            not state them.
-        continuous: Whether everything between the ends is offered, too.
-    """
+    """One format in one size."""
 
     pixel_format: int
-    size: tuple[int, int]
+    size: tuple[int, int]  # width and height [px]
+    # frame rates [Hz], rising; of a continuous range its ends; empty where the driver does not state them
     rates_hz: tuple[float, ...]
-    continuous: bool = False
+    continuous: bool = False  # whether everything between the ends is offered, too
 
     def reaches(self, rate_hz: float) -> bool:
-        """Return whether this rate [Hz] is offered.
-
-        A driver that does not list rates is assumed to reach it until it is read back.
-        """
+        """Whether this rate [Hz] is offered; a driver that lists none may reach it."""
         if not self.rates_hz:
             return True
         rate_share = 0.01  # 59.94 Hz serves 60 Hz
@@ -83,17 +59,14 @@ class Offer:
         """The offer in words."""
         join = " to " if self.continuous else ", "
         rates = join.join(f"{rate:.4g}" for rate in self.rates_hz) or "unknown"
-        return f"{fourcc_text(self.pixel_format)} {self.size[0]}x{self.size[1]} at {rates} Hz"
+        return f"{abi.fourcc_text(self.pixel_format)} {self.size[0]}x{self.size[1]} at {rates} Hz"
 
 
-def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
-    """Read all formats, sizes and rates that the camera offers.
-
-    Of a continuous range of sizes, its ends and, if within, the wanted size [px] are returned.
-    """
+def read_offers(device: abi.Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
+    """All formats, sizes and rates; of a range of sizes its ends and the wanted one."""
     offers: list[Offer] = []
     for description in _enumerate(
-        device, ENUM_FMT, lambda i: FormatDescription(index=i, type=V4L2_ABI.capture)
+        device, abi.ENUM_FMT, lambda i: abi.FormatDescription(index=i, type=abi.V4L2.capture)
     ):
         pixel_format = int(description.pixelformat)
         for size in _sizes(device, pixel_format, wanted):
@@ -104,19 +77,13 @@ def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
 def choose_offer(
     offers: Sequence[Offer], size: tuple[int, int], rate_hz: float, pixels: Pixels = Pixels.COLOUR
 ) -> Offer:
-    """Choose the best format for these pixels with this size and rate.
-
-    It must have exactly this size [px] and this rate [Hz].
-
-    Raises:
-        CameraError: There is none; the text lists what there is.
-    """
-    wanted = [fourcc(name) for name in PREFERENCE[pixels]]
+    """Choose the best format for these pixels with exactly this size [px] and rate."""
+    wanted = [abi.fourcc(name) for name in PREFERENCE[pixels]]
     able = [o for o in offers if o.pixel_format in wanted and o.size == size and o.reaches(rate_hz)]
     if not able:
         listed = "; ".join(offer.text() for offer in offers if offer.pixel_format in wanted) or "nothing"
         known = ", ".join(PREFERENCE[pixels])
-        foreign = sorted({fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in wanted})
+        foreign = sorted({abi.fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in wanted})
         unread = f" (and {', '.join(foreign)}, {_WHY_NOT[pixels]})" if foreign else ""
         raise CameraError(
             f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: "
@@ -127,30 +94,16 @@ def choose_offer(
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the bytes of a frame lie.
-
-    Attributes:
-        pixels: What is made of them.
-        name: Four letters of the format, one of `PREFERENCE[pixels]`.
-        size: Width and height [px].
-        stride: Bytes from row to row; meaningless for JPEG.
-        full_range: Whether luma is coded as 0 to 255, and not as 16 to 235.
-    """
+    """Layout of the bytes of a frame."""
 
     pixels: Pixels
-    name: str
-    size: tuple[int, int]
-    stride: int
-    full_range: bool = False
+    name: str  # four letters of the format, one of `PREFERENCE[pixels]`
+    size: tuple[int, int]  # width and height [px]
+    stride: int  # bytes from row to row; meaningless for JPEG
+    full_range: bool = False  # whether luma is coded as 0 to 255, and not as 16 to 235
 
     def image(self, data: memoryview) -> Image | None:
-        """Make a new image, BGR (H, W, 3) or grey (H, W).
-
-        None for a frame that is truncated or broken.
-
-        Raises:
-            CameraError: Its values do not lie where they should.
-        """
+        """New image, BGR (H, W, 3) or grey (H, W); None: truncated or broken."""
         if self.name in JPEG_FORMATS:
             return self._decoded(bytes(data))
         raw = np.frombuffer(data, np.uint8)
@@ -167,23 +120,18 @@ class Layout:
             return None  # the caller counts it as broken
 
 
-def set_format(device: Device, offer: Offer, pixels: Pixels) -> Layout:
-    """Set size and format, and see what the driver made of them.
-
-    Raises:
-        CameraError: Something else.
-        OSError: The driver refuses.
-    """
-    asked = Format(type=V4L2_ABI.capture)
+def set_format(device: abi.Device, offer: Offer, pixels: Pixels) -> Layout:
+    """Set size and format, and see what the driver made of them."""
+    asked = abi.Format(type=abi.V4L2.capture)
     pix = asked.fmt.pix
     pix.width, pix.height = offer.size
-    pix.pixelformat, pix.field = offer.pixel_format, V4L2_ABI.field_none
-    device.ioctl(S_FMT, asked)
-    name = fourcc_text(pix.pixelformat)
+    pix.pixelformat, pix.field = offer.pixel_format, abi.V4L2.field_none
+    device.ioctl(abi.S_FMT, asked)
+    name = abi.fourcc_text(pix.pixelformat)
     if (pix.width, pix.height, pix.pixelformat) != (*offer.size, offer.pixel_format):
         raise CameraError(f"format: wanted {offer.text()}, got {name} {pix.width}x{pix.height}")
-    of_jpeg = pix.quantization == V4L2_ABI.default_range and pix.colorspace == V4L2_ABI.colorspace_jpeg
-    full_range = of_jpeg or pix.quantization == V4L2_ABI.full_range
+    of_jpeg = pix.quantization == abi.V4L2.default_range and pix.colorspace == abi.V4L2.colorspace_jpeg
+    full_range = of_jpeg or pix.quantization == abi.V4L2.full_range
     return Layout(pixels, name, offer.size, int(pix.bytesperline), full_range)
 
 
@@ -201,7 +149,7 @@ def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows).reshape(height, width, 2), code), np.uint8)
 
 
-def _enumerate(device: Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
+def _enumerate(device: abi.Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
     """Yield the entries 0, 1, … until the driver reports that there is no more."""
     for index in range(256):  # a driver that never ends its enumeration is broken
         item = entry(index)
@@ -217,12 +165,12 @@ def _enumerate(device: Device, request: int, entry: Callable[[int], EntryT]) -> 
         yield item
 
 
-def _sizes(device: Device, pixel_format: int, wanted: tuple[int, int]) -> list[tuple[int, int]]:
+def _sizes(device: abi.Device, pixel_format: int, wanted: tuple[int, int]) -> list[tuple[int, int]]:
     found: list[tuple[int, int]] = []
     for entry in _enumerate(
-        device, ENUM_FRAMESIZES, lambda i: FrameSizes(index=i, pixel_format=pixel_format)
+        device, abi.ENUM_FRAMESIZES, lambda i: abi.FrameSizes(index=i, pixel_format=pixel_format)
     ):
-        if entry.type == V4L2_ABI.discrete:
+        if entry.type == abi.V4L2.discrete:
             found.append((int(entry.size[0]), int(entry.size[1])))
             continue
         low_w, high_w, step_w, low_h, high_h, step_h = (int(value) for value in entry.size)
@@ -236,16 +184,16 @@ def _on_grid(value: int, low: int, high: int, step: int) -> bool:
     return low <= value <= high and (value - low) % max(step, 1) == 0
 
 
-def _with_rates(device: Device, pixel_format: int, size: tuple[int, int]) -> Offer:
+def _with_rates(device: abi.Device, pixel_format: int, size: tuple[int, int]) -> Offer:
     rates: list[float] = []
     width, height = size
     for entry in _enumerate(
         device,
-        ENUM_FRAMEINTERVALS,
-        lambda i: FrameIntervals(index=i, pixel_format=pixel_format, width=width, height=height),
+        abi.ENUM_FRAMEINTERVALS,
+        lambda i: abi.FrameIntervals(index=i, pixel_format=pixel_format, width=width, height=height),
     ):
         values = [int(value) for value in entry.interval]
-        if entry.type != V4L2_ABI.discrete:
+        if entry.type != abi.V4L2.discrete:
             slowest, fastest = _rate(values[2], values[3]), _rate(values[0], values[1])
             return Offer(pixel_format, size, (slowest, fastest), continuous=True)
         rates.append(_rate(values[0], values[1]))

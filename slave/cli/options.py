@@ -1,21 +1,4 @@
-"""Define the options of the slave's commands.
-
-Define the options of `run` and `record`, and what all commands share.
-
-Options of several commands: rig, link, camera, simulated world.
-
-Options of `phalanx-slave run`.
-
-Options of `phalanx-slave record`.
-
-Define the options of the commands that set up: colours and doctor.
-
-Options of `phalanx-slave colours`.
-
-Options of `phalanx-slave doctor`.
-
-What is not passed is read from the files in /etc/phalanx.
-"""
+"""Define the options of the slave's commands; their docstrings are the help."""
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError
@@ -436,7 +419,7 @@ def colours(command: ArgumentParser) -> None:
 
 
 def click(text: str) -> tuple[str, tuple[float, float]]:
-    """A marker and a pixel (u, v) on it.
+    """A marker and a pixel (u, v) on it, from MARKER=U,V.
 
     Raises:
         ArgumentTypeError: The text is not MARKER=U,V.

@@ -1,10 +1,9 @@
 """Open the device that an option names: camera, IMU, tracker or lights.
 
-Open the device that an option names: camera, IMU, tracker or lights.
-
-None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error that
-lists what there is. A driver is imported where it is opened, so other commands start without its library. What
-simulates or replays a device is opened by its command, which knows the scene.
+None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error of the
+device's class that lists what there is. A driver is imported where it is opened, so other commands start without its
+library. What simulates or replays a device is opened by its command, which knows the scene. What is no recording is
+opened again when it was lost, until `stop` is set; `connection_lost` is called when that, or opening, takes time.
 """
 
 import argparse
@@ -34,17 +33,7 @@ REAL_CAMERAS = ("picamera2", "v4l2")
 
 
 def driver_of(option: str, value: str, forms: str, error: type[PhalanxError]) -> tuple[str, str]:
-    """Name and place of the driver that the value of an option names.
-
-    Args:
-        option: With its dashes, for the text of the error.
-        value: NAME or NAME:PLACE.
-        forms: What there is, as in `slave.drivers`: NAME, NAME:PLACE or NAME[:PLACE].
-        error: What to raise.
-
-    Raises:
-        PhalanxError: There is no such driver, or it needs a place, or takes none.
-    """
+    """Name and place of a `value` NAME[:PLACE] that must be one of the `forms`."""
     name, colon, place = value.partition(":")
     for form in forms.split(" | "):
         known, optional, _ = form.partition("[:")
@@ -66,23 +55,9 @@ def open_camera(
     wrist: bool = False,
     connection_lost: ConnectionLost = nobody,
 ) -> FrameSource | None:
-    """Open the real camera that `--camera` names.
+    """Open the real camera that `driver` names; None: it is no real one.
 
-    Args:
-        driver: The value of `--camera`.
-        options: Of the command: luma, sync, sync_timeout, control, allow_missing.
-        camera: The camera file.
-        clock: The slave's clock.
-        stop: Set when the slave is to end; until then a camera that was lost is opened again. None: losing it is an
-            error.
-        wrist: Whether it is the camera of a wrist device, whose frames are grey.
-        connection_lost: Called when it takes time to open it, now or again.
-
-    Returns:
-        The camera, or None if the driver is none of a real camera.
-
-    Raises:
-        CameraError: An option is of another driver or makes no sense, or the camera cannot be opened.
+    Losing it without `stop` is an error.
     """
     kind, _, place = driver.partition(":")
     pixels = _pixels(kind, options.luma, wrist)
@@ -124,13 +99,7 @@ def reconnecting_camera(
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
 ) -> FrameSource:
-    """Open a camera that is opened again whenever it is lost.
-
-    That lasts until `stop` is set; None: losing it is an error.
-
-    Raises:
-        CameraError: It cannot be opened the first time.
-    """
+    """Open a camera that is opened again until `stop` is set; None: loss is an error."""
     if stop is None:
         return opener(camera)
     return ReconnectingCamera(opener, camera, clock, stop, connection_lost)
@@ -144,21 +113,7 @@ def open_imu(
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
 ) -> ImuSource:
-    """Open the IMU that `--imu` names.
-
-    Until `stop` is set, it is opened again when it was lost.
-
-    Args:
-        name: The rig's IMU.
-        driver: The value of `--imu`.
-        rate_hz: Samples per second that the rig needs.
-        clock: The slave's clock.
-        stop: Set when the slave is to end.
-        connection_lost: Called when it is lost.
-
-    Raises:
-        ImuError: There is no such driver, or the IMU cannot be opened.
-    """
+    """Open the IMU that `--imu` names; `rate_hz` is what the rig needs."""
     kind, place = driver_of("--imu", driver, IMUS, ImuError)
     opener: Callable[[], ImuSource]
     if kind == "ximu3":
@@ -188,11 +143,7 @@ def imu_places() -> str:
 
 
 def orientation_of(imu: ImuCalibration) -> OrientationFilter:
-    """The filter that adds the orientation to samples.
-
-    Raises:
-        CalibrationError: The rig trusts a heading that nobody knows.
-    """
+    """The filter that adds the orientation; the rig must not trust its heading."""
     if imu.heading_sigma_rad is not None:
         raise CalibrationError(
             f"imu.heading_sigma_rad: {imu.heading_sigma_rad:g}, but an orientation from rates and forces has no "
@@ -210,22 +161,7 @@ def open_tracker(
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
 ) -> TrackerSource:
-    """Open the tracker that `--tracker` names.
-
-    One that is no recording is opened again when it was lost.
-
-    Args:
-        name: Of the device in our messages.
-        device: The value of `--tracker`.
-        serial: Which device, if there are several.
-        program: survive-cli.
-        clock: The slave's clock.
-        stop: Set when the slave is to end.
-        connection_lost: Called when it is lost.
-
-    Raises:
-        TrackerError: There is no such driver, or it cannot be opened.
-    """
+    """Open the tracker that `--tracker` names; `program` is survive-cli."""
     kind, path = driver_of("--tracker", device, TRACKERS, TrackerError)
     opener: Callable[[], TrackerSource]
     if kind == "survive" and path:
@@ -246,11 +182,7 @@ def open_tracker(
 
 
 def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProfile:
-    """The object of a rig on which the tracker `name` sits.
-
-    Raises:
-        CalibrationError: There is none; a file is missing or broken.
-    """
+    """The object of a rig on which the tracker `name` sits, or `CalibrationError`."""
     profiles = [load(calibration / "objects" / f"{one}.json", ObjectProfile) for one in rig.objects]
     for profile in profiles:
         if profile.tracker == name:
@@ -263,19 +195,7 @@ def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProf
 
 
 def choose_lights(lights: str | None, rig: RigCalibration, camera: str) -> str | None:
-    """What lights the frames of a camera.
-
-    Args:
-        lights: The value of `--lights`; None: not given.
-        rig: Whose camera it is.
-        camera: The value of `--camera`.
-
-    Returns:
-        The choice; None where the slave switches nothing, as the camera or another controller does.
-
-    Raises:
-        LightsError: Not given where it must be, given where there is nothing to light, or unknown.
-    """
+    """What lights the frames; None: the slave switches nothing."""
     kind = camera.partition(":")[0]
     if rig.kind != "wrist" or kind == "replay":
         if lights is not None:
@@ -301,11 +221,7 @@ def choose_lights(lights: str | None, rig: RigCalibration, camera: str) -> str |
 
 
 def light_limits(lights: str, rig: RigCalibration) -> StrobeCalibration:
-    """The limits within which lights are switched.
-
-    Raises:
-        LightsError: The rig file has none.
-    """
+    """The limits within which lights are switched."""
     if rig.strobe is None:
         raise LightsError(
             f"--lights {lights}: rig {rig.name!r}: strobe: missing; laser and LEDs are only switched within limits:"
@@ -315,11 +231,7 @@ def light_limits(lights: str, rig: RigCalibration) -> StrobeCalibration:
 
 
 def open_lights(lights: str, rig: RigCalibration) -> Interlock:
-    """Open real lights, dark, within the limits of the rig file.
-
-    Raises:
-        LightsError: They cannot be opened, or the rig file has no limits for them.
-    """
+    """Open real lights, dark, within the limits of the rig file."""
     strobe = light_limits(lights, rig)
     kind, place = driver_of("--lights", lights, LIGHTS, LightsError)
     if kind == "gpio":

@@ -1,20 +1,10 @@
 """Make one recording of several, or of foreign videos: `--join`, `--from`.
 
-Joining of single recordings into one.
-
-Recordings of single cameras, and of the IMU, made side by side, become one recording of all of them.
-
-Every camera is recorded by a process of its own, into a folder of its own. Cameras of one rig become a recording of
-that rig; those of several rigs, such as marker cameras and the wrist device of one hand, one of all rigs. Their times
-can be compared as they are when they are on one clock: one start of one machine. Between machines only the wall clocks
-relate the clocks to each other, as well as something (NTP, PTP) keeps those together; so that is done only on
-request.
-
-`phalanx-slave record --join`: one recording of several cameras.
-
-`phalanx-slave record --from`: recording from videos or pictures.
-
-They were made by other programs.
+Every camera, and the IMU, is recorded by a process of its own, into a folder of its own. Cameras of one rig become a
+recording of that rig; those of several rigs, such as marker cameras and the wrist device of one hand, one of all
+rigs. Times can be compared as they are when they are on one clock: one start of one machine. Between machines only
+the wall clocks relate the clocks to each other, as well as NTP or PTP keeps those together; so that is done only on
+request. What is broken or does not belong together raises `RecordingError`, which names file and key.
 """
 
 import argparse
@@ -50,18 +40,10 @@ def join_recordings(
     by_wall_clock: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
-    """Write one recording of all; return camera -> number of frames.
+    """Write one recording of all `folders`; return camera -> number of frames.
 
-    Times are on the clock of the first. The file of a camera is that of the recording which has its frames.
-
-    Args:
-        folders: Recordings of one rig or of several, each with frames of other cameras.
-        output: New or empty folder.
-        by_wall_clock: Trust the wall clocks where the clocks differ.
-        progress: Called with frames done and frames in all.
-
-    Raises:
-        RecordingError: One is broken, they do not belong together, or there is no room; the text names file and key.
+    Times are on the clock of the first; the file of a camera is that of the recording which has its frames.
+    `by_wall_clock` trusts the wall clocks where the clocks differ; `progress` is called with frames done and in all.
     """
     refuse_occupied(output)
     parts = [open_recording(folder) for folder in folders]
@@ -94,10 +76,7 @@ def join_recordings(
 
 
 def _manifest(parts: Sequence[FrameRecording]) -> tuple[Manifest, dict[str, FrameRecording]]:
-    """Build the manifest of the joined recording.
-
-    Also returns which part has the frames of each camera.
-    """
+    """Manifest of the joined recording, and the part that has each camera's frames."""
     owners = _owners(parts)
     cameras = {name: file for part in reversed(parts) for name, file in part.manifest.cameras.items()}
     names = dict.fromkeys(name for part in parts for name in part.manifest.cameras)
@@ -125,10 +104,7 @@ def _rigs(part: FrameRecording) -> dict[str, RigCalibration]:
 
 
 def _imu(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> tuple[ImuSample, ...]:
-    """Return the samples of the one part that has an IMU.
-
-    They are on the clock of the first part; none where no part has an IMU.
-    """
+    """Samples of the one part that has an IMU, if any, on the clock of the first."""
     both = zip(parts, shifts_ns, strict=True)
     having = [(part.folder, shift_ns) for part, shift_ns in both if (part.folder / IMU).exists()]
     if len(having) > 1:
@@ -197,7 +173,6 @@ def _differ(first: FrameRecording, other: FrameRecording, key: str) -> Recording
 
 
 def _owners(parts: Sequence[FrameRecording]) -> dict[str, FrameRecording]:
-    """Camera -> the recording with its frames."""
     owners: dict[str, FrameRecording] = {}
     for part in parts:
         for camera in sorted({row.camera for row in part.rows}):
@@ -259,11 +234,7 @@ def _check_space(output: Path, files: Sequence[Path]) -> None:
 
 
 def join(options: argparse.Namespace) -> int:
-    """Join them.
-
-    Raises:
-        RecordingError: One is broken, or they do not belong together.
-    """
+    """Run `record --join`."""
 
     def progress(done: int, total: int) -> None:
         every = 500  # frames, between two lines that report the progress
@@ -276,12 +247,7 @@ def join(options: argparse.Namespace) -> int:
 
 
 def import_foreign(options: argparse.Namespace) -> int:
-    """Import them.
-
-    Raises:
-        PhalanxError: A file is missing, broken, of no camera or of another size than was calibrated.
-    """
-    from common.errors import RecordingError
+    """Run `record --from`."""
     from slave.foreign.importing import Wish, import_pictures
 
     paths: list[Path] = []
@@ -301,10 +267,7 @@ def import_foreign(options: argparse.Namespace) -> int:
 
 
 def camera_path(text: str) -> tuple[str | None, Path]:
-    """Split an argument into an optional camera and its video or folder.
-
-    A path with `=` in it counts as a path if it exists.
-    """
+    """Split [NAME=]PATH; a path with `=` in it counts as a path if it exists."""
     name, equals, path = text.partition("=")
     if Path(text).exists() or not (name and equals and path):
         return None, Path(text)

@@ -1,14 +1,8 @@
 """Detect in whole recordings, and calibrate marker colours from them.
 
-Offline detection of a whole recording, into one file per camera.
-
-Deterministic, without clock or network.
-
-`phalanx-slave run -o`: detections of a recorded camera.
-
-The output has the same bytes on every run.
-
-`phalanx-slave colours`: marker colours of a camera from a recording.
+`phalanx-slave run -o` writes one file per camera with the same bytes on every run, without clock or network;
+`phalanx-slave colours` writes a camera file. A recording or file that is missing, broken or cannot be written raises
+`RecordingError` or `CalibrationError`.
 """
 
 import argparse
@@ -27,12 +21,13 @@ from common.arrays import Float, Int
 from common.calibration import CameraCalibration, HandProfile, load, save
 from common.command_line import UsageError, echo, remark
 from common.errors import CalibrationError, RecordingError
-from common.recording.frame_recording import FrameRecording, open_recording
+from common.recording.frame_recording import MANIFEST, FrameRecording, load_manifest, open_recording
 from common.recording.pictures import FramePictures
 from common.recording.recorded_files import write_npz
+from slave.cameras.replay import is_grey
 from slave.markers.autocolour import by_clicks, by_hand, by_hues, calibrate_moving, checked, frames_for
 from slave.markers.autocolour_things import spread
-from slave.markers.colours import ColourRow, calibrate
+from slave.markers.colours import ColourRow, calibrate, report
 from slave.markers.reloadable import detector_for, plain_of
 from slave.markers.white_balance import Inline
 from slave.wrist.offline import RecordedWristDetections
@@ -65,14 +60,7 @@ class RecordedDetections:
 
 
 def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
-    """Return the camera of a recording.
-
-    Geometry and timing are from the recording, colours from `calibration` if given.
-
-    Raises:
-        RecordingError: The recording has no such camera.
-        CalibrationError: DIR/cameras/NAME.json is broken, or there are no marker colours anywhere.
-    """
+    """The camera of a recording, with the colours of `calibration` if given."""
     recording.frames_of(camera)  # refuses an unknown name
     own = recording.manifest.cameras[camera]
     if calibration is not None:
@@ -94,7 +82,6 @@ def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) 
 
 
 def _clicks(recording: FrameRecording) -> str:
-    """The options of `colours` that name a pixel of each marker."""
     return " ".join(f"--click {name}=U,V" for name in recording.manifest.marker_rig().markers)
 
 
@@ -109,19 +96,9 @@ def detect_recording(
 ) -> RecordedDetections:
     """Detect the markers in every frame of one camera.
 
-    The colours follow the light where the camera has references.
-
-    Args:
-        folder: Recording.
-        camera: Camera name.
-        calibration: calib_json tree whose cameras/<camera>.json holds the marker colours.
-        progress: Called with frames done and frames in all.
-        tags: Is given every frame, too.
-        windows_only: Scan windows where markers are expected, as `MarkerDetector`.
-
-    Raises:
-        RecordingError: The recording or a frame is broken, or it has no such camera or no frame of it.
-        CalibrationError: No marker colours.
+    The colours, of the calib_json tree `calibration` or the recording's, follow the light where the camera has
+    references. `progress` is called with frames done and in all; `tags` is given every frame, too; `windows_only` as
+    `MarkerDetector`.
     """
     recording = open_recording(folder)
     rows = recording.frames_of(camera)
@@ -163,9 +140,7 @@ def calibrate_colours(
     hand: Path | None = None,
     notify: Callable[[str], None] = lambda _text: None,
 ) -> list[ColourRow]:
-    """Make the colour ranges of one camera from a recording.
-
-    Writes its camera file.
+    """Make the colour ranges of one camera from a recording; write its camera file.
 
     With clicks, from the clicked colours of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
     from what moves with the hand in all frames.
@@ -231,13 +206,7 @@ def calibrate_colours(
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder a result goes to.
-
-    A new calibration tree begins with its first file.
-
-    Raises:
-        RecordingError: It cannot be made.
-    """
+    """Make the folder of a result: a new calibration tree begins with its first file."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -245,12 +214,7 @@ def make_folder(folder: Path) -> None:
 
 
 def tag_collector(folder: Path, camera: str, calibration: Path | None) -> "TagCollector | None":
-    """What finds the tags of a recording's objects; None: none of them has any.
-
-    Raises:
-        RecordingError: The recording is broken or has no such camera.
-        CalibrationError: An object's file is broken or missing.
-    """
+    """What finds the tags of a recording's objects; None: none of them has any."""
     recording = open_recording(folder)
     manifest = recording.manifest
     recording.frames_of(camera)  # refuses an unknown name
@@ -264,13 +228,7 @@ def tag_collector(folder: Path, camera: str, calibration: Path | None) -> "TagCo
 
 
 def save_detections(path: Path, found: "RecordedDetections | RecordedWristDetections | RecordedTags") -> None:
-    """Write detections_<camera>.npz, or tags_<camera>.npz.
-
-    Equal content gives equal bytes.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
+    """Write detections_<camera>.npz or tags_<camera>.npz; equal content, equal bytes."""
     make_folder(path.parent)
     try:
         write_npz(path, {name: getattr(found, name) for name in found.__slots__})
@@ -279,15 +237,11 @@ def save_detections(path: Path, found: "RecordedDetections | RecordedWristDetect
 
 
 def detect(options: argparse.Namespace) -> int:
-    """Detect markers, or fingers before a wrist device, in every frame.
-
-    Raises:
-        PhalanxError: The recording or a file of calib_json is missing or broken, or an option makes no sense for it.
-    """
-    from common.recording.frame_recording import load_manifest
-    from slave.cameras.replay import is_grey
-
-    camera, recording = _source(options)
+    """Run `run -o`: detect markers, or fingers before a wrist device, in every frame."""
+    kind, _, folder = str(options.camera).partition(":")
+    if kind != "replay" or not folder:
+        raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
+    camera, recording, calibration = str(options.name), Path(folder), options.calibration
 
     def progress(done: int, total: int) -> None:
         every = 500  # frames, between two lines that report the progress
@@ -297,59 +251,25 @@ def detect(options: argparse.Namespace) -> int:
     if is_grey(load_manifest(recording), camera):
         if options.scan == "windows":
             raise CalibrationError(f"--scan: camera {camera!r} sees no markers")
-        _detect_fingers(options, recording, progress)
+        from slave.wrist.offline import detect_wrist_recording
+
+        done = detect_wrist_recording(recording, camera, calibration, options.hand, progress)
+        remark(f"{camera}: {done.summary()}")
+        save_detections(options.output, done.detections)
         return 0
     if options.hand is not None:
         raise CalibrationError(f"--hand: camera {camera!r} sees markers; only a wrist camera knows a hand")
-    _detect_markers(options, recording, progress)
+    tags = tag_collector(recording, camera, calibration)
+    windows = options.scan == "windows"
+    found = detect_recording(recording, camera, calibration, progress, tags, windows_only=windows)
+    save_detections(options.output, found)
+    if tags is not None:
+        save_detections(options.output.parent / f"tags_{camera}.npz", tags.all())
     return 0
 
 
-def _source(options: argparse.Namespace) -> tuple[str, Path]:
-    """Camera and recording.
-
-    Raises:
-        UsageError: They are not named.
-    """
-    kind, _, folder = str(options.camera).partition(":")
-    if kind != "replay" or not folder:
-        raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
-    return str(options.name), Path(folder)
-
-
-def _detect_markers(
-    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
-) -> None:
-    pass
-
-    tags = tag_collector(recording, options.name, options.calibration)
-    windows = options.scan == "windows"
-    found = detect_recording(
-        recording, options.name, options.calibration, progress, tags, windows_only=windows
-    )
-    save_detections(options.output, found)
-    if tags is not None:
-        save_detections(options.output.parent / f"tags_{options.name}.npz", tags.all())
-
-
-def _detect_fingers(
-    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
-) -> None:
-    from slave.wrist.offline import detect_wrist_recording
-
-    done = detect_wrist_recording(recording, options.name, options.calibration, options.hand, progress)
-    remark(f"{options.name}: {done.summary()}")
-    save_detections(options.output, done.detections)
-
-
 def run(options: argparse.Namespace) -> int:
-    """Find the colours, write the camera file and print which colours collide.
-
-    Raises:
-        PhalanxError: The recording or a file is missing or broken, or the colours cannot be distinguished.
-    """
-    from slave.markers.colours import report
-
+    """Run `colours`: write the camera file and print which colours collide."""
     cv2.setNumThreads(1)
     with _recording(options) as folder:
         table = calibrate_colours(
@@ -368,13 +288,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _recording(options: argparse.Namespace) -> Generator[Path]:
-    """The recording; of a video or pictures one that lasts as long as it is needed.
-
-    Raises:
-        PhalanxError: They cannot be read, or are not those of the camera.
-    """
-    from common.errors import RecordingError
-    from common.recording.frame_recording import MANIFEST
+    """The recording; of a video or pictures one that lasts as long as it is needed."""
     from slave.foreign.importing import Wish, import_pictures
 
     if (options.recording / MANIFEST).is_file():

@@ -1,10 +1,6 @@
-"""Open what the options of several commands name: files, clocks, camera.
+"""Open what the options of several commands name: files, clocks, keys, camera.
 
-What the options of several commands name: files of calib_json, clocks, keys.
-
-Opening of the camera of `run` and `record`.
-
-The lights of a wrist device are opened with it.
+A file, key or device that is not as it must be raises the `PhalanxError` of its kind.
 """
 
 import argparse
@@ -33,20 +29,12 @@ USUAL_TREE = Path("calib_json")
 
 
 def rig_of(options: argparse.Namespace, typical: str = USUAL_RIG) -> RigCalibration:
-    """The rig; `typical` if none is named.
-
-    Raises:
-        CalibrationError: Its file is missing or broken.
-    """
+    """The rig; `typical` if none is named."""
     return load(rig_path(options, typical), RigCalibration)
 
 
 def camera_of(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibration]:
-    """The rig, and the camera of this slave.
-
-    Raises:
-        CalibrationError: It is none of the rig, or a file is missing or broken.
-    """
+    """The rig, and the camera of this slave."""
     rig = rig_of(options)
     if options.name not in rig.cameras:
         raise CalibrationError(
@@ -56,11 +44,7 @@ def camera_of(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibr
 
 
 def objects_of(options: argparse.Namespace, rig: RigCalibration) -> dict[str, ObjectProfile]:
-    """The objects of the rig, by name.
-
-    Raises:
-        CalibrationError: A file is missing or broken.
-    """
+    """The objects of the rig, by name."""
     return {name: load(tree_of(options) / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects}
 
 
@@ -80,11 +64,7 @@ def camera_path(options: argparse.Namespace, camera: str) -> Path:
 
 
 def world_of(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, RigCalibration]:
-    """Return folder and rig of the files that describe the simulated world.
-
-    Raises:
-        CalibrationError: As `slave.commands.simulated.world_of`.
-    """
+    """Folder and rig of the simulated world; see `slave.commands.simulated.world_of`."""
     from slave.commands.simulated import world_of as world
 
     return world(tree_of(options), rig, options.truth, options.truth_rig)
@@ -101,20 +81,13 @@ def clock_of(options: argparse.Namespace, true_clock: Clock) -> SkewedClock:
 
 
 def skew_of(options: argparse.Namespace, true_clock: Clock) -> str:
-    """Describe how the slave's clock differs from the machine's.
-
-    It is for whoever compares two recordings; empty if there is no difference.
-    """
+    """How the slave's clock differs from the machine's, to compare recordings by."""
     skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
     return skewed + (f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else "")
 
 
 def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
-    """What this device seals its datagrams by, and how it comes to the bus.
-
-    Raises:
-        PhalanxError: There is no rig key, or the keys folder has no certificate or no secret of this device.
-    """
+    """What this device seals its datagrams by, and how it comes to the bus."""
     from common.bus.keys import access_of, link_key
 
     access = access_of(os.environ, options.name, options.keys, options.open)
@@ -132,25 +105,7 @@ def open_lit(
     stop: threading.Event | None = None,
     connection_lost: ConnectionLost = nobody,
 ) -> FrameSource:
-    """Open the camera, and the lights of a wrist device.
-
-    The lights are dark before the camera is opened.
-
-    Args:
-        options: Of `run` or `record`.
-        rig: Whose camera it is.
-        camera: The camera file.
-        clock: The slave's clock.
-        true_clock: What the simulated world goes by.
-        stop: Set when the slave is to end; until then a camera that is lost is opened again. None: losing it is an
-            error.
-        away: Called when it takes time to open it, now or again.
-
-    Raises:
-        CameraError: There is no such driver, or the camera cannot be opened.
-        LightsError: The lights are not given, do not fit, or cannot be opened.
-        CalibrationError: A file of the simulated world is missing or broken.
-    """
+    """Open the camera, and before it, dark, the lights of a wrist device."""
     lights = devices.choose_lights(options.lights, rig, str(options.camera))
     if lights is None or (
         lights == devices.SYNTHETIC and options.scene == "board"
@@ -199,22 +154,9 @@ def _open(
         from slave.cameras.replay import ReplayCamera
 
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
-    if kind == "synthetic" and not folder:
-        return _open_synthetic(options, rig, camera, clock, true_clock, stop, connection_lost, lights)
-    raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
-
-
-def _open_synthetic(
-    options: argparse.Namespace,
-    rig: RigCalibration,
-    camera: CameraCalibration,
-    clock: Clock,
-    true_clock: Clock,
-    stop: threading.Event | None,
-    connection_lost: ConnectionLost,
-    lights: "SimulatedStrobe | None",
-) -> FrameSource:
-    from slave.cameras.synthetic import SyntheticCamera
+    if kind != "synthetic" or folder:
+        raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
+    from slave.cameras.synthetic import FaultyCamera, Frozen, SyntheticCamera
     from slave.commands.simulated import FrameClock, scene_of
 
     scene = scene_of(*world_of(options, rig), options.scene, options.seed)
@@ -230,10 +172,7 @@ def _open_synthetic(
 
     if getattr(options, "faults", None) is None:
         return draw(camera)
-    from slave.cameras.synthetic import FaultyCamera, Frozen
-
     frozen = Frozen()
-
     return devices.reconnecting_camera(
         lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
         camera,

@@ -1,6 +1,6 @@
-"""`phalanx-slave record`: raw frames of a camera to disk.
+"""Run `phalanx-slave record`: raw frames of a camera, or existing data, to disk.
 
-An IMU may be recorded beside it; or a recording is made of existing data.
+A file, device or disk that is not as it must be, or no frame, raises its `PhalanxError`.
 """
 
 import argparse
@@ -32,11 +32,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """Recorded scene and its clocks.
-
-    The clocks are the slave's, and that of the simulated world.
-    """
-
     rig: RigCalibration
     camera: CameraCalibration
     clock: SkewedClock
@@ -44,12 +39,7 @@ class _Scene:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Record a camera, or make a recording of what is there already.
-
-    Raises:
-        UsageError: The folder or the name is missing.
-        PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
-    """
+    """Record a camera, or make a recording of what is there already."""
     if options.imu_csv is not None:
         return import_table_of_imu(options)
     if options.output is None:
@@ -65,11 +55,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def record_camera(options: argparse.Namespace) -> int:
-    """Record until the length is reached or until stopped.
-
-    Raises:
-        PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
-    """
+    """Record until the length is reached or until stopped; raises as `run`."""
     from common.recording.frame_writing import refuse_occupied
     from slave.commands.simulated import add_imu, imu_of
 
@@ -131,10 +117,7 @@ def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
 def _record(
     options: argparse.Namespace, scene: _Scene, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
 ) -> "tuple[Progress, PhalanxError | None]":
-    """Record the camera to its end.
-
-    Returns how much was recorded, and the error that ended it early, if any.
-    """
+    """Record to the end; how much, and the error that ended it early, if any."""
     from slave.recorder import Length, ProgressDisplay, Recorder, feed
 
     display = ProgressDisplay(options.name, sys.stderr)
@@ -165,7 +148,6 @@ def _record(
 
 @contextmanager
 def _imu_recorder(options: argparse.Namespace, scene: _Scene) -> "Generator[ImuRecorder | None, None, None]":
-    """A real IMU of the rig that is recorded with a camera, if one is asked for."""
     if options.imu is None or options.imu == "synthetic":
         yield None
         return

@@ -1,15 +1,7 @@
 """Run `phalanx-slave run`: detect or measure live, and send.
 
-`phalanx-slave run --imu` and `record --imu-csv`.
-
-The first sends what an IMU measures, the second imports a table of IMU samples.
-
-`phalanx-slave run --tracker`: sends where a tracker on an object is.
-
-`phalanx-slave run`: detect and send in real time.
-
-It detects markers, or fingers before a wrist device, and sends where they are; or it sends the data of another
-sensor.
+A camera, an IMU or a tracker; also `record --imu-csv`, which imports a table of IMU samples. A file, key, device or
+network that is not as it must be raises its `PhalanxError`.
 """
 
 import argparse
@@ -46,7 +38,10 @@ from slave.service import COMPILE_S, ConnectionLost, Service, stop_by_signal, st
 from slave.sources import TrackerSource
 
 if TYPE_CHECKING:
+    from common.bus.keys import Access
+    from common.link.datagram import LinkKey
     from slave.raw import RawSettings
+    from slave.sender import Sender
     from slave.sources import ImuSource
     from slave.tuning import CameraFiles
 
@@ -54,14 +49,9 @@ USUAL_NAME = "imu"
 
 
 def send_imu(options: argparse.Namespace) -> int:
-    """Send samples until stopped.
-
-    Raises:
-        PhalanxError: A file, the IMU, a key or the network is not as it must be.
-    """
+    """Send samples until stopped."""
     from slave.commands.simulated import SyntheticSensor, imu_of
-    from slave.sender import Sender, send_samples
-    from slave.uplink import Uplink
+    from slave.sender import send_samples
 
     rig = rig_of(options)
     if options.name is None:
@@ -73,10 +63,6 @@ def send_imu(options: argparse.Namespace) -> int:
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
-
-    def print_line(line: str) -> None:
-        echo(f"{options.name}: {line}")
-
     service = Service(os.environ, noun="samples")
     with stop_by_signal() as stop:
         if options.imu == "synthetic":
@@ -87,18 +73,12 @@ def send_imu(options: argparse.Namespace) -> int:
             source = devices.open_imu(
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
             )
-        uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
-        send_samples(sender, source, orientation)
+        send_samples(_sender(options, key, clock, stop, service, access), source, orientation)
     return 0
 
 
 def import_table_of_imu(options: argparse.Namespace) -> int:
-    """Notify what is in the table of an IMU, and write imu.csv if a folder is given.
-
-    Raises:
-        PhalanxError: It is missing or broken.
-    """
+    """Report what is in the table of an IMU, and write imu.csv if a folder is given."""
     from common.imu.csv_table import read_csv
     from slave.imu.recording import import_table
 
@@ -109,34 +89,23 @@ def import_table_of_imu(options: argparse.Namespace) -> int:
 
 
 def send_tracker(options: argparse.Namespace) -> int:
-    """Send poses until stopped.
-
-    Raises:
-        PhalanxError: A file, the tracker, a key or the network is not as it must be.
-    """
-    from slave.sender import Sender, send_poses
-    from slave.uplink import Uplink
+    """Send poses until stopped."""
+    from slave.sender import send_poses
 
     rig = rig_of(options)
     profile = devices.object_with(tree_of(options), rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
-
-    def print_line(line: str) -> None:
-        echo(f"{options.name}: {line}")
-
     service = Service(os.environ, noun="poses")
     with stop_by_signal() as stop:
         source = _open(options, rig, profile, clock, true_clock, stop, service.connection_lost)
         try:
-            uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+            sender = _sender(options, key, clock, stop, service, access)
         except PhalanxError:
             source.close()
             raise
-        recorded = options.tracker.startswith("survive:")
-        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
-        send_poses(sender, source, recorded)
+        send_poses(sender, source, recorded=options.tracker.startswith("survive:"))
     return 0
 
 
@@ -160,23 +129,14 @@ def _open(
 
 
 def run(options: argparse.Namespace) -> int:
-    """Send what a camera, an IMU or a tracker measures; or detect in a recording.
-
-    Raises:
-        UsageError: The name is missing, or an option is of another sensor.
-        PhalanxError: A file, the device, its lights, a key or the network is not as it must be.
-    """
+    """Send what a camera, an IMU or a tracker measures; or detect in a recording."""
     if options.output is not None and options.camera is None:
         raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
     if options.imu is not None:
-        pass
-
         return send_imu(options)
     if options.name is None:
         raise UsageError("say which camera or tracker of the rig this is: --name NAME")
     if options.tracker is not None:
-        pass
-
         return send_tracker(options)
     cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
     if options.output is not None:
@@ -189,16 +149,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def send_camera(options: argparse.Namespace) -> int:
-    """Detect and send until stopped.
-
-    Raises:
-        PhalanxError: A file, the camera, its lights, a key or the network is not as it must be.
-    """
-    # Imported here: to detect in a recording needs neither sockets nor zenoh, and starts twice as fast.
+    """Detect and send until stopped."""
     from slave.live import send_detections
     from slave.markers import engine as marker_engine
-    from slave.sender import Sender
-    from slave.uplink import Uplink
     from slave.wrist import engine as wrist_engine
 
     stop, service = stop_on_signals(), Service(os.environ)
@@ -211,18 +164,30 @@ def send_camera(options: argparse.Namespace) -> int:
     raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if files.rig.kind == "wrist" else marker_engine).engine_named(options.engine)
     source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.connection_lost)
-    uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-
-    def print_line(line: str) -> None:
-        echo(f"{options.name}: {line}")
-
-    sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+    sender = _sender(options, key, clock, stop, service, access)
     send_detections(sender, files, source, options.colours, options.scan, engine, raw)
     return 0
 
 
+def _sender(
+    options: argparse.Namespace,
+    key: "LinkKey",
+    clock: Clock,
+    stop: threading.Event,
+    service: Service,
+    access: "Access",
+) -> "Sender":
+    # Imported here: to detect in a recording needs neither sockets nor zenoh, and starts twice as fast.
+    from slave.sender import Sender
+    from slave.uplink import Uplink
+
+    uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+    return Sender(
+        options.name, uplink, clock, stop, lambda line: echo(f"{options.name}: {line}"), service, access
+    )
+
+
 def _files(options: argparse.Namespace) -> "CameraFiles":
-    """The files that are followed while it runs."""
     from slave.tuning import CameraFiles
 
     rig, camera = camera_of(options)

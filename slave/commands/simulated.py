@@ -1,10 +1,8 @@
 """Simulate sensors: the scene of a camera, the IMU on a hand, a tracker.
 
-Simulate sensors: the scene of a camera, the IMU on a hand, a tracker.
-
-A simulated IMU or tracker is the first-class stand-in for hardware. It measures item k when its own oscillator, which
-is the slave's (perhaps skewed) clock, is at `epoch + k periods`, and emits it then. A process too slow for its rate
-leaves items out, seen as gaps in `seq`, and never works off a backlog.
+A simulated IMU or tracker measures item k when its own oscillator, which is the slave's (perhaps skewed) clock, is at
+`epoch + k periods`, and emits it then. A process too slow for its rate leaves items out, seen as gaps in `seq`, and
+never works off a backlog. A scene that has no such sensor raises the `PhalanxError` of its kind.
 """
 
 import threading
@@ -34,13 +32,9 @@ TRACKER_HZ = 100.0  # poses per second of the simulated tracker
 
 
 class FrameClock:
-    """The time of a scene that goes on only where somebody sleeps in it.
-
-    Holds the time.
-    """
+    """The time of a scene that goes on only where somebody sleeps in it."""
 
     def __init__(self, start_ns: int) -> None:
-        """Begin at a time [ns]."""
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
@@ -53,10 +47,7 @@ class FrameClock:
 
 
 class SyntheticSensor(Generic[ItemT]):
-    """A `Source` that measures the scene of the synthetic cameras.
-
-    Holds the number of the next item.
-    """
+    """A `Source` that measures the scene of the synthetic cameras."""
 
     def __init__(
         self,
@@ -66,15 +57,7 @@ class SyntheticSensor(Generic[ItemT]):
         clock: SkewedClock,
         stop: threading.Event,
     ) -> None:
-        """Get ready. The sensor may join at any time: `seq` counts from the epoch.
-
-        Args:
-            measure: Item by number, at a time of the scene [s], and with a stamp [ns].
-            rate_hz: Items per second.
-            epoch_ns: Scene time 0, on the true clock [ns].
-            clock: The slave's clock; stamps are on it, and its rate is that of the items.
-            stop: Ends the stream, also while an item is waited for.
-        """
+        """Measure items by number, time of the scene [s] and stamp [ns] from the epoch."""
         self._measure, self._rate_hz = measure, rate_hz
         self._epoch_ns, self._clock, self._stop = epoch_ns, clock, stop
         self._first_ns = clock.from_true(epoch_ns)
@@ -82,10 +65,7 @@ class SyntheticSensor(Generic[ItemT]):
         self._started = self._closed = False
 
     def read(self) -> ItemT | None:
-        """Measure the next item and wait until it is due.
-
-        None once closed or stopped.
-        """
+        """Measure the next item and wait until it is due; None once closed or stopped."""
         seq = self._due_next()
         t_ns = self._measured_ns(seq)
         item = self._measure(seq, (self._clock.to_true(t_ns) - self._epoch_ns) * 1e-9, t_ns)
@@ -101,10 +81,7 @@ class SyntheticSensor(Generic[ItemT]):
         self._closed = True
 
     def _due_next(self) -> int:
-        """Number of the next item.
-
-        That after the last, or the first to come where that is half a period late.
-        """
+        """The item after the last, or the first to come where that is half a period late."""
         late_ns = self._clock.now_ns() - self._measured_ns(self._next)
         period_ns = 1e9 / self._rate_hz
         if late_ns <= (0.5 * period_ns if self._started else 0.0):
@@ -121,11 +98,8 @@ def world_of(
 ) -> tuple[Path, RigCalibration]:
     """Folder and rig of the simulated world: the slave's own, unless given.
 
-    Args:
-        assumed: The calib_json tree of the slave.
-        rig: Its rig, of which places and lenses may be unknown.
-        truth: Another tree, which knows them; None: the slave's own tree is the truth.
-        name: The rig there; None: the one of the same name.
+    Places and lenses of the slave's own rig may be unknown; the tree `truth` and its rig `name`, else of the same
+    name, know them.
 
     Raises:
         CalibrationError: That rig is of another kind, lacks cameras, or one of its files is missing or broken.
@@ -149,11 +123,7 @@ def world_of(
 
 
 def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:
-    """The scene `name` before a rig's cameras, from files of a calib_json tree.
-
-    Raises:
-        PhalanxError: As `view_by_name`; a file is missing or broken.
-    """
+    """The scene `name` before a rig's cameras, from files of a calib_json tree."""
     hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
     cameras = {n: load(calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras}
     objects = {n: load(calibration / "objects" / f"{n}.json", ObjectProfile) for n in rig.objects}
@@ -161,12 +131,7 @@ def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Sc
 
 
 def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed: int) -> SimulatedImu:
-    """The IMU on the hand that a camera, by its driver, sees in a scene.
-
-    Raises:
-        CameraError: The camera is not synthetic, or there is no hand before it.
-        PhalanxError: As `scene_of`, and `SimulatedImu.of`.
-    """
+    """The IMU on the hand that a camera, by its driver, sees in a scene."""
     scene = scene_of(calibration, rig, name, seed) if camera == "synthetic" else None
     if not isinstance(scene, Scene | WristScene):
         raise CameraError(
@@ -178,12 +143,7 @@ def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed:
 def tracker_of(
     calibration: Path, rig: RigCalibration, name: str, seed: int, profile: ObjectProfile
 ) -> SimulatedTracker:
-    """The tracker on an object that synthetic cameras see in the scene `name`.
-
-    Raises:
-        TrackerError: There is no object in that scene.
-        PhalanxError: As `scene_of`, and `SimulatedTracker.of`.
-    """
+    """The tracker on an object that synthetic cameras see in the scene `name`."""
     scene = scene_of(calibration, rig, name, seed)
     if not isinstance(scene, Scene):
         raise TrackerError(f"--scene {name}: there is no object in it that a tracker could sit on")
@@ -191,10 +151,7 @@ def tracker_of(
 
 
 def poses_of(name: str, tracker: SimulatedTracker) -> Callable[[int, float, int], TrackerPose]:
-    """What a `SyntheticSensor` measures of a tracker; NaN where it is lost.
-
-    Our messages call it `name`.
-    """
+    """What a `SyntheticSensor` measures of tracker `name`; NaN where it is lost."""
 
     def measure(seq: int, t_s: float, t_ns: int) -> TrackerPose:
         pose = tracker.pose(t_s)
@@ -206,13 +163,7 @@ def poses_of(name: str, tracker: SimulatedTracker) -> Callable[[int, float, int]
 
 
 def add_imu(folder: Path, imu: SimulatedImu, epoch_ns: int, clock: SkewedClock) -> None:
-    """Write into a recording what the IMU measured meanwhile.
-
-    It is on the clock of the frames; scene time 0 is at `epoch_ns`.
-
-    Raises:
-        RecordingError: The recording is broken, or the file cannot be written.
-    """
+    """Add what the IMU measured meanwhile; scene time 0 is at `epoch_ns`."""
     taken_s = [(clock.to_true(row.t_ns) - epoch_ns) * 1e-9 for row in open_recording(folder).rows]
     samples = imu.around(min(taken_s), max(taken_s), epoch_ns)
     write_imu(folder, (replace(one, t_ns=clock.from_true(one.t_ns)) for one in samples))

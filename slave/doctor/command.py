@@ -1,15 +1,4 @@
-"""Run `phalanx-slave doctor`: every check of each slave, or test of its lights.
-
-The budget of a strobe as text, and a test of its lights without a camera.
-
-This is what `doctor --lights` prints and does.
-
-`phalanx-slave doctor --lights`: limits and test of a rig's lights.
-
-It shows what laser and LEDs may do, and tests them.
-
-`phalanx-slave doctor`: which slaves this machine has, and every check of each.
-"""
+"""Run `phalanx-slave doctor`: every check of each slave, or test of its lights."""
 
 import argparse
 import shlex
@@ -25,7 +14,7 @@ from common.errors import LightsError
 from common.machine import program
 from common.recording.frame_recording import Illumination
 from slave.cli.table import PROGRAM
-from slave.commands.devices import open_lights
+from slave.commands.devices import imu_places, open_lights
 from slave.commands.options import camera_path, rig_of
 from slave.doctor.devices import cameras_of, check_camera, check_devices, check_groups
 from slave.doctor.host import (
@@ -53,11 +42,7 @@ SHOWN = {"J": (1e6, "uJ"), "W": (1e3, "mW"), "W/m2/sr": (1e-3, "kW/m2/sr")}
 
 
 def budget(rig: RigCalibration, camera: CameraCalibration) -> str:
-    """Pulse, duty, power and every limit with its share, as lines.
-
-    Raises:
-        CalibrationError: The rig file has no strobe, or the exposure of the camera's file leaves no room for its light.
-    """
+    """Pulse, duty, power and every limit with its share, as lines."""
     check_pulses(rig, camera)
     strobe, laser = rig.strobe, rig.laser
     assert strobe is not None
@@ -92,13 +77,7 @@ def blink(
     stop: threading.Event,
     seconds: float,
 ) -> int:
-    """Switch laser and LEDs in turn and return the number of pulses.
-
-    They are switched as before a camera of that rate, through the guard.
-
-    Raises:
-        LightsError: The lights fail.
-    """
+    """Switch laser and LEDs in turn, as before the camera; the number of pulses."""
     clock = SystemClock()
     length_ns = schedule_of(rig, camera).length_ns
     period_ns = round(1e9 / camera.frame_rate_hz)
@@ -148,11 +127,7 @@ USUAL_RIG = "wrist"
 
 
 def look_at_lights(options: argparse.Namespace) -> int:
-    """Notify the budget; switch lights only where that is asked for.
-
-    Raises:
-        PhalanxError: A file is missing or broken, or the lights cannot be opened or switched.
-    """
+    """Print the budget; switch lights only where that is asked for."""
 
     rig = rig_of(options, USUAL_RIG)
     camera = load(camera_path(options, rig.cameras[0]), CameraCalibration)
@@ -178,22 +153,11 @@ ETC = "/etc/phalanx"
 
 
 def run(options: argparse.Namespace) -> int:
-    """Report what is well and what is not, and return the exit code.
-
-    Instead, it may check the lights or list ports.
-
-    Raises:
-        UsageError: An option of the lights is given without them.
-        PhalanxError: The lights cannot be looked at or switched.
-    """
+    """Check and report, or list ports, or look at the lights; the exit code."""
     if options.ports:
-        from slave.commands.devices import imu_places as places
-
-        echo(places())
+        echo(imu_places())
         return 0
     if options.lights is not None:
-        pass
-
         return look_at_lights(options)
     if options.blink or options.off:
         raise UsageError(f"--blink and --off need the lights: --lights {SWITCHED_LIGHTS}")
@@ -203,12 +167,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
-    """All findings: the machine, then each slave.
-
-    Args:
-        options: Of `phalanx-slave doctor`.
-        system: The computer.
-    """
+    """All findings: the machine, then each slave."""
     yield from check_host(system)
     yield from check_clock(system, options.master)
     yield check_groups(system)
@@ -230,7 +189,6 @@ def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
 def _look(
     system: System, folder: Path, name: str, slave: "argparse.Namespace | Finding"
 ) -> Iterator[Finding]:
-    """The checks of one slave."""
     unit = check_unit(system, name)
     yield unit.finding
     yield from check_keys(system, folder, name)
@@ -246,10 +204,7 @@ def _look(
 
 
 def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":
-    """Return the options of a slave.
-
-    They are those of its service, each replaced by the doctor's own option where given.
-    """
+    """Options of a slave's service, replaced by the doctor's own where given."""
     given = [
         word
         for option in ("rig", "camera", "calibration")
@@ -284,7 +239,6 @@ def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":
 
 
 def _extras(slave: argparse.Namespace) -> Iterator[str]:
-    """Libraries that only this slave needs."""
     if str(getattr(slave, "camera", "")).partition(":")[0] == "picamera2":
         yield "picamera2"
     if str(getattr(slave, "lights", "")).startswith("gpio:"):

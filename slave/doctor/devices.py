@@ -1,15 +1,8 @@
 """Check the camera, and what devices the service may open.
 
-Checks of what the service may open.
-
-Its groups, the devices that its options name, the buffers of libcamera.
-
-Checks of the camera itself.
-
-It opens, has every setting of its file with all automatics off, and delivers frames.
-
-One that the running service has cannot be opened a second time. Of a V4L2 camera the automatics are read all the same;
-of another it is reported that it was not checked.
+The camera opens, has every setting of its file with all automatics off, and delivers frames. One that the running
+service has cannot be opened a second time: of a V4L2 camera the automatics are read all the same; of another it is
+reported that it was not checked.
 """
 
 import argparse
@@ -39,10 +32,7 @@ RULE = (
 
 
 def check_groups(system: System) -> Finding:
-    """Check that all groups of the unit exist.
-
-    systemd starts the unit only if none is missing.
-    """
+    """Check that all groups of the unit exist: else systemd does not start it."""
     there = _group_ids(system)
     if missing := [name for name in GROUPS if name not in there]:
         return fail("groups", f"missing: {', '.join(missing)}; the service ends with 216/GROUP", SYSUSERS)
@@ -118,7 +108,6 @@ def _may_open(mode: int, group: int, ids: Mapping[str, int]) -> bool:
 
 
 def _group_ids(system: System) -> dict[str, int]:
-    """Those groups of the service that exist."""
     found: dict[str, int] = {}
     for line in (system.text("/etc/group") or "").splitlines():
         name, _, rest = line.partition(":")
@@ -143,12 +132,7 @@ def _name(device: Path) -> str:
 
 
 def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
-    """Files and device of a camera.
-
-    Args:
-        slave: Options of `phalanx-slave run`.
-        taken: Whether the service runs, and has it.
-    """
+    """Check files and device of a camera; `taken`: the service runs, and has it."""
     try:
         file = load(slave.calibration / "cameras" / f"{slave.name}.json", CameraCalibration)
         rig = load(slave.calibration / "rigs" / f"{slave.rig}.json", RigCalibration)
@@ -174,10 +158,7 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
 
 
 def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) -> Finding:
-    """Open the camera as the slave does and read some frames.
-
-    Each setting is written and read back first.
-    """
+    """Open the camera as the slave does, settings included, and read some frames."""
     found: list[Finding] = []
 
     def look() -> None:
@@ -206,7 +187,6 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
 
 
 def _automatics(path: Path) -> Finding:
-    """Which automatics of a V4L2 camera are on."""
     try:
         device = KernelDevice(path)
     except OSError as error:

@@ -1,34 +1,9 @@
 """Examine the host, and say what is wrong with its fix.
 
-State what a check gets, the system, and what it gives, findings.
-
-Findings of the doctor.
-
-One line per check, how bad it is, and what mends it. A check that was not made is reported as such.
-
-The computer as the doctor sees it.
-
-Files below a root, and programs that answer. A test supplies its own.
-
-Check the machine: its system, clock, service and libraries.
-
-Checks of the machine itself.
-
-64 bit, which system on which board, Python, disk space, heat, supply.
-
-Checks of the system's clock.
-
-It matters for cameras in step and for people who read logs. Phalanx itself measures the clocks of its link.
-
-`chronyc -c tracking` is a line of 14 fields (chronyc(1)); the offset is seconds that the system is ahead of NTP.
-
-Checks of the service itself, as systemd reports it.
-
-Does it run, how often was it restarted, what did it print last.
-
-Checks of the libraries of the service, made by its own Python.
-
-Libraries that are installed for another Python do not help the service.
+System, board, Python, disk, heat, supply; the clock, which matters for cameras in step and for people who read logs
+(Phalanx itself measures the clocks of its link); the service as systemd reports it; and the libraries, imported by
+the service's own Python, for those of another do not help it. A check that was not made is reported as such. A test
+supplies a `System` of its own: files below a root, and programs that answer.
 """
 
 import os
@@ -59,19 +34,12 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One check.
+    """One check."""
 
-    Attributes:
-        check: What was looked at, in two or three words.
-        verdict: How bad it is.
-        text: What was seen; of what was not looked at, why not.
-        fix: What mends it; empty where nothing needs to be mended.
-    """
-
-    check: str
+    check: str  # what was looked at, in two or three words
     verdict: Verdict
-    text: str
-    fix: str = ""
+    text: str  # what was seen; of what was not looked at, why not
+    fix: str = ""  # what mends it; empty where nothing needs to be mended
 
 
 def ok(check: str, text: str) -> Finding:
@@ -100,10 +68,7 @@ def exit_code(findings: Sequence[Finding]) -> int:
 
 
 def as_text(findings: Sequence[Finding]) -> str:
-    """Format one line per check, with the fix below it.
-
-    Checks that were not made come last, in one block.
-    """
+    """One line per check, the fix below it; checks that were not made come last."""
     seen = [one for one in findings if one.verdict is not Verdict.UNSEEN]
     width = max((len(one.check) for one in findings), default=0)
     lines: list[str] = []
@@ -120,10 +85,7 @@ def as_text(findings: Sequence[Finding]) -> str:
 
 
 def as_json(findings: Sequence[Finding], program: Program) -> str:
-    """Format the findings as JSON for programs.
-
-    {"host", "version", "ok", "findings": [{"check", "verdict", "text", "fix"}]}.
-    """
+    """{"host", "version", "ok", "findings": [{"check", "verdict", "text", "fix"}]}."""
     report = {
         "host": program.host,
         "version": program.version,
@@ -135,17 +97,11 @@ def as_json(findings: Sequence[Finding], program: Program) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """Output of a program.
+    """Output of a program."""
 
-    Attributes:
-        code: Its exit code, negative for a signal; None: it is not there, or did not end in time.
-        out: Its output.
-        error: Its standard error, or why there is no code.
-    """
-
-    code: int | None
+    code: int | None  # its exit code, negative for a signal; None: it is not there, or did not end in time
     out: str
-    error: str
+    error: str  # its standard error, or why there is no code
 
 
 Run = Callable[[Sequence[str], float], Ran]
@@ -167,13 +123,7 @@ def run(command: Sequence[str], timeout_s: float) -> Ran:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A computer.
-
-    Attributes:
-        root: Below which its files are.
-        environment: Of the doctor's process.
-        run: Runs a program, for so many seconds at most.
-    """
+    """A computer: its files below `root`, and what runs a program for some seconds."""
 
     root: Path
     environment: Mapping[str, str]
@@ -189,10 +139,7 @@ class System:
         return self.root / str(place).lstrip("/")
 
     def text(self, place: str) -> str | None:
-        """Return the content of a file without its end of line and its NUL.
-
-        The NUL is that of the device tree; None: it cannot be read.
-        """
+        """Content of a file without end of line and NUL (of the device tree), or None."""
         try:
             return self.path(place).read_text(errors="replace").strip("\0\n ")
         except OSError:
@@ -285,10 +232,7 @@ def _metrics(system: System) -> Iterator[Finding]:
 
 
 def _memory_limit(system: System) -> Finding:
-    """Whether the kernel keeps the unit's MemoryMax.
-
-    That of Raspberry Pi OS does so only where it is asked to.
-    """
+    """Whether the kernel keeps MemoryMax; Raspberry Pi OS's only where asked to."""
     controllers = system.text("/sys/fs/cgroup/cgroup.controllers")
     if controllers is None:
         return unseen("memory limit", "no control groups of version 2 here")
@@ -316,10 +260,7 @@ def _throttled(system: System) -> Finding:
 
 
 def _flags(system: System) -> int | None:
-    """Read the status flags of the firmware.
-
-    vcgencmd is asked, which knows all of them on every board; else those of sysfs are read.
-    """
+    """Status flags of the firmware: by vcgencmd, which knows all, else by sysfs."""
     asked = system.run(("vcgencmd", "get_throttled"), 5.0)
     if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
         return int(found[1], 16)
@@ -333,20 +274,20 @@ INSTALL = (
 
 
 def check_clock(system: System, master: str | None) -> Iterator[Finding]:
-    """What keeps the clock, and how well."""
+    """What keeps the clock, and how well.
+
+    `chronyc -c tracking` is a line of 14 fields (chronyc(1)); the offset is seconds that the system is ahead of NTP.
+    """
     asked = system.run(("chronyc", "-c", "-n" if master is None else "-N", "tracking"), 5.0)
     if asked.code is None:
         yield _without_chrony(system)
         return
     fields = asked.out.strip().split(",")
-    # fields
     if asked.code != 0 or len(fields) != 14:
         stated = (asked.error or asked.out).strip().splitlines()[-1:] or ["no answer"]
         yield warn("clock", f"chronyd: {stated[0]}", "sudo systemctl enable --now chrony")
         return
     try:
-        # offset s
-        # rms s
         offset_s, rms_s = float(fields[4]), float(fields[6])
     except ValueError:
         yield warn("clock", f"chronyd reports {asked.out.strip()!r}", "sudo systemctl restart chrony")
@@ -396,12 +337,7 @@ BEFORE = {
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """How a service is.
-
-    Attributes:
-        finding: For people.
-        runs: Whether it has its device.
-    """
+    """State of a service; `runs`: it has its device."""
 
     finding: Finding
     runs: bool

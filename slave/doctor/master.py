@@ -1,12 +1,7 @@
 """Check the keys of a device, and whether the master is received.
 
-Check whether the master is received.
-
-It tests whether a beacon of this rig arrives within a second, and from where. Nothing is sent.
-
-Checks of the keys of a device.
-
-All exist, belong together, are for this name, are valid, and nobody else can read them.
+A beacon of this rig has to arrive within a second; nothing is sent. All keys exist, belong together, are for this
+name, are valid, and nobody else can read them.
 """
 
 import os
@@ -99,10 +94,7 @@ _PUBLIC = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicK
 
 
 def folder_of(system: System, given: Path | None) -> Path:
-    """Return the folder of the keys.
-
-    It is the given one, the one that the environment states, or where an installer puts them.
-    """
+    """Folder of the keys: given, of the environment, or where an installer puts it."""
     if given is not None:
         return given
     named = system.environment.get("PHALANX_KEYS")

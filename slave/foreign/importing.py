@@ -1,9 +1,7 @@
-"""Conversion of foreign videos and pictures to a recording.
+"""Make a recording of foreign videos and pictures.
 
-It makes calibration, times and rows; pictures are linked, not decoded again.
-
-A video or picture gets a second name in the recording's folder (a hard link), which takes no room; where the disks
-differ it is copied. It is read once, to count its frames and what is broken in it.
+It makes calibration, times and rows. A video or picture gets a second name in the recording's folder (a hard link),
+which takes no room; where the disks differ it is copied. It is read once, to count its frames and what is broken.
 """
 
 import os
@@ -39,29 +37,19 @@ NOTE = "imported from "
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What is to be imported.
+    """What is to be imported."""
 
-    Attributes:
-        calibration: calib_json tree.
-        paths: Videos, folders of pictures, or folders of these.
-        named: Camera -> its video or folder of pictures.
-        rig: Name of the rig; None: the one that has these cameras.
-        times: Table of the times of all cameras; None: those beside each video, or its own.
-    """
-
-    calibration: Path
-    paths: Sequence[Path] = ()
+    calibration: Path  # calib_json tree
+    paths: Sequence[Path] = ()  # videos, folders of pictures, or folders of these
+    # camera -> its video or folder of pictures
     named: Mapping[str, Path] = field(default_factory=dict[str, Path])
-    rig: str | None = None
-    times: Path | None = None
+    rig: str | None = None  # name of the rig; None: the one that has these cameras
+    times: Path | None = None  # table of the times of all cameras; None: those beside each video, or its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Imported:
-    """What one camera took.
-
-    Numbers of its frames, their names in the recording, and when they were taken.
-    """
+    """What one camera took: its frames, their names in the recording, their times."""
 
     source: Source
     files: Mapping[int, str]
@@ -70,12 +58,9 @@ class _Imported:
 
 
 def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dict[str, int]:
-    """Write the recording.
+    """Write the recording; return camera -> number of its frames.
 
     A former import in the same folder is replaced, nothing else is.
-
-    Returns:
-        Camera -> number of its frames.
 
     Raises:
         PhalanxError: A file is missing or broken, of no camera or of another size than by the camera file, or has no
@@ -130,7 +115,6 @@ def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dic
 
 
 def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
-    """The rig with the cameras that there are pictures of."""
     names = tuple(name for name in rig.cameras if any(source.camera == name for source in sources))
     places = {name: rig.T_rig_camera[name] for name in names if name in rig.T_rig_camera}
     return msgspec.structs.replace(rig, cameras=names, T_rig_camera=places)
@@ -139,13 +123,7 @@ def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
 def _imported(
     source: Source, camera: CameraCalibration, wish: Wish, notify: Callable[[str], None]
 ) -> _Imported:
-    """Return numbers, names and times of the frames of one camera.
-
-    They are reported in one line.
-
-    Raises:
-        RecordingError: No frame can be decoded, the size is another one, or the times are of no use.
-    """
+    """Numbers, names and times of the frames of one camera, reported in one line."""
     size = (camera.width_px, camera.height_px)
     try:
         read = _video if source.is_video else _pictures
@@ -228,10 +206,6 @@ def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], w
 
 
 def _write(out: Path, manifest: Manifest, imported: Sequence[_Imported]) -> None:
-    """Write the manifest, the pictures and the rows.
-
-    The pictures have their names in the recording; the rows follow, sorted by time.
-    """
     first = min(int(one.timed.t_ns[0]) for one in imported)  # tables may count from any time
     rows: list[FrameRow] = []
     for one in imported:
@@ -250,11 +224,7 @@ def _write(out: Path, manifest: Manifest, imported: Sequence[_Imported]) -> None
 
 
 def _place(out: Path, one: _Imported) -> None:
-    """Give the video or the pictures of a camera their names in the recording.
-
-    Raises:
-        RecordingError: The disk is full, or cannot be written.
-    """
+    """Give the video or the pictures of a camera their names in the recording."""
     if one.source.is_video:
         pairs = [(one.source.path, out / (one.source.camera + one.source.path.suffix.lower()))]
     else:
@@ -272,11 +242,7 @@ def _place(out: Path, one: _Imported) -> None:
 
 
 def _clear(out: Path) -> None:
-    """Take a former import away.
-
-    Raises:
-        RecordingError: There is something else.
-    """
+    """Take a former import away; refuse anything else."""
     if (out / MANIFEST).is_file() and load_manifest(out).note.startswith(NOTE):
         shutil.rmtree(out)
     refuse_occupied(out)

@@ -1,10 +1,7 @@
 """Find which camera a foreign file is of, and when its frames were taken.
 
-Which camera a video or a folder of pictures is of.
-
-Times at which foreign frames were taken.
-
-They come from a table of times, the video's own times, or a constant rate.
+Times come from a table, the video's own stamps, or a constant rate. What is none, or could be meant in several ways,
+raises `RecordingError`, which names file and line.
 """
 
 import csv
@@ -29,12 +26,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What one camera took.
-
-    Attributes:
-        camera: Its name in the rig.
-        path: A video, or a folder of pictures.
-    """
+    """A video, or a folder of pictures, that one camera of the rig took."""
 
     camera: str
     path: Path
@@ -57,13 +49,7 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def found_in(paths: Sequence[Path]) -> list[Path]:
-    """Find videos and folders of pictures.
-
-    They are those that are named, or that are in a folder that is named.
-
-    Raises:
-        RecordingError: One is neither, or holds both; the text names it.
-    """
+    """Videos and folders of pictures that are named, or in a folder that is named."""
     found: list[Path] = []
     for path in paths:
         if path.is_file():
@@ -89,13 +75,7 @@ def found_in(paths: Sequence[Path]) -> list[Path]:
 
 
 def sources_of(paths: Sequence[Path], rig: RigCalibration, notify: Callable[[str], None]) -> list[Source]:
-    """Assign a camera to each video or folder of pictures.
-
-    It is the camera of its name, or, where no name is a camera's, the next in the order of the rig.
-
-    Raises:
-        RecordingError: Some names are cameras and some are not, or there are not as many as cameras.
-    """
+    """Assign a camera to each path: by its name, or, if none has one, by order."""
     known = [path for path in paths if path.stem in rig.cameras]
     fix = "say whose they are: --camera NAME=PATH for each"
     if len(known) == len(paths):
@@ -125,14 +105,7 @@ def sources_of(paths: Sequence[Path], rig: RigCalibration, notify: Callable[[str
 def rig_for(
     calibration: Path, name: str | None, paths: Sequence[Path], named: Mapping[str, Path]
 ) -> RigCalibration:
-    """Return the rig called `name`, or the one that fits the cameras.
-
-    `name` None: the one marker rig that has these cameras, and no other.
-
-    Raises:
-        RecordingError: There is none, or several could be meant.
-        CalibrationError: A file is broken.
-    """
+    """The rig `name`; None: the one marker rig that has these cameras, and no other."""
     folder = calibration / "rigs"
     if name is not None:
         return load(folder / f"{name}.json", RigCalibration)
@@ -169,26 +142,17 @@ Times = Mapping[int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timed:
-    """The frames that have a time.
+    """The frames that have a time."""
 
-    Attributes:
-        number: (T,) their numbers.
-        t_ns: (T,) [ns], rising.
-        note: Where the times are from, for people.
-    """
-
-    number: Int
-    t_ns: Int
-    note: str
+    number: Int  # (T,) their numbers
+    t_ns: Int  # (T,) [ns], rising
+    note: str  # where the times are from, for people
 
 
 def read_times(path: Path, camera: str) -> Times:
     """The times of one camera in a table with a header.
 
     The columns are `frame`, `time` in seconds or `t_ns`, and `camera` where it is of several; others do not matter.
-
-    Raises:
-        RecordingError: It cannot be read, lacks a column, or a value is no number; the text names file and line.
     """
     try:
         reader = csv.DictReader(io.StringIO(read_table(path.parent, path.name), newline=""))
@@ -219,11 +183,7 @@ def read_times(path: Path, camera: str) -> Times:
 
 
 def by_table(path: Path, times: Times, number: Int) -> Timed:
-    """The frames (T,) that a table has a time of.
-
-    Raises:
-        RecordingError: The table has none of them, counts from 1, or times that do not rise.
-    """
+    """The frames (T,) that a table has a time of."""
     if 0 not in times and len(number) and max(times) == number[-1] + 1:
         raise RecordingError(
             f"{path}: frames are counted from 0; this one begins at {min(times)} and ends one late"

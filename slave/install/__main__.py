@@ -7,10 +7,7 @@ from slave.install.probe import OLDEST, judge, probe
 
 
 def print_line(line: str) -> None:
-    """Print one line at once.
-
-    The PC shows it while the next step runs. The PC may be gone; the installation goes on.
-    """
+    """Print one line at once for the PC; it may be gone, the installation goes on."""
     try:
         print(line, flush=True)
     except BrokenPipeError:
@@ -18,10 +15,7 @@ def print_line(line: str) -> None:
 
 
 def refuse(action: str) -> int:
-    """Report that this Python is too old.
-
-    It runs under the old Python, which cannot read the installer itself.
-    """
+    """Report that this Python is too old, which cannot read the installer itself."""
     facts = probe()
     why = judge(facts)
     print_line(

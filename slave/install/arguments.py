@@ -1,14 +1,7 @@
 """Define the arguments of the installer, and the plan that they make.
 
-What goes wrong while a slave is installed.
-
-Options of the installer, and the plan that they make.
-
-The plan is which slaves of a rig this machine runs, and how.
-
-The command line of `phalanx-slave install` as text.
-
-It is all of the installer that a slave which only runs loads.
+The plan is which slaves of a rig this machine runs, and how. A slave which only runs loads no other file of the
+installer. What does not fit raises `InstallError`.
 """
 
 from __future__ import annotations
@@ -24,10 +17,7 @@ from typing import Any, cast
 
 
 class InstallError(Exception):
-    """The installation is not possible.
-
-    The text is one line that states why, and what to do. The machine is as it was before.
-    """
+    """Not possible: one line, why and what to do. The machine is as it was before."""
 
 
 class NotReadyError(InstallError):
@@ -39,24 +29,18 @@ CALIBRATION = f"{STATE}/calib_json"
 READY_S, SETTLE_S = 90.0, 2.0
 OF_DEVICE = ("pem", "key", "secret")  # endings of the keys of one device
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_UNQUOTED = re.compile(
-    r"[A-Za-z0-9_@%+=:,./\[\]-]+"
-)  # what an environment file of systemd takes as it stands
+# what an environment file of systemd takes as it stands
+_UNQUOTED = re.compile(r"[A-Za-z0-9_@%+=:,./\[\]-]+")
 _HOST = re.compile(r"[A-Za-z0-9.:-]+")
 
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """One process of this machine.
+    """One process of this machine."""
 
-    Attributes:
-        name: Camera or IMU, as the rig's file calls it.
-        options: Of `phalanx-slave run`.
-        stop_post: Command of `phalanx-slave` that makes the lights dark after it has ended; empty: it has none.
-    """
-
-    name: str
-    options: tuple[str, ...]
+    name: str  # camera or IMU, as the rig's file calls it
+    options: tuple[str, ...]  # of `phalanx-slave run`
+    # command of `phalanx-slave` that makes the lights dark after it has ended; empty: it has none
     stop_post: tuple[str, ...] = ()
 
     @property
@@ -76,30 +60,19 @@ class Sender:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be on this machine.
+    """What is to be on this machine."""
 
-    Attributes:
-        master: Host name or address of the machine whose master it sends to; the clock follows it.
-        senders: Processes.
-        calibration: Path below calib_json -> content.
-        keys: File name -> content: rig.key, ca.pem, device-NAME.pem, .key, .secret. Empty: those that are there stay.
-        boot: Lines of config.txt that are needed.
-        picamera2: Whether a camera is opened by picamera2, which comes by apt.
-    """
-
-    master: str
+    master: str  # host name or address of the machine whose master it sends to; the clock follows it
     senders: tuple[Sender, ...]
-    calibration: Mapping[str, bytes]
+    calibration: Mapping[str, bytes]  # path below calib_json -> content
+    # File name -> content: rig.key, ca.pem, device-NAME.pem, .key, .secret. Empty: those that are there stay
     keys: Mapping[str, bytes]
-    boot: tuple[str, ...] = ()
-    picamera2: bool = False
+    boot: tuple[str, ...] = ()  # lines of config.txt that are needed
+    picamera2: bool = False  # whether a camera is opened by picamera2, which comes by apt
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that state what a machine is to run.
-
-    They are the same here and for `phalanx fleet deploy`, which hands them on.
-    """
+    """Add what states what a machine is to run, here and in `phalanx fleet deploy`."""
     parser.add_argument(
         "--master", metavar="HOST", help="host name or address of the PC, whose clock is followed"
     )
@@ -145,13 +118,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys: Mapping[str, bytes]) -> Plan:
     """What the options ask for.
 
-    Args:
-        options: Of `add_options`.
-        calibration: Path below calib_json -> content, of the whole tree or of what the rig needs.
-        keys: File name -> content; of the folder of a PC or of a device.
-
-    Raises:
-        InstallError: They do not fit to each other, or to the rig.
+    `calibration` (path below calib_json -> content) has the whole tree or what the rig needs; `keys` (file name ->
+    content) a folder of a PC or of a device.
     """
     if options.master is None or not _HOST.fullmatch(options.master):
         given = f" {options.master}" if options.master else ""
@@ -232,7 +200,6 @@ def _rig(calibration: Mapping[str, bytes], name: str) -> dict[str, Any]:
 
 
 def _names(rig: dict[str, Any]) -> list[str]:
-    """Of all that send: cameras, then its IMU."""
     imu = cast("dict[str, object]", rig.get("imu") or {}).get("name")
     return [str(name) for name in rig["cameras"]] + ([str(imu)] if imu else [])
 
@@ -246,11 +213,7 @@ def _only(rig: dict[str, Any], name: str) -> tuple[str, ...]:
 
 
 def _needed(calibration: Mapping[str, bytes], name: str, rig: dict[str, Any]) -> dict[str, bytes]:
-    """The files of this rig, and nobody else's hand.
-
-    Raises:
-        InstallError: One is missing.
-    """
+    """The files of this rig, and nobody else's hand."""
     files = [f"rigs/{name}.json", *(f"cameras/{camera}.json" for camera in rig["cameras"])]
     files += [f"hands/{rig['hand']}.json"] if rig.get("hand") else []
     files += [f"objects/{one}.json" for one in cast("list[str]", rig.get("objects") or [])]
@@ -265,11 +228,7 @@ def wanted_keys(names: Sequence[str]) -> list[str]:
 
 
 def _of_device(keys: Mapping[str, bytes], names: Sequence[str]) -> dict[str, bytes]:
-    """What of a keys folder belongs on this machine, under its names there.
-
-    Raises:
-        InstallError: One is missing, or none.
-    """
+    """What of a keys folder belongs on this machine, under its names there."""
     if not keys:
         return {}
     found = {name: keys[name] for name in ("rig.key", "ca.pem") if name in keys}
@@ -302,7 +261,6 @@ def _boot(options: argparse.Namespace, drivers: Sequence[str]) -> tuple[str, ...
 
 
 def _of(name: str, texts: Sequence[str], names: Sequence[str]) -> str | None:
-    """Return the last value given for `name`, or for all."""
     return (_all_of(name, texts, names) or [None])[-1]
 
 

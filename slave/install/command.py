@@ -1,12 +1,7 @@
 """Install, update or remove the service on this machine.
 
-Sources of keys and calibration.
-
-Folders of this machine, or the archive that the PC sent with the installer.
-
-`phalanx-slave install`, and what the PC runs on a machine by ssh.
-
-Both use the same installer, its options and its messages.
+`phalanx-slave install`, and what the PC runs by ssh: keys and calibration come from folders of this machine, or from
+the archive that the PC sent with the installer. Whatever goes wrong is an `InstallError`.
 """
 
 from __future__ import annotations
@@ -37,11 +32,7 @@ _SHARED = stat.S_IRWXG | stat.S_IRWXO
 
 
 def from_archive(archive: Path) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """Keys and calibration of an archive: path -> content each.
-
-    Raises:
-        InstallError: It is none.
-    """
+    """Keys and calibration of an archive: path -> content each."""
     try:
         with zipfile.ZipFile(archive) as opened:
             names = [name for name in opened.namelist() if not name.endswith("/")]
@@ -55,11 +46,7 @@ def from_archive(archive: Path) -> tuple[dict[str, bytes], dict[str, bytes]]:
 
 
 def calibration_of(folder: Path) -> dict[str, bytes]:
-    """All JSON files of a calib_json tree.
-
-    Raises:
-        InstallError: There is none.
-    """
+    """All JSON files of a calib_json tree."""
     if not (folder / "rigs").is_dir():
         raise InstallError(f"{folder}: no calib_json tree (no rigs/ in it); give --calibration DIR")
     return {
@@ -68,11 +55,7 @@ def calibration_of(folder: Path) -> dict[str, bytes]:
 
 
 def keys_of(folder: Path | None) -> dict[str, bytes]:
-    """The files of a keys folder that a device may have; empty without a folder.
-
-    Raises:
-        InstallError: It is not there, or others can read it.
-    """
+    """The files of a keys folder that a device may have; empty without a folder."""
     if folder is None:
         return {}
     if not folder.is_dir():
@@ -105,15 +88,7 @@ def run_here(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = None) -> int:
-    """Install, roll back, or remove, and return the exit code.
-
-    0 done, 1 something the user can mend.
-
-    Args:
-        options: Of `add_install`.
-        notify: Called with one line a step.
-        systemd: The machine's services; None: those of this machine.
-    """
+    """Install, roll back, or remove; the exit code: 1 something the user can mend."""
     machine = steps.Machine(options.root, systemd or Systemd(), notify, options.ready_s, options.settle_s)
     os.umask(0o022)  # the slave, who is not root, runs what is installed
     try:
@@ -158,10 +133,7 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
 
 
 def _clear(stage: Path) -> None:
-    """Remove the files that the PC sent for this installation.
-
-    What other installations left that were cut off long ago is removed, too.
-    """
+    """Remove what the PC sent for this installation, or others cut off long ago."""
     for one in stage.parent.glob("*"):
         left_s = 3600.0  # no installation takes so long
         if one == stage or time.time() - one.stat().st_mtime > left_s:
@@ -182,11 +154,7 @@ def report_line(outcome: steps.Outcome, dry_run: bool) -> str:
 
 
 def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machine) -> None:
-    """Look at this machine, and bring what it lacks by apt.
-
-    Raises:
-        InstallError: It cannot be installed on.
-    """
+    """Look at this machine, and bring what it lacks by apt."""
     if options.root != Path("/"):
         return
     camera = "picamera2" if picamera2 else ""
@@ -207,10 +175,7 @@ def missing_packages(there: list[str], picamera2: bool) -> list[str]:
 
 
 def _start_s(systemd: Systemd) -> float | None:
-    """Return how long the slowest slave of this machine took to start [s].
-
-    None: none runs, or it is not known.
-    """
+    """How long the slowest slave here took to start [s]; None: not known."""
     units = [f"phalanx-slave@{path.stem}.service" for path in (Path("/") / ETC).glob("*.env")]
     try:
         took = [systemd.state(unit).start_s for unit in units]
@@ -225,9 +190,7 @@ def _end(options: argparse.Namespace, notify: Notify, result: dict[str, object],
 
 
 def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -> int:
-    """Run `python3 -m slave.install ACTION ...`.
-
-    The PC runs this before a slave is installed.
+    """Run `python3 -m slave.install ACTION ...`, as the PC does.
 
     `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` reports the machine's state; `packages NAME...`
     calls apt.

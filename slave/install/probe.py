@@ -1,8 +1,6 @@
-"""Facts about the machine before anything is installed on it.
+"""Gather facts about the machine before anything is installed on it.
 
-They are for `judge`. Writes nothing.
-
-An old Python runs this too, so that its version is reported instead of a syntax error.
+An old Python runs this too, so that its version is reported instead of a syntax error. Writes nothing.
 """
 
 from __future__ import annotations
@@ -31,12 +29,7 @@ _FIND_CAMERAS = (
 
 
 def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
-    """The facts, as JSON has them.
-
-    Args:
-        root: Where the machine's files are.
-        camera: Driver that will be used; picamera2 is asked for its cameras, where it is there already.
-    """
+    """The facts, as JSON has them, of the machine whose files are below `root`."""
     release = _os_release(root)
     found: dict[str, Any] = {
         "machine": platform.machine(),
@@ -62,13 +55,7 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
 
 
 def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | None:
-    """One line why nothing can be installed there, with what to do; None: it can.
-
-    Args:
-        facts: Of `probe`.
-        camera: Driver that will be used.
-        apt: Whether packages that are missing will be installed.
-    """
+    """Why nothing can be installed there, and what to do; None: it can."""
     python = tuple(facts["python"])
     if facts["bits"] != 64 or facts["machine"] not in MACHINES:
         return (
@@ -123,10 +110,7 @@ def _has_package(name: str) -> bool:
 
 
 def _cameras() -> list[str] | None:
-    """List the cameras that libcamera finds.
-
-    None where picamera2 is not installed, so that it is not known.
-    """
+    """The cameras that libcamera finds; None: picamera2 is not installed."""
     stated = _output_of(["/usr/bin/python3", "-c", _FIND_CAMERAS])
     for line in (stated or "").splitlines():
         if line.startswith("CAMERAS "):
@@ -135,10 +119,7 @@ def _cameras() -> list[str] | None:
 
 
 def _output_of(command: list[str]) -> str | None:
-    """Return the output of a command.
-
-    None: it does not exist, failed, or takes too long.
-    """
+    """Output of a command; None: it does not exist, failed, or takes too long."""
     try:
         quick_s = 20.0
         done = subprocess.run(

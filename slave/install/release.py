@@ -1,9 +1,9 @@
-"""Releases below /opt/phalanx.
+"""Make and remove releases below /opt/phalanx.
 
-Each is a virtual environment, made under another name and renamed when it is whole.
-
-It sees the system's packages (picamera2 and libcamera come by apt); what it has itself goes before them. That comes
-from a folder of wheels, without a network, or from the environment that the installer runs in.
+Each is a virtual environment, made under another name and renamed when it is whole. It sees the system's packages
+(picamera2 and libcamera come by apt); what it has itself goes before them. That comes from a folder of wheels,
+without a network, or from the environment that the installer runs in. No room, and wheels that are missing or of
+another machine, raise `InstallError`; nothing of that release stays.
 """
 
 from __future__ import annotations
@@ -44,12 +44,7 @@ sys.exit(main())
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a release's packages come from.
-
-    Attributes:
-        wheels: Folder of wheels; None: `site` is copied.
-        site: site-packages of the environment that the installer runs from.
-    """
+    """Packages of a release: a folder of `wheels`, or the site-packages `site`."""
 
     wheels: Path | None
     site: Path | None = None
@@ -60,20 +55,13 @@ class Source:
         return Source(None, Path(sysconfig.get_path("purelib")))
 
     def _release(self) -> str | None:
-        """Return the release that the installer runs from, if it does.
-
-        Then only options, keys or files change.
-        """
+        """The release that the installer runs from, if it does: only files change then."""
         assert self.site is not None
         parts = self.site.resolve().parts
         return parts[4] if parts[:4] == ("/", *RELEASES.split("/")) and len(parts) > 4 else None
 
     def name(self) -> str:
-        """Version and a hash of all that is in it: other content is another release.
-
-        Raises:
-            InstallError: There is no Phalanx in it.
-        """
+        """Version and a hash of all that is in it: other content is another release."""
         digest = hashlib.sha256()
         if self.wheels is not None:
             wheels = sorted(self.wheels.glob("*.whl"))
@@ -98,11 +86,7 @@ class Source:
 
 
 def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -> bool:
-    """Make the release `name` if it is not there whole; whether it had to be made.
-
-    Raises:
-        InstallError: No room, or a wheel is missing or of another machine. Nothing of it stays.
-    """
+    """Make the release `name` if it is not there whole; whether it had to be made."""
     releases = root / RELEASES
     if (releases / name).is_dir():
         return False
@@ -130,10 +114,7 @@ def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -
 
 
 def prune(root: Path, current: str, before: str | None) -> list[str]:
-    """Remove all but two releases and return the names of the removed.
-
-    The current release stays, and the one before it, else the newest of the others.
-    """
+    """Remove all but the current release and that before, else the newest other."""
     folders = sorted((root / RELEASES).glob("[!.]*"), key=lambda path: path.stat().st_mtime)
     others = [path.name for path in folders if path.name != current]
     kept = before if before in others else others[-1] if others else None
@@ -144,10 +125,7 @@ def prune(root: Path, current: str, before: str | None) -> list[str]:
 
 
 def remove(root: Path, name: str) -> None:
-    """Remove a release.
-
-    Its name goes first: half of one must never be taken for a whole one.
-    """
+    """Remove a release, its name first: half of one is never taken for a whole one."""
     left = root / RELEASES / f".new-{name}"
     shutil.rmtree(left, ignore_errors=True)
     with contextlib.suppress(FileNotFoundError):
@@ -156,7 +134,6 @@ def remove(root: Path, name: str) -> None:
 
 
 def _check_space(releases: Path, source: Source) -> None:
-    """Raises InstallError: there is too little."""
     if source.wheels is not None:
         sizes = [zipfile.ZipFile(wheel).infolist() for wheel in source.wheels.glob("*.whl")]
         size = sum(item.file_size for items in sizes for item in items)
@@ -222,10 +199,7 @@ _QUIET = (
 
 
 def _copy_site(fresh: Path, site: Path) -> None:
-    """Copy the packages that are installed beside the installer.
-
-    Phalanx's own packages are copied, too, if they are elsewhere (an editable installation).
-    """
+    """Copy the packages beside the installer, and our own from where they are."""
     there = next((fresh / "lib").glob("python3*/site-packages"))
     shutil.copytree(site, there, dirs_exist_ok=True, symlinks=True, ignore=shutil.ignore_patterns("*.pth"))
     own = _own_packages(site)

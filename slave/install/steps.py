@@ -1,12 +1,8 @@
 """Install and remove Phalanx, step by step.
 
-The installation, step by step.
-
-Release, files, switch, restart, wait; it is rolled back if the service does not run then.
-
-Removal of everything that belongs to Phalanx.
-
-Services, releases, keys, calibration, groups, lines of config.txt. apt's packages stay.
+Release, files, switch, restart, wait; it is rolled back if the service does not run then. Removed is everything that
+belongs to Phalanx: services, releases, keys, calibration, groups, lines of config.txt. apt's packages stay. Whatever
+fails raises `InstallError`, and the machine is as before.
 """
 
 from __future__ import annotations
@@ -44,26 +40,16 @@ _UNITS = "phalanx-slave@{}.service"
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The machine that is installed on.
+    """The machine that is installed on."""
 
-    Attributes:
-        root: Where its files are.
-        systemd: Its services.
-        notify: Called with one line a step.
-        ready_s: How long its slaves may take until they are ready, at most.
-        settle_s: How long they then have to stay so.
-    """
-
-    root: Path
+    root: Path  # where its files are
     systemd: Systemd
-    notify: Callable[[str], None]
-    ready_s: float
-    settle_s: float
+    notify: Callable[[str], None]  # called with one line a step
+    ready_s: float  # how long its slaves may take until they are ready, at most
+    settle_s: float  # how long they then have to stay so
 
     def limit_s(self, unit: str) -> float:
-        """Return the time limit [s] for the next start of a slave.
-
-        It is for a slave that runs now with the same options.
+        """Time limit [s] for the next start of a slave with the same options.
 
         While it is waited for, its camera sees nothing: so it is judged by its own last start on this machine.
         """
@@ -74,44 +60,23 @@ class Machine:
         return self.ready_s if took_s is None else min(self.ready_s, max(least_s, times * took_s))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """While nobody else installs on it.
-
-        Raises:
-            InstallError: Somebody else does, and has no end.
-        """
+        """Hold the machine while nobody else installs on it; see `transaction.alone`."""
         return alone(self.root, self.notify, self.systemd.sleep)
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What an installation did.
+    """What an installation did."""
 
-    Attributes:
-        release: Which one is current now.
-        changed: Paths that were written or removed, and `current` if another release is.
-        restarted: Services.
-        reboot: Whether config.txt has changed, which the next start reads.
-    """
-
-    release: str
+    release: str  # which one is current now
+    # paths that were written or removed, and `current` if another release is
     changed: list[str] = field(default_factory=list[str])
-    restarted: list[str] = field(default_factory=list[str])
-    reboot: bool = False
+    restarted: list[str] = field(default_factory=list[str])  # services
+    reboot: bool = False  # whether config.txt has changed, which the next start reads
 
 
 def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bool = False) -> Outcome:
-    """Bring the machine to the plan; a machine that is there already is left alone.
-
-    Args:
-        plan: What is to be.
-        source: Packages of the release.
-        name: Of the release.
-        machine: Where.
-        dry_run: Only print what would change.
-
-    Raises:
-        InstallError: It failed, and the machine is as before.
-    """
+    """Bring the machine to the plan with release `name`, unless it is there already."""
     with contextlib.nullcontext() if dry_run else machine.alone():
         notes = Transaction(machine.root)
         if notes.is_open and not dry_run:
@@ -139,18 +104,13 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
             _undo(machine, plan.senders, name if made else None)
             raise InstallError(f"{error}; everything is as before") from error
         notes.end()
-        _finish(machine, name, before)
+        for gone in release.prune(machine.root, name, before):
+            machine.notify(f"removed release {gone}")
         return outcome
 
 
 def roll_back(machine: Machine, dry_run: bool = False) -> str:
-    """Roll back to the state before the last installation.
-
-    Returns one line that states what is there then, or would be.
-
-    Raises:
-        InstallError: There was none before, or what was before does not run.
-    """
+    """Go back to the state before the last installation; what is there, in a line."""
     with contextlib.nullcontext() if dry_run else machine.alone():
         left, before = _current(machine.root), Transaction(machine.root).release_before
         text = f"release {before}" if before else "no release, as before the first installation"
@@ -180,12 +140,6 @@ def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: M
 
 
 def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcome, machine: Machine) -> None:
-    """Write, switch, restart, wait.
-
-    Raises:
-        InstallError: What was installed does not run.
-        OSError: A file cannot be written.
-    """
     run, root = machine.systemd.run, machine.root
     limits = {  # before anything is stopped
         s.unit: machine.ready_s if f"{ETC}/{s.name}.env" in outcome.changed else machine.limit_s(s.unit)
@@ -222,21 +176,8 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         machine.notify(f"not ready before the machine is restarted, for config.txt has changed: {error}")
 
 
-def _finish(machine: Machine, name: str, before: str | None) -> None:
-    for gone in release.prune(machine.root, name, before):
-        machine.notify(f"removed release {gone}")
-
-
 def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> None:
-    """Undo an installation.
-
-    What then fails is only reported, for the first cause matters more.
-
-    Args:
-        machine: Where.
-        senders: Whose services may have been started.
-        fresh: Release that was made for this; None: it was there before.
-    """
+    """Undo an installation; only report errors, for the first cause matters more."""
     try:
         _take_back(machine, {sender.name for sender in senders})
     except (InstallError, OSError) as error:
@@ -246,11 +187,6 @@ def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> N
 
 
 def _take_back(machine: Machine, started: set[str] | None = None) -> None:
-    """Put files and release back, and restart what runs by them.
-
-    Raises:
-        InstallError: There is nothing to take back, or it does not run.
-    """
     run = machine.systemd.run
     units = Transaction(machine.root).take_back()
     there = _senders(machine.root)
@@ -300,12 +236,7 @@ _PRIVATE = ("var/lib/private/phalanx", "var/cache/private/phalanx", "var/log/pri
 
 
 def uninstall(machine: Machine, dry_run: bool = False) -> list[str]:
-    """Remove it; what was there, as paths below the root.
-
-    Raises:
-        InstallError: A service does not stop, or another installation has no end.
-        OSError: A file cannot be removed.
-    """
+    """Remove it; what was there, as paths below the root."""
     with contextlib.nullcontext() if dry_run else machine.alone():
         return _remove(machine, dry_run)
 
@@ -316,8 +247,7 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
         groups = Record.read(root).groups
     except InstallError:  # then they stay; all else goes
         groups = ()
-    senders = sorted(path.stem for path in (root / ETC).glob("*.env"))
-    units = [f"phalanx-slave@{name}.service" for name in senders]
+    units = [_UNITS.format(name) for name in sorted(_senders(root))]
     own = [UNIT, SYSUSERS, CHRONY, ETC, OPT, *_STATE, *_PRIVATE]
     own += [
         str(path.relative_to(root))
@@ -358,11 +288,7 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
 
 
 def packages(names: list[str], machine: Machine) -> None:
-    """Install packages of the system by apt, and report which.
-
-    Raises:
-        InstallError: apt failed; without a network `--no-apt` leaves it out.
-    """
+    """Install packages of the system by apt, and report which."""
     if not names:
         return
     command = ["apt-get", "install", "-y", "-q", "--no-install-recommends", *names]

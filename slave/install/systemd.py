@@ -1,12 +1,6 @@
-"""Run systemd and other programs, as an installer needs them.
+"""Run systemd and other programs, as installer and doctor need them.
 
-Other programs, run to their end.
-
-Installer and doctor query the system by them. Standard library only.
-
-systemd, as an installer needs it.
-
-It restarts a slave, waits until it is ready and stays so, and reads its last log lines.
+Standard library only. What fails or does not end in time raises `InstallError`; its last line is the reason.
 """
 
 from __future__ import annotations
@@ -55,12 +49,7 @@ _ASKS = re.compile(r"may take (\d+) s")  # of a service's status: slave/service.
 
 @dataclass(frozen=True, slots=True)
 class UnitState:
-    """How a service is.
-
-    Attributes:
-        start_s: From the start of its process until it was ready [s]; None: it is not running.
-        output: What it reports of itself.
-    """
+    """State of a service; `start_s` [s] until it was ready, None: it does not run."""
 
     active: bool
     enabled: bool
@@ -76,11 +65,7 @@ Run = Callable[[Sequence[str]], str]
 
 
 def run_command(command: Sequence[str], deadline_s: float = 60.0) -> str:
-    """Run a command and return its output.
-
-    Raises:
-        InstallError: It failed, or takes too long; its last line is the reason.
-    """
+    """Run a command and return its output."""
     try:
         done = finished(command, deadline_s)
     except FileNotFoundError as error:
@@ -94,10 +79,7 @@ def run_command(command: Sequence[str], deadline_s: float = 60.0) -> str:
 
 
 class Systemd:
-    """The system's services.
-
-    Holds how commands are run and how time is measured, which tests replace.
-    """
+    """The system's services; tests replace how commands run and time is measured."""
 
     def __init__(
         self,
@@ -105,15 +87,10 @@ class Systemd:
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Of this machine."""
         self.run, self._now, self.sleep = run, now, sleep
 
     def state(self, unit: str) -> UnitState:
-        """How it is now.
-
-        Raises:
-            InstallError: systemd does not answer.
-        """
+        """State of a service now."""
         wanted = "ActiveState,SubState,UnitFileState,MainPID,NRestarts,Result,ExecMainStatus,StatusText"
         wanted += ",ExecMainStartTimestampMonotonic,ActiveEnterTimestampMonotonic"
         text = self.run(["systemctl", "show", "-p", wanted, unit])
@@ -134,16 +111,10 @@ class Systemd:
         )
 
     def wait_ready(self, limits: Mapping[str, float], settle_s: float) -> None:
-        """Wait until all units have sent READY=1 and none restarts.
+        """Wait until all units are ready, and stay so without a restart for `settle_s`.
 
-        None may have restarted since for `settle_s`.
-
-        Args:
-            limits: Service -> how long it may take [s]; one whose status asks for more time while it starts has that.
-            settle_s: How long they then have to stay so [s].
-
-        Raises:
-            NotReadyError: One does not; its last words are in the text.
+        `limits` is service -> how long it may take [s], unless its status asks for more while it starts;
+        `NotReadyError` has the last words of the one that is not.
         """
         began, since = self._now(), time.time() - 1.0
         ends = {unit: began + limit for unit, limit in limits.items()}
@@ -172,9 +143,8 @@ class Systemd:
             if late := [u for u in limits if u not in steady and self._now() > ends[u]]:
                 passed_s = self._now() - began
                 state = self.state(late[0])
-                why = self._why(
-                    late[0], state, since, state.pid
-                )  # the words of the one before are not its own
+                # the words of the one before are not its own
+                why = self._why(late[0], state, since, state.pid)
                 raise NotReadyError(f"{late[0]} is not ready after {passed_s:.0f} s: {why}")
             if stayed and self._now() > max(ends.values()) + settle_s:
                 raise NotReadyError(f"{next(iter(limits))} does not stay ready for {settle_s:g} s")
@@ -182,10 +152,7 @@ class Systemd:
             self.sleep(step_s)
 
     def _why(self, unit: str, state: UnitState, since: float, pid: int = 0) -> str:
-        """Return the last log lines of a unit since a time, or how systemd ended it.
-
-        The time is in [s since 1970]; the lines are those of process `pid` if one is given.
-        """
+        """Last log line of a unit since a time [s since 1970], or how systemd ended it."""
         if state.status in _STATUS:
             return f"status {_STATUS[state.status]}"
         words = ["journalctl", f"_SYSTEMD_UNIT={unit}", f"--since=@{since:.0f}"]

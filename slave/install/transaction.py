@@ -1,18 +1,10 @@
 """Change files so that they can be rolled back, one installation at a time.
 
-Changes of files that can be rolled back.
-
-The former content is kept until the next installation.
-
-The notes are a folder below /opt/phalanx. While its manifest is open, a change is under way: whoever finds it so (the
-power went) takes it back first.
-
-Lock that allows one installation at a time on a machine.
-
-An installation whose PC went away goes on to its end, and the next waits for it.
-
-The lock is on a folder that is always there, so no file of it comes and goes, and it ends with whoever has it. That one
-has an end, too: each command that an installer runs has a time limit.
+The former content is kept below /opt/phalanx until the next installation. While its manifest is open, a change is
+under way: whoever finds it so (the power went) takes it back first. An installation whose PC went away goes on to its
+end, and the next waits for it: the lock is on a folder that is always there, and ends with whoever has it. Each
+command that an installer runs has a time limit, so that has an end, too. Nothing to take back, and links in the
+slave's folder, raise `InstallError`, other files `OSError`.
 """
 
 from __future__ import annotations
@@ -46,10 +38,9 @@ def changed(root: Path, files: Mapping[str, File | None]) -> list[str]:
 
 
 class Transaction:
-    """One installation's changes. Holds nothing but the place of its notes."""
+    """One installation's changes on the machine whose files are below `root`."""
 
     def __init__(self, root: Path) -> None:
-        """Of the machine whose files are below `root`."""
         self._root, self._notes = root, root / NOTES
         self._manifest = self._notes / _MANIFEST
 
@@ -60,21 +51,12 @@ class Transaction:
 
     @property
     def release_before(self) -> str | None:
-        """The release that was current before; None: there was none.
-
-        Raises:
-            InstallError: There is nothing to take back.
-        """
+        """The release that was current before; None: there was none."""
         current = self._there()["current"]
         return None if current is None else Path(current).name
 
     def begin(self, paths: list[str], restarted: list[str]) -> None:
-        """Keep what is at `paths`, and which release is current.
-
-        Args:
-            paths: Below the root; those that are not there yet are noted as such.
-            restarted: Services that will be restarted, so that taking it back restarts them again.
-        """
+        """Keep what is at `paths`, the current release, and what will be `restarted`."""
         self._forget()
         kept: dict[str, str | None] = {}
         for number, path in enumerate(paths):
@@ -91,11 +73,7 @@ class Transaction:
         self._write(self._read() | {"open": False})
 
     def take_back(self) -> list[str]:
-        """Put everything back; the services that have to be restarted.
-
-        Raises:
-            InstallError: There is nothing to take back.
-        """
+        """Put everything back; the services that have to be restarted."""
         notes = self._there()
         for path, kept in notes["files"].items():
             before = None if kept is None else read(self._root, f"{NOTES}/{kept}")
@@ -126,7 +104,7 @@ class Transaction:
         write(self._root, f"{NOTES}/{_MANIFEST}", File(json.dumps(notes, indent=1).encode(), 0o600))
 
     def _forget(self) -> None:
-        """The manifest goes first: without it what is left means nothing."""
+        """Remove the notes, the manifest first: without it what is left means nothing."""
         self._manifest.unlink(missing_ok=True)
         shutil.rmtree(self._notes, ignore_errors=True)
 
@@ -144,7 +122,6 @@ def read(root: Path, path: str) -> File | None:
 
     Raises:
         InstallError: It is in the slave's folder, and no plain file: root follows no link that a slave may have made.
-        OSError: It cannot be read.
     """
     own = _is_slaves(path)
     try:
@@ -164,13 +141,10 @@ def read(root: Path, path: str) -> File | None:
 
 
 def write(root: Path, path: str, file: File) -> None:
-    """Write a file whole or not at all.
-
-    It belongs to the owner of its folder, so that a slave may save its own again.
+    """Write a file whole or not at all; it belongs to the owner of its folder.
 
     Raises:
         InstallError: A folder of the slave's is a link: whoever made it would have root write elsewhere.
-        OSError: It cannot be written.
     """
     name, fresh = Path(path).name, f".{Path(path).name}.new"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -192,26 +166,14 @@ def write(root: Path, path: str, file: File) -> None:
 
 
 def remove(root: Path, path: str) -> None:
-    """Remove a file, if it is there.
-
-    Raises:
-        InstallError: A folder of the slave's is a link.
-        OSError: It cannot be removed.
-    """
+    """Remove a file, if it is there."""
     with contextlib.suppress(FileNotFoundError), _folder(root, path, make=False) as folder:
         os.unlink(Path(path).name, dir_fd=folder)
 
 
 @contextlib.contextmanager
 def _folder(root: Path, path: str, *, make: bool) -> Generator[int]:
-    """Open a descriptor of the folder of a file.
-
-    Missing folders are made with the right properties if `make` is set.
-
-    Raises:
-        InstallError: A folder of the slave's is a link.
-        OSError: It is not there, or cannot be made.
-    """
+    """Descriptor of the folder of a file, made with the right mode if `make`."""
     below = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
     so_far = Path()
     try:
@@ -228,10 +190,7 @@ def _folder(root: Path, path: str, *, make: bool) -> Generator[int]:
 
 
 def _inner(name: str, folder: int, path: str, make: bool) -> int:
-    """Open a descriptor of the folder `name` in `folder`.
-
-    `path` states where that is.
-    """
+    """Descriptor of the folder `name` in `folder`; `path` states where that is."""
     own, fresh = _is_slaves(path), False
     if make:
         with contextlib.suppress(FileExistsError):
@@ -274,16 +233,7 @@ LOCKED = "opt"
 
 @contextlib.contextmanager
 def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
-    """Hold the machine below `root` for oneself.
-
-    Args:
-        root: Where the machine's files are.
-        notify: Notified that it has to wait.
-        sleep: Waits so many seconds.
-
-    Raises:
-        InstallError: Another one still has it after ten minutes.
-    """
+    """Hold the machine below `root` for oneself."""
     (root / LOCKED).mkdir(parents=True, exist_ok=True)
     folder = os.open(root / LOCKED, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -1,12 +1,7 @@
 """List the files that a plan installs, with their places and content.
 
-Phalanx's lines in a Raspberry Pi's config.txt.
-
-They are a marked block that has only what the file does not state already.
-
-Files that a plan installs, with their places and content.
-
-Keys and calibration are checked before anything is written.
+In a Raspberry Pi's config.txt a marked block has only what the file does not state already. Keys are checked before
+anything is written. Keys that are none raise `InstallError`.
 """
 
 from __future__ import annotations
@@ -28,10 +23,7 @@ _ALL = "[all]"  # lines before may be for one model only
 
 
 def with_block(text: str, lines: Sequence[str]) -> str:
-    """Return `text` with a block of those `lines` that it lacks.
-
-    Without a block if it has all of them.
-    """
+    """`text` with a block of those `lines` that it lacks, if any."""
     plain = without_block(text)
     own = _shown_to_all(plain)
     missing = [line for line in lines if line not in own]
@@ -57,10 +49,7 @@ def without_block(text: str) -> str:
 
 
 def _shown_to_all(text: str) -> set[str]:
-    """Return the lines that hold on every model.
-
-    Of a setting that is stated twice, the last one counts.
-    """
+    """The lines that hold on every model; the last of a setting counts."""
     stated: dict[str, str] = {}
     everyone = True
     for line in (line.strip() for line in text.splitlines()):
@@ -93,15 +82,10 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What the last installation left behind for the next one.
+    """What the last installation left behind for the next one."""
 
-    Attributes:
-        calibration: Path below calib_json -> SHA-256 of what the PC had then.
-        groups: Groups of the system that we made.
-    """
-
-    calibration: Mapping[str, str]
-    groups: tuple[str, ...] = ()
+    calibration: Mapping[str, str]  # path below calib_json -> SHA-256 of what the PC had then
+    groups: tuple[str, ...] = ()  # groups of the system that we made
 
     @staticmethod
     def read(root: Path) -> Record:
@@ -123,11 +107,7 @@ class Record:
 
 
 def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
-    """Path below `root` -> what it is to be; None: gone.
-
-    Raises:
-        InstallError: Keys are none, or there are none at all.
-    """
+    """Path below `root` -> what it is to be; None: gone."""
     files: dict[str, File | None] = {
         UNIT: File(_own("phalanx-slave@.service")),
         SYSUSERS: File(_own("phalanx.sysusers.conf")),
@@ -156,13 +136,7 @@ def own_groups() -> list[str]:
 
 
 def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
-    """Refuse invalid keys.
-
-    That is what is no rig key, no secret, no certificate, or a key of another certificate.
-
-    Raises:
-        InstallError: Names the file.
-    """
+    """Refuse what is no rig key, secret or certificate, or another one's key."""
     for file in ("rig.key", *(f"device-{name}.secret" for name in names)):
         if not re.fullmatch(rb"[0-9a-fA-F]{64}\s*", keys[file]):
             raise InstallError(
@@ -220,10 +194,7 @@ def _gone(plan: Plan, root: Path) -> dict[str, File | None]:
 
 
 def _calibration(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
-    """Return the PC's calibration files that are new or changed.
-
-    They are compared with the last installation; else what the slave saved stays.
-    """
+    """Files that the PC changed since the last time; what a slave saved stays."""
     files: dict[str, File | None] = {}
     for path, content in plan.calibration.items():
         there = (root / CALIB / path).exists()

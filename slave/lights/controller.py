@@ -1,21 +1,13 @@
 """Predict the exposures of a camera, and switch its lights in step.
 
-Predict the next exposures of a camera, and which light each one gets.
+The strobe is that of Kim et al. 2012: ambient, laser, LED as frame number k modulo 3 is 0, 1, 2. Which frame is
+number 0 is agreed with nobody: a frame is classified by its content (`slave.wrist.strobe`).
 
-The strobe is that of Kim et al. 2012: ambient, laser, LED in turn.
+The stamps of a camera that runs freely lie on a line: mid-exposure = first + number x period. It is fitted to the
+last ones by least squares, numbers counted by time alone (so that lost frames do no harm), and read where the next
+frames will be. There is no schedule until an exposure is known to a part of the lead, and none beyond `AHEAD` periods
+after the last frame: a camera that stalls is not lit.
 
-The stamps of a camera that runs freely lie on a line: mid-exposure = first + number x period. A line is fitted to the
-last ones by least squares, numbers counted by time alone (so that lost frames and drivers that number only what they
-deliver do no harm), and read where the next frames will be. There is no schedule until the stamps lie on a line well
-enough that an exposure is known to a part of the lead, and none beyond `AHEAD` periods after the last frame: a camera
-that stalls is not lit.
-
-Frame number k of the strobe's cycle is ambient, laser, LED as k modulo 3 is 0, 1, 2. Which frame is number 0 is agreed
-with nobody: a frame is classified by its content (`slave.wrist.strobe`).
-
-Switch ambient -> laser -> LED in step with a camera.
-
-`Strober.step` does what is due and returns when to call it again; it never waits. The thread only waits and steps.
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
 exposure skips that pulse (`skipped`): a frame without its light makes no cycle, a light that smears into the next
 frame might become a wrong one. A light that came on only after the exposure had begun goes off at once (`late`).
@@ -42,20 +34,12 @@ MARGIN_NS = 200_000  # a light is on from so long before an exposure to so long 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One light for one exposure; times on the clock of the stamps [ns].
+    """One light for one exposure; times on the clock of the stamps [ns]."""
 
-    Attributes:
-        number: Frame number in the cycle's count.
-        lit: The light.
-        on_ns: When to switch it on.
-        latest_ns: Later than this it must not go on any more: the exposure would begin without it.
-        off_ns: When to switch it off.
-    """
-
-    number: int
+    number: int  # frame number in the cycle's count
     lit: Illumination
     on_ns: int
-    latest_ns: int
+    latest_ns: int  # later than this it must not go on any more: the exposure would begin without it
     off_ns: int
 
 
@@ -74,22 +58,18 @@ class _Line:
 
 
 class StrobeSchedule:
-    """Predicts. Holds the last stamps with their numbers, and the line through them.
+    """Predicts exposures from the last stamps and the line through them.
 
-    Attributes:
-        restarts: How often the stamps left the line, or were away too long, and a new one was begun.
+    `restarts` counts how often the stamps left the line, or were away too long, and a new one was begun.
     """
 
     def __init__(
         self, frame_rate_hz: float, exposure_us: float, lead_us: float, offset_us: float = 0.0
     ) -> None:
-        """Know of no frame yet.
+        """Know of no frame yet; a light goes on `lead_us` before an exposure [us].
 
-        Args:
-            frame_rate_hz: Of the camera file: single frames.
-            exposure_us: Exposure and, of a rolling shutter, the reading of all rows [us].
-            lead_us: How much before an exposure a light goes on [us].
-            offset_us: How much later exposures are than their time stamps [us].
+        `frame_rate_hz` counts single frames; `exposure_us` includes the reading of all rows of a rolling shutter;
+        exposures are `offset_us` later than their stamps.
         """
         self._nominal_ns = 1e9 / frame_rate_hz
         self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)
@@ -114,12 +94,7 @@ class StrobeSchedule:
         return self._line is not None
 
     def push(self, seq: int, t_ns: int) -> bool:
-        """Take the time stamp of a frame, its mid-exposure [ns].
-
-        Returns whether a new line is begun, whose numbers start again.
-
-        The number `seq` matters for the first frame of a line only.
-        """
+        """Take a mid-exposure [ns]; whether a new line begins, counted from `seq`."""
         if not self._stamps:
             self._stamps.append((seq, t_ns))
             return True
@@ -154,10 +129,7 @@ class StrobeSchedule:
         return number + int((now_ns - begun_ns) // self._line.period_ns)
 
     def after(self, number: int) -> Pulse | None:
-        """Return the first pulse of a frame after frame `number`.
-
-        None: not known, or too far ahead.
-        """
+        """First pulse after frame `number`; None: not known, or too far ahead."""
         if self._line is None:
             return None
         for k in range(number + 1, self._stamps[-1][0] + AHEAD + 1):
@@ -194,24 +166,12 @@ _LOG = logging.getLogger(__name__)
 
 
 class Strober:
-    """Makes the light of each frame.
+    """Switches the light of each frame.
 
-    Holds the pulse that is on, and the number of the last frame that was lit or skipped.
-
-    Attributes:
-        counts: Event -> how often.
-            skipped: pulses not begun, as it was too late for them.
-            late: pulses ended at once, as the driver took too long.
+    `counts`: pulses `skipped`, as it was too late for them; `late`, ended at once, as the driver took too long.
     """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        """Begin dark.
-
-        Args:
-            schedule: Knows the exposures.
-            guard: The lights.
-            clock: That of the frames' stamps.
-        """
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
         self._on: Pulse | None = None
         self._number = -1
@@ -276,30 +236,23 @@ class Strober:
 
 
 class Strobe:
-    """Keeps a camera lit: schedule of exposures, strober, lights."""
+    """Keeps a camera lit: schedule, fed by `push`, strober, lights."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        """Begin dark.
-
-        Args:
-            schedule: Fed by `push`.
-            interlock: The lights; closed by `close`.
-            clock: That of the frames' stamps.
-        """
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
         self._strober = Strober(schedule, interlock, clock)
 
     def push(self, seq: int, t_ns: int) -> None:
-        """A frame came; its mid-exposure [ns]."""
+        """Take a frame's mid-exposure [ns]."""
         if self._schedule.push(seq, t_ns):
             self._strober.renumber()
 
     def expose(self, exposure_us: float) -> None:
-        """The camera exposes for so long from now on [us]."""
+        """Take another exposure time [us]."""
         self._schedule.expose(exposure_us)
 
     def stalled(self) -> None:
-        """There are no frames any more: go dark, and know nothing."""
+        """Go dark, and forget the stamps: there are no frames any more."""
         self._schedule.forget()
         self._strober.renumber()
         self._strober.dark()
@@ -310,23 +263,15 @@ class Strobe:
         return {f"lights.{event}": count for event, count in own.items()}
 
     def close(self) -> None:
-        """Go dark, give the lights back. Safe to call twice.
-
-        Raises:
-            LightsError: The lights could not be darkened.
-        """
+        """Go dark, give the lights back. Safe to call twice."""
         self._strober.dark()
         self._interlock.close()
 
 
 class StrobeController(Strobe):
-    """A strobe that works on a thread of its own.
-
-    Holds the strober and its schedule under one lock.
-    """
+    """A strobe that works on a thread of its own, under one lock."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        """Start the thread; arguments as of `Strobe`."""
         super().__init__(schedule, interlock, clock)
         self._news = threading.Condition()
         self._closed = False

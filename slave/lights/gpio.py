@@ -1,16 +1,14 @@
-"""Laser and LEDs behind two GPIO lines.
-
-They are driven by libgpiod 2 (Linux's character device); this is the only file that uses it.
+"""Switch laser and LEDs behind two GPIO lines, by libgpiod 2.
 
 `gpio:CHIP:LASER,LED`: the chip as a path, a name or a number, the lines as numbers of the chip or by name; `/low`
-after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a change
-seen, and read back.
+after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a
+change seen, and read back.
 
-A slave that is killed or stopped during a pulse darkens nothing, and what a pin does whose process is gone is the
-matter of the chip's driver: it may become an input, or keep its level. So a second process inherits the request, is
-sent every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`).
-None is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
-monostable in series (docs/safety.md).
+A slave that is killed or stopped during a pulse darkens nothing, and the chip's driver may keep a pin's level. So a
+second process inherits the request, is sent every pulse, and sets the lines dark when one lasts too long or the first
+process is gone (`gpio_watchdog`); none is lit without it. Against a dead kernel, or a kill of both, only wires help:
+a pull-down resistor, and a monostable in series (docs/safety.md). What is missing or does not follow raises
+`LightsError`.
 """
 
 import errno
@@ -49,11 +47,7 @@ class Line:
 
     @classmethod
     def of(cls, text: str) -> "Line":
-        """`17`, `GPIO17`, either with `/low`.
-
-        Raises:
-            LightsError: Neither.
-        """
+        """`17`, `GPIO17`, either with `/low`; else `LightsError`."""
         place, slash, level = text.partition("/")
         if not place or (slash and level != "low"):
             raise LightsError(f"--lights gpio: line {text!r}: {FORM}")
@@ -61,21 +55,10 @@ class Line:
 
 
 class GpioLights:
-    """`Lights` behind two GPIO lines.
-
-    Holds the request of the lines and its watchdog process; None while the chip is away.
-    """
+    """`Lights` behind two GPIO lines."""
 
     def __init__(self, place: str, longest_s: float) -> None:
-        """Request the lines, dark.
-
-        Args:
-            place: CHIP:LASER,LED.
-            longest_s: No light is on for longer, whatever becomes of this process [s].
-
-        Raises:
-            LightsError: No such chip or line, not allowed, in use by somebody else, or the library is missing.
-        """
+        """Request CHIP:LASER,LED, dark; no light is on for more than `longest_s` [s]."""
         chip, colon, lines = place.rpartition(":")
         names = lines.split(",")
         if not colon or not chip or len(names) != 2:
@@ -92,11 +75,7 @@ class GpioLights:
         self._reopened = 0
 
     def switch(self, lit: Illumination) -> None:
-        """Set both lines; lines that were lost are requested again first.
-
-        Raises:
-            LightsError: The chip or the watchdog process is gone, or a line does not follow.
-        """
+        """Set both lines; lines that were lost are requested again first."""
         if self._closed:
             return
         if self._request is None:
@@ -215,7 +194,6 @@ class GpioLights:
         return f"{self._chip}: line {lines}: cannot be requested ({error}); `gpioinfo` lists the lines"
 
     def _users(self) -> str:
-        """Who has the lines."""
         try:
             with self._gpiod.Chip(self._chip) as chip:
                 infos = [chip.get_line_info(one.place) for one in (self._laser, self._led)]
@@ -236,11 +214,7 @@ def _levels(values: Sequence[object]) -> str:
 
 
 def _library() -> ModuleType:
-    """The library, in version 2.
-
-    Raises:
-        LightsError: It is missing, or version 1.
-    """
+    """The library, in version 2."""
     try:
         import gpiod
     except ImportError as error:

@@ -1,6 +1,4 @@
-"""Watchdog that darkens two GPIO lines when the slave that lit them cannot.
-
-It is a process of its own, started beside the slave.
+"""Darken two GPIO lines, as a process of its own, when their slave cannot.
 
     python gpio_watchdog.py FD LONGEST_S        standard input: a pipe; the slave writes `1` before a light goes on
                                             and `0` after it went off
@@ -23,10 +21,7 @@ SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL of linux/gpio.h: _IOWR(
 
 
 def main() -> int:
-    """Watch until standard input ends, and return the exit code.
-
-    0: the lines are dark, 1: they do not exist any more.
-    """
+    """Watch until standard input ends; 0: the lines are dark, 1: they are gone."""
     for number in (signal.SIGABRT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     lines, longest_s = int(sys.argv[1]), float(sys.argv[2])

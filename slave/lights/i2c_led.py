@@ -1,18 +1,15 @@
-"""Laser and LEDs behind one LM3644 flash driver on I2C.
-
-LED1 drives the laser, LED2 the LEDs.
+"""Switch laser (LED1) and LEDs (LED2) behind one LM3644 flash driver on I2C.
 
 Texas Instruments, LM3644, SNVSA52E (September 2016); sections of that data sheet below. Its flash mode is begun by
 one write and ended by another, or by the chip itself: after the time-out, 10 ms at the least, it clears the mode bits
-(8.3.1, 8.4.5.2). So a pulse ends though the slave was killed, the bus is cut or the kernel has died: the chip needs
-nobody. It also regulates the currents, and stops for shorts and heat. The LM3644TT, whose shortest time-out is 40 ms,
-is refused.
+(8.3.1, 8.4.5.2). So a pulse ends though the slave was killed, the bus is cut or the kernel has died. It also
+regulates the currents, and stops for shorts and heat. The LM3644TT, whose shortest time-out is 40 ms, is refused.
 
 A fault takes the chip to standby until both flag registers are read, which clears them (8.4.5.1): they are read after
-every pulse, and counted by name. After an unplug all registers have their defaults: everything is written and read back
-again before the next pulse. Registers are written at 400 kHz in 70 us, at 100 kHz in 0.3 ms: well within the lead.
-
-Torch and IR mode, in which no time-out ends the light, are never written.
+every pulse, and counted by name. After an unplug all registers have their defaults: everything is written and read
+back again before the next pulse. Registers are written at 400 kHz in 70 us, at 100 kHz in 0.3 ms: well within the
+lead. Torch and IR mode, in which no time-out ends the light, are never written. A chip that is missing, another one
+or not dark, and currents out of range, raise `LightsError`.
 """
 
 import fcntl
@@ -58,21 +55,10 @@ FAULTS2 = ("led_hot", "overvoltage", "input_low", "ntc_open", "ntc_short")
 
 
 class FlashDriverLights:
-    """`Lights` behind the flash driver chip.
-
-    Holds the open bus, and whether the chip is known to be set up; counts its faults.
-    """
+    """`Lights` behind the flash driver chip; counts its faults."""
 
     def __init__(self, place: str, strobe: StrobeCalibration) -> None:
-        """Open the bus, and set the chip up, dark.
-
-        Args:
-            place: BUS[:ADDRESS], numbers; the address in C's notation.
-            strobe: With the currents of laser and LEDs.
-
-        Raises:
-            LightsError: No such bus, not allowed, no chip there or another one; a current is missing or out of range.
-        """
+        """Open the bus of BUS[:ADDRESS], the address in C's notation; set up, dark."""
         bus, colon, address = place.partition(":")
         try:
             # 8.5.2.4
@@ -92,11 +78,7 @@ class FlashDriverLights:
         self._set_up()
 
     def switch(self, lit: Illumination) -> None:
-        """Begin a flash, or end it; a chip that was away is set up again first.
-
-        Raises:
-            LightsError: The chip does not answer, or did not go dark.
-        """
+        """Begin a flash, or end it; a chip that was away is set up again first."""
         if lit not in FLASH:
             self.off()
             return
@@ -128,16 +110,11 @@ class FlashDriverLights:
             self._drop()
 
     def counts(self) -> dict[str, int]:
-        """Return the fault and reconnection counts.
-
-        `fault.<name>`: what the chip's flags reported; `reopened`: how often it was lost and came back.
-        """
+        """`fault.<name>`: of the chip's flags; `reopened`: how often it was lost."""
         return dict(self._counts)
 
     def _set_up(self) -> None:
         """Check which chip it is, and write and read back what it needs."""
-        if self._bus is None:
-            self._bus = self._opened()
         self._write(REGISTER.enable, REGISTER.standby)
         id_mask, lm3644 = 0x3F, 0x02  # 8.6.12
         kind = self._read(REGISTER.device_id) & id_mask
@@ -189,10 +166,7 @@ class FlashDriverLights:
         return self._bus
 
     def _lost(self, error: OSError) -> LightsError:
-        """Mark the bus to be opened again next time and return the error.
-
-        It may have been an adapter that was unplugged.
-        """
+        """The error; the bus, maybe of an unplugged adapter, is opened again next time."""
         self._drop()
         return LightsError(
             f"{self._where}: no answer ({error.strerror or error}); `i2cdetect -y {self._number}` shows who answers"
@@ -204,10 +178,7 @@ class FlashDriverLights:
             bus.close()
 
     def _opened(self) -> SMBus:
-        """Return the open bus, locked against other programs.
-
-        Every program of lights takes the lock: each keeps the limits for itself alone.
-        """
+        """The open bus, locked: each program of lights keeps the limits for itself alone."""
         try:
             bus = SMBus(self._number)
         except FileNotFoundError as error:
@@ -232,11 +203,7 @@ class FlashDriverLights:
 
 
 def current_code(current_a: float | None, light: str) -> int:
-    """Code of the largest current that is not above `current_a` [A] (8.6.3).
-
-    Raises:
-        LightsError: There is none, or it is out of range.
-    """
+    """Code of the largest current that is not above `current_a` [A] (8.6.3)."""
     least_a, step_a, most_code = 0.0109, 0.011725, 0x7F  # 8.6.3, 8.6.4: I = code x 11.725 mA + 10.9 mA
     most_a = least_a + most_code * step_a
     if current_a is None or not least_a <= current_a <= most_a:

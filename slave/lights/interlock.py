@@ -1,12 +1,10 @@
-"""Safety interlock between a source of light commands and the driver.
+"""Guard a light driver: no pulse too long, no duty too high, never left on.
 
-No pulse is too long, no duty too high, and the light goes off if nobody switches it off.
-
-Wrapped around every driver. It knows nothing of cameras: it holds the two limits of the rig file (`max_pulse_us`,
-`max_duty`) against what is asked for and against what happens, on the clock of this machine. A pulse is refused before
-it begins if it is to be longer than allowed, or if with it a light would have been on for more than its share of the
-last second. A watchdog, on a thread of its own, ends what has lasted as long as it may. What a driver does when the
-whole process dies is its own matter, described in each driver's file and in docs/safety.md.
+Wrapped around every driver, it holds the two limits of the rig file (`max_pulse_us`, `max_duty`) against what is
+asked for and what happens, on the clock of this machine. A pulse is refused if it is to be longer than allowed, or if
+with it a light would have been on for more than its share of the last second. A watchdog, on a thread of its own,
+ends what has lasted as long as it may. What happens when the whole process dies is in each driver's file and in
+docs/safety.md. A driver that fails raises `LightsError`.
 """
 
 import atexit
@@ -31,11 +29,9 @@ class Lights(Protocol):
     """Laser and LEDs of a wrist device. Opened dark by its constructor."""
 
     def switch(self, lit: Illumination) -> None:
-        """Switch the laser on (`LASER`), the LEDs on (`LED`), or both off.
+        """Switch laser on (`LASER`), LEDs on (`LED`), or both off, and wait for it.
 
         Nothing is on for `AMBIENT` and `NONE`; laser and LEDs are never on together.
-
-        Returns when it is done.
 
         Raises:
             LightsError: The device is gone, or did not do it. What it does then, nobody knows: `off` is tried next.
@@ -58,14 +54,7 @@ class Lights(Protocol):
 class Interlock:
     """A light driver within limits.
 
-    Holds what is on, until when at most, the pulses of the last second, whether it failed.
-
-    Attributes:
-        counts: Event -> how often.
-            pulses: begun.
-            refused: not begun, as they would have been too long, or too much.
-            off_by_watchdog: ended by the watchdog.
-            failed: the driver did not do as commanded.
+    `counts`: `pulses` begun; `refused`, too long or too much; `off_by_watchdog`; `failed`, not done as commanded.
     """
 
     def __init__(
@@ -75,14 +64,7 @@ class Interlock:
         clock: Clock | None = None,
         watch: bool = True,
     ) -> None:
-        """Take the driver over, dark, and start the watchdog.
-
-        Args:
-            lights: The driver; closed by `close`.
-            strobe: The limits.
-            clock: Of this machine.
-            watch: Start the watchdog's thread; without, somebody calls `look`.
-        """
+        """Take the driver over, dark; start the watchdog: without, call `look`."""
         self._lights = lights
         self._clock: Clock = SystemClock() if clock is None else clock
         self._longest_ns = round(strobe.max_pulse_us * 1e3)
@@ -102,11 +84,7 @@ class Interlock:
     def begin(self, lit: Illumination, length_ns: int) -> bool:
         """Have a light on for so long [ns]; whoever begins also calls `end`.
 
-        Returns:
-            False, and nothing is on, if that is too long, too much, or something is on already or may be.
-
-        Raises:
-            LightsError: The driver failed.
+        False, and nothing is on, if that is too long, too much, or something is on already or may be.
         """
         with self._changed:
             now_ns = self._clock.now_ns()
@@ -133,10 +111,7 @@ class Interlock:
             self._on, self._failing = None, False
 
     def look(self) -> float | None:
-        """Switch off a light that has lasted long enough.
-
-        Returns in how many seconds to check again, None: there is nothing to check.
-        """
+        """End a light that has lasted long enough; in how many seconds to look again."""
         with self._changed:
             if not self._failing:
                 if self._on is None:
@@ -154,11 +129,7 @@ class Interlock:
             return None
 
     def close(self) -> None:
-        """Go dark, give the driver back, end the watchdog. Safe to call twice.
-
-        Raises:
-            LightsError: The driver could not be darkened.
-        """
+        """Go dark, give the driver back, end the watchdog. Safe to call twice."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -172,10 +143,7 @@ class Interlock:
         return {**self.counts, **self._lights.counts()}
 
     def _order(self, order: Callable[[], None]) -> None:
-        """Send an order to the driver.
-
-        Whatever it raises is a failure, after which a light may be on: the watchdog handles that.
-        """
+        """Send an order; whatever it raises is a failure, after which a light may be on."""
         try:
             order()
         except (

@@ -1,15 +1,9 @@
 """Light the frames of a camera, real or simulated, by a strobe.
 
-Camera whose frames are lit by a strobe.
-
-Every frame's stamp goes to the controller on its way to the detector.
-
-Light a simulated wrist device by the strobe of real lights.
-
-The camera waits for the strobe: before a frame is drawn, everything that the strobe would have done up to the end of
-its exposure is done, each at the moment it asked for, or later where lateness is part of the simulation. A thread
-would be as late as the drawing of pictures in the same process makes it, which no real device suffers from. The lights
-write into a timeline what was on when, and the camera looks it up.
+Every frame's stamp goes to the strobe on its way to the detector. A simulated camera waits for the strobe: before a
+frame is drawn, everything that the strobe would have done up to the end of its exposure is done, each at the moment
+it asked for; a thread would be as late as the drawing makes it, which no real device suffers from. An exposure that
+cannot be lit so raises `CalibrationError`; in a running camera `CameraError`.
 """
 
 import threading
@@ -31,22 +25,12 @@ from slave.sources import Frame, FrameSource, Tunable
 
 
 class StrobedCamera:
-    """A `FrameSource` around another, whose frames are lit by a strobe.
-
-    It is `Tunable` where the inner one is. Closes camera and lights. Holds the exposure limit.
-    """
+    """A `FrameSource` around another, lit by a strobe; `Tunable` where that is."""
 
     def __init__(
         self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Strobe
     ) -> None:
-        """Begin dark; light comes once the stamps are understood.
-
-        Args:
-            source: The camera, open.
-            camera: Its file, which `check_pulses` let pass.
-            rig: With `strobe`.
-            controller: Made with `schedule_of` these.
-        """
+        """Begin dark; light comes once the stamps are understood."""
         self._source, self._camera, self._rig = source, camera, rig
         self._controller = controller
 
@@ -71,11 +55,7 @@ class StrobedCamera:
             self._source.close()
 
     def tune(self, camera: CameraCalibration) -> None:
-        """As the camera's; the lights follow the exposure.
-
-        Raises:
-            CameraError: Refused by the camera, or its light would be on for longer than the rig file allows.
-        """
+        """As the camera's; the lights follow the exposure."""
         if not isinstance(self._source, Tunable):
             raise CameraError(f"camera {camera.name!r}: its driver can change no settings")
         try:
@@ -101,22 +81,14 @@ class StrobedCamera:
 
 
 def schedule_of(rig: RigCalibration, camera: CameraCalibration) -> StrobeSchedule:
-    """What predicts the exposures of a camera of a rig with `strobe`.
-
-    Raises:
-        CalibrationError: As `check_pulses`.
-    """
+    """What predicts the exposures of a camera; raises as `check_pulses`."""
     strobe = check_pulses(rig, camera)
     offset_us = rig.stamp_offset_us.get(camera.name, 0.0) + 0.5 * _rows_us(camera)
     return StrobeSchedule(camera.frame_rate_hz, _exposed_us(camera), strobe.lead_us, offset_us)
 
 
 def check_pulses(rig: RigCalibration, camera: CameraCalibration) -> StrobeCalibration:
-    """Refuse an exposure that cannot be lit alone and within the limits; the limits.
-
-    Raises:
-        CalibrationError: With the keys, their values and the bound.
-    """
+    """Refuse an exposure that cannot be lit alone and within the limits; the limits."""
     if rig.strobe is None:
         raise CalibrationError(
             f"rig {rig.name!r}: strobe: missing; lights are switched only within limits: power, pulse, duty"
@@ -149,10 +121,7 @@ def _rows_us(camera: CameraCalibration) -> float:
 
 
 def _exposed_us(camera: CameraCalibration) -> float:
-    """Return the time [us] in which any row of a frame is exposed.
-
-    From the beginning of the first row's exposure to the end of the last one's.
-    """
+    """From the start of the first row's exposure to the end of the last one's [us]."""
     return camera.exposure_us + _rows_us(camera)
 
 
@@ -172,13 +141,9 @@ class Lit:
 
 
 class Timeline:
-    """What was on when, from any thread.
-
-    Holds the last switchings; written by the lights, read by the camera.
-    """
+    """What was on when; written by the lights, read by the camera, of any threads."""
 
     def __init__(self) -> None:
-        """Begin dark."""
         self._lock = threading.Lock()
         # Four switchings per cycle of the strobe, so some seconds
         self._switched: deque[tuple[int, Illumination]] = deque(maxlen=512)
@@ -201,10 +166,9 @@ class Timeline:
 
 
 class SyntheticLights:
-    """`Lights` that only take note. Holds whether it was closed."""
+    """`Lights` that only take note on a timeline, at the times of `clock`."""
 
     def __init__(self, timeline: Timeline, clock: Clock) -> None:
-        """Switch on `timeline`, at the times of `clock`, that of the camera's stamps."""
         self._timeline, self._clock = timeline, clock
         self._closed = False
 
@@ -228,8 +192,6 @@ class SyntheticLights:
 
 
 class _SetClock:
-    """A clock that is set."""
-
     def __init__(self) -> None:
         self.t_ns = 0
 
@@ -238,31 +200,19 @@ class _SetClock:
 
 
 class SimulatedStrobe(Strobe):
-    """Keeps a synthetic camera lit, without a thread.
-
-    Holds the time up to which all is done.
-    """
+    """Keeps a synthetic camera lit, without a thread."""
 
     def __init__(
         self, schedule: StrobeSchedule, strobe: StrobeCalibration, late_ns: Callable[[], int] = lambda: 0
     ) -> None:
-        """Begin dark.
-
-        Args:
-            schedule: Fed by `push`.
-            strobe: The limits.
-            late_ns: How much later than asked for the strober comes this time [ns].
-        """
+        """Begin dark; `late_ns`: how much later than asked for the strober comes [ns]."""
         self._late_ns, self._set_clock, self._timeline = late_ns, _SetClock(), Timeline()
         lights = SyntheticLights(self._timeline, self._set_clock)
         super().__init__(schedule, Interlock(lights, strobe, self._set_clock, watch=False), self._set_clock)
         self._again_ns: int | None = None
 
     def during(self, start_ns: int, stop_ns: int) -> Lit:
-        """What is on from `start_ns` to `stop_ns` [ns].
-
-        That is not before the times asked for until now.
-        """
+        """What is on from `start_ns` to `stop_ns` [ns], not before any time asked so far."""
         while self._again_ns is not None and self._again_ns <= stop_ns:
             self._monitored(self._again_ns)
             self._set_clock.t_ns = max(self._again_ns, self._set_clock.t_ns)

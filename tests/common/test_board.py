@@ -10,7 +10,7 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.geometry.transforms import transform
-from common.sim.board import BOARD, BoardRenderer, BoardScene
+from common.sim.board import BOARD, BoardRenderer, BoardScene, board_corners
 
 CALIB = Path(__file__).parents[2] / "calib_json"
 RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)
@@ -21,7 +21,7 @@ STEP_S = BOARD.held_s + BOARD.moved_s
 
 def seen_at(renderer: BoardRenderer, camera: str, t_s: float) -> tuple[Float, Float]:
     """Corners (54, 2) as found near the truth, and the truth [px]."""
-    truth = SCENE.optics(camera).project(transform(SCENE.T_rig_board(t_s), SCENE.corners_m()))
+    truth = SCENE.optics(camera).project(transform(SCENE.T_rig_board(t_s), board_corners()))
     grey = np.asarray(cv2.cvtColor(renderer.render(t_s), cv2.COLOR_BGR2GRAY))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
     start = truth.astype(np.float32).reshape(-1, 1, 2)
@@ -62,7 +62,7 @@ def test_the_board_is_held_and_then_moved() -> None:
 
 
 def test_squares_have_their_size() -> None:
-    edge = SCENE.corners_m().reshape(BOARD.rows, BOARD.columns, 3)
+    edge = board_corners().reshape(BOARD.rows, BOARD.columns, 3)
     np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=1), axis=2), BOARD.square_m)
     np.testing.assert_allclose(np.linalg.norm(np.diff(edge, axis=0), axis=2), BOARD.square_m)
 

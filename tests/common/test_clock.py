@@ -1,4 +1,4 @@
-"""Clocks: a skewed clock inverts exactly, a tick never drifts, an offset is found to microseconds."""
+"""Clocks: a skewed clock inverts exactly, an offset is found to microseconds."""
 
 import random
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.clock import SkewedClock, SystemClock, Ticker
+from common.clock import SkewedClock, SystemClock
 from common.link.clock_offset import ClockEstimate, OffsetEstimator
 from tests.network_helpers import ManualClock
 
@@ -87,31 +87,6 @@ def test_system_clock_never_runs_backwards() -> None:
     clock = SystemClock()
     times = [clock.now_ns() for _ in range(1000)]
     assert times == sorted(times)
-
-
-def test_ticks_stay_on_their_grid_and_skip_what_is_over() -> None:
-    clock = ManualClock(1000)
-    ticker = Ticker(100, clock)
-    clock.t_ns = 1130  # the body took 130: the tick at 1100 is late but still the current one
-    assert ticker.next() == 1100
-    clock.t_ns = 1210
-    assert ticker.next() == 1200
-    clock.t_ns = 1570  # 1300 and 1400 are over for good
-    assert ticker.next() == 1500
-    assert ticker.missed == 2
-    with pytest.raises(ValueError, match="period_ns"):
-        Ticker(0)
-
-
-def test_a_tick_is_waited_for() -> None:
-    clock = SystemClock()
-    ticker = Ticker(2 * MS, clock)
-    first = ticker.next()
-    assert clock.now_ns() >= first
-    for _ in range(5):
-        tick = ticker.next()
-        assert (tick - first) % (2 * MS) == 0
-        assert clock.now_ns() >= tick
 
 
 @given(

@@ -208,7 +208,7 @@ from common.errors import MessageError, PhalanxError
 from common.messages import decode
 from common.recording.pictures import size_of
 from common.recording.pictures import decode as picture, decode_file
-from master.calibrate.cameras.views import _load
+from master.calibrate.cameras.views import load_image
 from master.calibrate.wrist.device import load_grey
 from slave.cameras.grey import Pixels
 from slave.cameras.replay import read_png
@@ -220,7 +220,7 @@ ways = {
     "usb": lambda: Layout(Pixels.COLOUR, "MJPG", (640, 480), 0).image(memoryview(data)),
     "usb grey": lambda: Layout(Pixels.LUMA, "MJPG", (640, 480), 0).image(memoryview(data)),
     "recording": lambda: read_png(path, (480, 640)),
-    "file": lambda: _load(path),
+    "file": lambda: load_image(path),
     "grey file": lambda: load_grey(path),
     "unguarded": lambda: cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR),
 }

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from bench.rigs.faults import LEAST_HZ, Fault, FaultRig, Run, cut, measured, of_links
+from bench.rigs.faults import LEAST_HZ, Fault, FaultRig, Pace, Run, cut, measured, of_links
 from bench.rigs.local import UP_S, until
-from bench.rigs.poses import Pace
 from tests.hostile_datagrams import Capture, assault, flood, hostile, targets
 
 FAULTS = {fault.name: fault for fault in of_links(seconds=1.5)}

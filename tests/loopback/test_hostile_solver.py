@@ -13,8 +13,8 @@ import pytest
 from msgspec import Struct
 
 from bench.rigs.fuzz import Attack, all_attacks
-from bench.rigs.fuzz_examples import Speaker, own_kinds
 from bench.rigs.hostile import HAND, HONEST, RATE_HZ, STOLEN, WRIST_RIG, scratch_tree
+from bench.rigs.hostile_sender import Speaker, own_kinds
 from bench.rigs.rooms import ROOM, detections
 from common.link.datagram import MAX_DATAGRAM, OVERHEAD, Kind
 from common.link.handshake import EchoAnswer, Started

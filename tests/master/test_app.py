@@ -12,11 +12,11 @@ from common.calibration import ImuCalibration
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand.model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
+from master.monitor.report import cameras_line
 from master.rig.pipeline import pipeline_of
 from master.rig.setup import RigSetup
 from master.run.app import AuxiliaryMessage, Observed, RunFigures, StageTimes, health, run
 from master.run.dispatcher import Dispatcher
-from master.run.live import cameras_line
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 

@@ -23,9 +23,10 @@ from common.messages import (
     ObjectSource,
     TrackerPose,
 )
+from master.monitor.report import cameras_line
 from master.outputs.result_files import contact_path, load_contact, load_object, object_path
 from master.rig.setup import RigFiles, load_setups
-from master.run.live import LiveSettings, cameras_line, run_live
+from master.run.live import LiveSettings, run_live
 from slave.uplink import Uplink
 from tests.network_helpers import free_endpoint, free_udp_port, until
 from tests.object_run import (

@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench.both.scene import Both, Observed
-from bench.both.shown import shown
+from bench.both.scene import Both, Observed, shown
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError, RecordingError
 from common.imu.recording import write_imu

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from bench.markers.accuracy import clicks
-from bench.markers.frames import sequences
-from bench.markers.kinds import KINDS
+from bench.markers.scene import KINDS, sequences
 from common.arrays import Image
 from common.recording.frame_recording import open_recording
 from common.sim.light import LightSchedule

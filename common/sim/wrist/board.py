@@ -1,18 +1,16 @@
 """A wrist device's camera sees a checkerboard, one place after another.
 
-Checkerboard in front of a wrist device's camera, in one place after another.
-
-It is held in each place; the frames are ambient, laser and LED.
-
-For the calibration of a wrist device without hardware. The board is flat, exact and white paper (Lambert); a wall
-stands behind it. Light falls off as it does: LEDs with the square of the distance, with the cosine on the paper and
-with their own lobe, the lens with a power of it; the laser is a sheet of Gaussian thickness within its fan.
-The sensor is linear, its noise that of photons and of reading. Not modelled: motion, since the board is held still.
+For the calibration of a wrist device without hardware; the frames are ambient, laser and LED. The board is flat,
+exact and white paper (Lambert); a wall stands behind it. Light falls off as it does: LEDs with the square of the
+distance, with the cosine on the paper and with their own lobe, the lens with a power of it; the laser is a sheet of
+Gaussian thickness within its fan. The sensor is linear, its noise that of photons and of reading. Not modelled:
+motion, since the board is held still.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -44,8 +42,9 @@ class WristBoardScene:
         rig: Wrist rig with `laser_plane` and `led`.
         camera: Its camera file, with intrinsics.
         columns, rows: Inner corners; square_m: side of a square [m].
-        poses: (N, 4, 4) board -> camera [m], held one after the other. Origin of the board: its first inner corner, x
-            along a row, y to the next row, z away from the viewer; the square between the first four corners is dark.
+        poses: (N, 4, 4) board -> camera [m], held one after the other. Origin of the board: its first inner
+            corner, x along a row, y to the next row, z away from the viewer; the square between the first
+            four corners is dark.
         ambient: Level of white paper in the light of the room, of the whole range.
         seed: Of the noise.
     """
@@ -83,11 +82,9 @@ def board_poses(
     count: int,
     seed: int,
 ) -> Float:
-    """Return board poses as a person shows them.
+    """Board poses (count, 4, 4) as a person shows them: whole, near and far, tilted.
 
-    Shape (count, 4, 4): whole in the image, near and far, tilted, crossed by the laser.
-
-    Without a plane they are anywhere in the image.
+    They are crossed by the laser; without a plane they are anywhere in the image.
 
     Raises:
         CalibrationError: The plane passes the camera's view, or the board is too large or small for it.
@@ -117,26 +114,16 @@ def board_poses(
 
 
 def _crossed(points: Float, plane: LaserPlane) -> float:
-    """Return how far points reach to both sides of a plane, the lesser of the two.
-
-    Points (n, 3), result in [m].
-    """
+    """How far [m] points (n, 3) reach to both sides of a plane, the lesser of both."""
     side = points @ np.array(plane.normal) - plane.offset_m
     return float(min(side.max(), -side.min()))
 
 
 class WristBoardRenderer:
-    """Renderer of a board scene for the wrist camera.
-
-    It holds the rays of every fine pixel; an image is a pure function of pose and light.
-    """
+    """Renderer of a board scene; an image is a pure function of pose and light."""
 
     def __init__(self, scene: WristBoardScene) -> None:
-        """Prepare the rays.
-
-        Raises:
-            CalibrationError: The camera has no intrinsics.
-        """
+        """Prepare the rays; CalibrationError: the camera has no intrinsics."""
         self._scene = scene
         optics = scene.optics()
         height, width = optics.height_px, optics.width_px
@@ -227,12 +214,7 @@ class WristBoardRenderer:
         )
 
     def _exposed(self, light: Float32, pose: int, lit: Illumination) -> Image:
-        """Convert light to a sensor image.
-
-        Blur of the lens, noise of photons and of reading, 8 bits.
-        """
-        import cv2
-
+        """Image of the sensor: blur of the lens, noise of photons and of reading, 8 bits."""
         lens_sigma_px = 0.55
         blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), lens_sigma_px), np.float64)
         rng = np.random.default_rng([self._scene.seed, pose, ILLUMINATIONS.index(lit)])
@@ -252,8 +234,8 @@ def record_wrist_board(
     """Render every pose as one strobe cycle and return the number of poses.
 
     Args:
-        folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.
-        scene: What to render.
+        folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with
+            T_camera_board.
         rig: The device by its manifest; None: the truth.
         illuminations: Frames of a strobe cycle that are kept; the others were lost.
 

@@ -1,19 +1,10 @@
 """Round cones model a simulated hand and the things that it holds.
 
-Flesh of one simulated hand: round cones on its bones.
-
-They differ from every plain model of the hand.
-
 A solver models a finger as cones with the radii of the profile. Real fingers are not that: so each seed draws other
 radii, adds the pads on the palmar side of every phalanx and the pulp at its tip, and gives the thumb its thenar. What
-a finger carries moves with its joints; what the palm carries turns with the wrist alone, and while that is straight it
-stands still in the camera's frame, as the end of the forearm always does.
-
-Things that the hand holds in front of the wrist camera.
-
-Bodies that follow those of the flesh, matt and dark.
-
-They hide what is behind them from the camera, and keep the laser and the LEDs from it.
+a finger carries moves with its joints; what the palm carries turns with the wrist alone, and while that is straight
+it stands still in the camera's frame, as the end of the forearm always does. Held things are bodies after those of
+the hand, matt and dark: they hide what is behind them from the camera, and keep the laser and the LEDs from it.
 """
 
 from collections.abc import Sequence
@@ -93,10 +84,10 @@ class HandCapsules:
         )
 
     def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Capsules:
-        """Return the bodies of the flesh in the frame of the joints.
+        """Return the bodies in the frame of the joints.
 
-        For a flexed wrist, `R_straight` (3, 3) is the rotation that the wrist's joint would have if it were straight:
-        that of the forearm.
+        Of a flexed wrist, `R_straight` (3, 3) is the rotation that its joint would have if it were straight:
+        the forearm's.
         """
         rotation, position = joints.rotation[self.joint], joints.position_m[self.joint]
         if R_straight is not None:
@@ -106,10 +97,7 @@ class HandCapsules:
         return Capsules(start, stop, self.start_radius_m, self.stop_radius_m)
 
     def same_palm(self, bodies: Capsules, others: Capsules) -> bool:
-        """Check whether the palm is identical in two sets of bodies, to the last bit.
-
-        If so, what is true of one is true of both.
-        """
+        """Whether the palm is identical in two sets of bodies, to the last bit."""
         palm = slice(self.still)
         return np.array_equal(bodies.start_m[palm], others.start_m[palm]) and np.array_equal(
             bodies.stop_m[palm], others.stop_m[palm]
@@ -121,11 +109,10 @@ class HandCapsules:
         return np.where(body > last, THING_GROUP, self.group[np.minimum(body, last)])
 
     def parts(self, bodies: Capsules, body: Int, points: Float) -> tuple[Int, Int]:
-        """Return the group and segment of lit points.
+        """Group and segment (N,) of lit points (N, 3) [m] of bodies (N,); a thing has 0.
 
-        Both (N,), at points (N, 3) [m] of bodies (N,); a thing has segment 0.
-
-        Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts them.
+        Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts
+        them.
         """
         group = self.group_of(body)
         segment = np.where(group == THING_GROUP, 0, self.segment[np.minimum(body, len(self.segment) - 1)])
@@ -137,20 +124,14 @@ class HandCapsules:
         return group, np.where(near, np.where(beyond, THUMB_SEGMENTS[1], THUMB_SEGMENTS[0]), segment)
 
     def tips(self, bodies: Capsules) -> Float:
-        """Return the outermost skin points along the last bones of the five fingers.
-
-        Shape (5, 3) [m].
-        """
+        """Outermost skin points (5, 3) [m] along the last bones of the five fingers."""
         along = bodies.stop_m[self.tip] - bodies.start_m[self.tip]
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         return bodies.stop_m[self.tip] + self.stop_radius_m[self.tip, None] * along
 
 
 class _Part(NamedTuple):
-    """One body of the flesh.
-
-    Its joint, its ends (3,) in the frame of that joint [m], radii [m], group, segment.
-    """
+    """One body: joint, ends (3,) in its frame [m], radii [m], group, segment."""
 
     joint: int
     start: Float
@@ -162,10 +143,7 @@ class _Part(NamedTuple):
 
 
 def _finger(model: HandModel, radius: list[float], finger: int, rng: np.random.Generator) -> list[_Part]:
-    """Return the cones along the phalanges, with a pad each.
-
-    The last phalanx's own cone comes last.
-    """
+    """The cones along the phalanges, with a pad each; the last one's own comes last."""
     segments = FINGER_SEGMENTS if finger else THUMB_SEGMENTS
     out: list[_Part] = []
     for k in range(3):
@@ -199,10 +177,7 @@ def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> 
 
 
 def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> list[_Part]:
-    """Return the bodies of the palm and forearm.
-
-    Metacarpals and what fills the gaps between them, the mounds before the fingers, the heel, the forearm.
-    """
+    """Metacarpals, fillings between them, mounds before the fingers, heel, forearm."""
     place, wrist_rotation, s = model.rest_position_m, model.rest_rotation[WRIST], model.side_sign
     roots = CHAINS[1:, 0]
     heads, bases = place[roots], place[list(METACARPALS)]
@@ -230,7 +205,7 @@ def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> li
     thick = -rng.uniform(0.003, 0.006)
     heel = np.array([-0.017 * s, thick - 0.010, 0.012])
     add(heel, heads[3] + np.array([0.0, thick, -0.016]), rng.uniform(0.012, 0.014), 0.0105)
-    for side in (-0.008, 0.010):  # _FOREARM_PARTS of them, the last ones
+    for side in (-0.008, 0.010):  # the last two bodies are the forearm
         add(np.array([side * s, -0.004, -0.06]), np.array([0.7 * side * s, -0.004, 0.008]), 0.021, 0.0185)
     return out
 
@@ -239,9 +214,7 @@ ALBEDO = 0.05  # of matt black coating or rubber in the near infrared, against u
 
 
 def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:
-    """Return round cones of equal radii that stand for closed cylinders.
-
-    In the camera's frame.
+    """Round cones of equal radii that stand for closed cylinders, camera frame.
 
     Their round ends hold as much as the flat ones: a hand that holds one in its middle touches none of them.
 

@@ -1,9 +1,9 @@
 """Finger motions before the wrist camera: curls, study poses, spreads, and all.
 
 A motion of stations goes from posture to posture (C2), holds each for a while and drifts all the time, as a hand in
-the air does. The wrist stays straight in all of them: the palm pose of a state is that of the forearm in the room, and
-the palm never moves in the camera's frame, since the device is strapped to the forearm. Of motions in which the wrist
-bends, `OnForearm` is what the device feels.
+the air does. The wrist stays straight in all of them: the palm pose of a state is that of the forearm in the room,
+and the palm never moves in the camera's frame, since the device is strapped to the forearm. Of motions in which the
+wrist bends, `OnForearm` is what the device feels.
 """
 
 from dataclasses import replace
@@ -35,10 +35,8 @@ KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, ther
 WOBBLE = np.radians(1.0)
 THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
 RANDOM_POSES = 60
-RANDOM_DEG, RANDOM_DIP = (
-    ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)),
-    (0.5, 0.9),
-)  # abduction, MCP, PIP; DIP / PIP
+# abduction, MCP, PIP; DIP / PIP
+RANDOM_DEG, RANDOM_DIP = ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)), (0.5, 0.9)
 FOREARM_ROTATION = np.radians(12.0)
 _HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
 _WIDE = ((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
@@ -57,10 +55,7 @@ def _alone(finger: int, share: float) -> Posture:
 
 
 def _swung(degrees: float) -> Posture:
-    """Return half-bent fingers abducted sideways together.
-
-    Towards the thumb for positive degrees.
-    """
+    """Half-bent fingers abducted sideways together, to the thumb if positive."""
     return tuple((row[0] + (degrees if finger else 0.0), *row[1:]) for finger, row in enumerate(_HALF_BENT))
 
 
@@ -90,39 +85,28 @@ _SPREAD: tuple[Posture, ...] = (
 
 
 class Stations:
-    """Sequence of postures in 60 s.
-
-    The state it holds is its script, fixed by the constructor.
-    """
+    """Sequence of postures in 60 s, and its script."""
 
     def __init__(
         self, model: HandModel, postures: tuple[Posture, ...], seed: int, period_s: float = PERIOD_S
     ) -> None:
         """Write the script: every posture is hit nearly, as people do.
 
-        Args:
-            model: Whose limits and coupling hold.
-            postures: (5, 3) each [deg]: abduction, flexion, PIP.
-            seed: Same seed, same motion.
-            period_s: Time [s] after which the first comes again; it is closed there where that is 60 s.
+        `postures` are (5, 3) each [deg]: abduction, flexion, PIP. After `period_s` [s] the first comes again;
+        the motion is closed there where that is 60 s.
         """
         rng = np.random.default_rng([seed, 11])
         self._model, self._drift = model, Drift(rng)
         self._postures = np.array(postures, dtype=np.float64)
         self._postures += rng.normal(0.0, (1.0, 2.5, 4.0), self._postures.shape)
-        self._period_s = period_s
+        self.period_s = period_s
         self._each_s = period_s / len(postures)
         move_s = 0.8  # at most: the way from one posture to the next
         self._move_s = min(move_s, 0.7 * self._each_s)
 
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return self._period_s
-
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % self._period_s
+        t = max(t_s, 0.0) % self.period_s
         place = min(int(t / self._each_s), len(self._postures) - 1)
         share = smooth_step((t - place * self._each_s) / self._move_s)
         before = self._postures[place - 1]  # that of the first is the last
@@ -137,18 +121,12 @@ class GuidedCurl:
     MCP and DIP follow the PIP by the ratios of Kim et al. 2012.
     """
 
-    def __init__(self, model: HandModel) -> None:
-        """Create the motion for one hand.
+    period_s = CURL_S
 
-        The limits of the hand do not clip what the ratios give.
-        """
+    def __init__(self, model: HandModel) -> None:
+        """Of one hand; its limits do not clip what the ratios give."""
         self._model = model
         self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return CURL_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -162,13 +140,13 @@ class GuidedCurl:
 
 
 class GuidedSubject:
-    """Motion that `calibrate wrist subject` asks for.
+    """Flat hand, straight fingers flexed at the knuckles, fist, and back.
 
-    Flat hand, straight fingers flexed at their knuckles, fist, and back.
-
-    Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
-    little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.
+    It is what `calibrate wrist subject` asks for. Nobody does it exactly: each seed is a person whose flat
+    hand is not quite flat, whose straight fingers follow a little, and whose fist has ratios of its own.
     """
+
+    period_s = SUBJECT_S
 
     def __init__(self, model: HandModel, seed: int) -> None:
         """Of one hand; the same seed, the same person."""
@@ -182,11 +160,6 @@ class GuidedSubject:
         own = 1.0 + rng.normal(0.0, (0.0, 0.10, 0.03, 0.06), (4, 4))
         self._fist = np.radians(CURL_PIP_DEG - 5.0) * ratios * own
         self._cycles, self._phase = rng.integers(2, 5, (4, 4)), rng.uniform(0.0, 2.0 * np.pi, (4, 4))
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return SUBJECT_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
@@ -203,16 +176,12 @@ class GuidedSubject:
 
 
 class RandomPoses:
-    """Sequence of poses whose joints are independent of each other.
+    """Sequence of poses whose joints are independent of each other."""
 
-    The state it holds is its script.
-    """
+    period_s = PERIOD_S
 
     def __init__(self, model: HandModel, seed: int) -> None:
-        """Draw the random poses.
-
-        In the ranges of `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits.
-        """
+        """Draw poses in `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits."""
         rng = np.random.default_rng([seed, 14])
         self._model = model
         self._angles = np.empty((RANDOM_POSES, 5, 4))
@@ -223,16 +192,8 @@ class RandomPoses:
         abduction, mcp, pip = (np.radians(rng.uniform(a, b, of)) for a, b in RANDOM_DEG)
         self._angles[:, 1:] = np.stack([abduction, mcp, pip, rng.uniform(*RANDOM_DIP, of) * pip], axis=-1)
 
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return PERIOD_S
-
     def at(self, t_s: float) -> HandState:
-        """Return the hand at time `t_s`.
-
-        In [s]; before 0 the pose of 0. In the second half of each pose's time the hand stands still.
-        """
+        """The hand at `t_s` [s]; in the second half of each pose's time it stands still."""
         t = max(t_s, 0.0) % PERIOD_S
         each_s = PERIOD_S / RANDOM_POSES
         place = min(int(t / each_s), RANDOM_POSES - 1)
@@ -243,28 +204,19 @@ class RandomPoses:
 
 
 class OnForearm:
-    """Motion of the forearm: where the palm would be if the wrist were straight.
-
-    It holds the motion.
-    """
+    """Motion of the forearm: where the palm would be if the wrist were straight."""
 
     def __init__(self, motion: HandMotion) -> None:
         """Of a hand."""
-        self._motion = motion
-
-    @property
-    def period_s(self) -> float:
-        """Time [s] after which the motion repeats."""
-        return self._motion.period_s
+        self._motion, self.period_s = motion, motion.period_s
 
     def at(self, t_s: float) -> HandState:
         """Forearm and fingers at time `t_s` [s]; before 0 the pose of 0."""
         state = self._motion.at(t_s)
         if not state.wrist_angles_rad.any():
             return state
-        back = rigid(
-            forearm_palm(state.wrist_angles_rad).T, np.zeros(3)
-        )  # both frames have their origin in the wrist
+        # both frames have their origin in the wrist
+        back = rigid(forearm_palm(state.wrist_angles_rad).T, np.zeros(3))
         return replace(state, T_rig_palm=state.T_rig_palm @ back, wrist_angles_rad=STRAIGHT)
 
 

@@ -1,18 +1,11 @@
 """Export writes a wrist sequence, alone or together with marker cameras.
 
-Export of a simulated wrist sequence as raw frames with exact truth.
-
-It is written as a recording; the order of the frames can be spoiled.
-
 The form is that of every recording of a wrist device: strobe cycles in the order ambient, laser, LED, and a truth
-with one row per strobe cycle, under the keys of rendered recordings.
+with one row per strobe cycle, under the keys of rendered recordings. The order of the frames can be spoiled.
 
-Export of one hand seen by marker cameras and its wrist device simultaneously.
-
-The result is one recording of kind `both`.
-
-All frames are on one clock, in the order of their stamps, and so are the samples of the wrist device's IMU. The truth
-is that of a marker recording, and beside it that of a wrist recording, its keys prefixed with `wrist_`.
+Together with marker cameras it is one recording of kind `both`: all frames are on one clock, in the order of their
+stamps, and so are the samples of the wrist device's IMU. The truth is that of a marker recording, and beside it that
+of a wrist recording, its keys prefixed with `wrist_`.
 """
 
 import heapq
@@ -50,10 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One frame to be taken: frame number, stamp, scene time and illumination.
-
-    Stamp in [ns], scene time in [s].
-    """
+    """One frame to be taken: number, stamp [ns], scene time [s], illumination."""
 
     seq: int
     t_ns: int
@@ -64,9 +54,7 @@ class Shot:
 def with_faults(
     frames: Sequence[T], rng: np.random.Generator, drop: float = 0.0, double: float = 0.0, swap: float = 0.0
 ) -> list[T]:
-    """Return frames as a faulty camera or link delivers them.
-
-    With these probabilities, each frame is lost, delivered twice, or delivered after the next one.
+    """Lose, double or delay frames, with these probabilities, as a faulty link does.
 
     A frame suffers at most one of the three; the frame that another one was swapped with suffers none.
     """
@@ -100,11 +88,12 @@ def record_wrist(
 
     Args:
         folder: New or empty.
-        scene: What to render.
         seconds: How long [s]; at least one strobe cycle is written.
         start_s: Scene time of the first frame [s].
-        poses_s: Scene times [s] instead: every strobe cycle is a pose of its own, in which the hand stands still.
-        faults: Makes of all frames those that are delivered, such as `with_faults`; stamps and numbers go on rising.
+        poses_s: Scene times [s] instead: every strobe cycle is a pose of its own, in which the hand stands
+            still.
+        faults: Makes of all frames those that are delivered, such as `with_faults`; stamps and numbers go on
+            rising.
         step: Pixels between the rays that shade skin (`WristRenderer`).
         rig: The device by its manifest; None: the truth.
 
@@ -118,10 +107,7 @@ def record_wrist(
 
 
 class WristTake:
-    """Frames that a wrist camera takes of a scene, with the exact truth.
-
-    It holds what is to be taken.
-    """
+    """Frames that a wrist camera takes of a scene, with the exact truth."""
 
     def __init__(
         self,
@@ -149,10 +135,7 @@ class WristTake:
         return self._shots[0].t_s, self._shots[-1].t_s
 
     def manifest(self, rig: RigCalibration | None = None) -> Manifest:
-        """Return the manifest of what is rendered.
-
-        The device is known as `rig` states; None: the truth.
-        """
+        """Return the manifest, with the device as `rig` states; None: the truth."""
         scene = self._scene
         return Manifest(
             version=1,
@@ -222,10 +205,7 @@ class WristTake:
 
 
 def _numbered(shots: list[Shot]) -> list[tuple[Shot, int]]:
-    """Number the shots in the order of their delivery.
-
-    What is lost leaves a gap, what comes twice takes a frame.
-    """
+    """Number shots as delivered: a loss leaves a gap, what comes twice takes a frame."""
     out: list[tuple[Shot, int]] = []
     more = 0
     last: int | None = None
@@ -254,7 +234,6 @@ def record_both(
 
     Args:
         folder: New or empty.
-        marker_scene: The hand before marker cameras.
         wrist_scene: The same hand with its wrist device; places in the room may differ.
         seconds: How long [s].
         start_s: Scene time of the first frame [s].

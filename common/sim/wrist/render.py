@@ -1,26 +1,13 @@
 """A renderer turns a wrist scene into camera frames: light, line, sensor.
 
-Light on the scene and the sensor that records it.
+Brightness is in levels of the sensor above black, at the exposure of the camera's file: 253 saturates. The rooms
+differ by what falls on the hand, by how bright they are behind it, by how far the window saturates, and by sunlight
+on skin. Skin is shaded on a coarser grid (rays against the hand, then Lambert), and enlarged; the laser line is drawn
+from its exact curve to parts of a pixel, widened by the thickness of the sheet, with the glow of the skin beside it.
 
-The room and its window behind the hand, LEDs and laser.
-
-Brightness is in levels of the sensor above black, at the exposure of the camera's file: 253 saturates. The rooms differ
-by what falls on the hand, by how bright they are behind it, by how far the window saturates, and by sunlight on skin.
-
-Renderer of the laser line.
-
-Its exact curve widened by the thickness of the sheet, with the glow of the skin beside it.
-
-A lit point moves along its ray by s where the sheet is looked at h off its middle: the point stays on the skin when
-n . (h m + s r) = 0, with n the normal of the skin, m that of the sheet, r the ray. So each piece between two rays is a
+A lit point moves along its ray by s where the sheet is looked at h off its middle: the point stays on the skin when n
+. (h m + s r) = 0, with n the normal of the skin, m that of the sheet, r the ray. So each piece between two rays is a
 ribbon of parallelograms, each as bright as the Gaussian profile gives and as large as its picture.
-
-Renderer from scene to wrist camera frames: ambient, laser and LED.
-
-Ambient is the light of the room alone.
-
-Skin is shaded on a coarser grid (rays against the flesh, then Lambert), and enlarged; the laser line is drawn from its
-exact curve, each piece as wide and as bright as the sheet of light is there, to parts of a pixel.
 """
 
 from copy import copy
@@ -41,10 +28,8 @@ BLACK_LEVEL = 2.0
 LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SURFACE_AT_M
 SURFACE_AT_M = 0.13
 SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
-GLOW = (
-    (5.0, 0.13),
-    (14.0, 0.10),
-)  # what comes out of the skin beside the line: sigma [px], share of the line's light
+# what comes out of the skin beside the line: sigma [px], share of the line's light
+GLOW = ((5.0, 0.13), (14.0, 0.10))
 _TILE_MARGIN = 128
 _LEVELS = {  # on the hand, behind it, of the window, of sun on skin
     "dark": (0.6, 0.4, 0.0, 0.0),
@@ -59,7 +44,8 @@ class Room:
     """One ambient light.
 
     Attributes:
-        hand, wall, window, sun: Levels on skin, behind it, of the window, and of sunlight that falls straight on skin.
+        hand, wall, window, sun: Levels on skin, behind it, of the window, and of sunlight that falls straight
+            on skin.
         to_sky, to_sun: Unit vectors (3,), camera frame.
         seed: Of what stands in the room.
     """
@@ -81,19 +67,14 @@ class Room:
         return cls(*_LEVELS[name], sky / np.linalg.norm(sky), sun / np.linalg.norm(sun), seed)
 
     def on_surface(self, normals: Plane) -> Plane:
-        """Return the levels of plain skin with the given normals.
-
-        Levels (N,), normals (N, 3): light from all sides, more from above, and the sun.
-        """
+        """Levels (N,) of plain skin with normals (N, 3): light from all sides, sun."""
         shade: Plane = self.hand * (0.75 + 0.25 * (normals @ self.to_sky.astype(np.float32)))
         if self.sun > 0.0:
             shade += self.sun * np.maximum(normals @ self.to_sun.astype(np.float32), 0.0)
         return shade
 
     def backdrop(self, size: tuple[int, int], step: float) -> Plane:
-        """Return the background, seen where there is no hand.
-
-        Shape (H, W), `size` = (W, H): a wall, things out of focus, a bright window.
+        """Background (H, W), `size` = (W, H): a wall, things out of focus, a window.
 
         `step` is how many pixels of the camera one of the backdrop is.
         """
@@ -124,18 +105,17 @@ def _box(image: Plane, low: Float, high: Float, level: float) -> None:
 
 
 class Leds:
-    """The LEDs beside the lens. Holds where they are."""
+    """The LEDs beside the lens."""
 
     def __init__(self, led_m: Float) -> None:
         """Of places (L, 3) [m], camera frame."""
         self._led = led_m.astype(np.float32)
 
     def on_surface(self, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
-        """Return the levels of plain skin at points lit by the LEDs.
+        """Levels (N,) of plain skin at (N, 3) [m]: inverse square, Lambert's cosine.
 
-        Levels (N,) at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
-
-        Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
+        Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the
+        LEDs.
         """
         faced = normals @ self._led.T - np.einsum("ij,ij->i", normals, points)[:, None]
         square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ self._led.T)
@@ -150,9 +130,9 @@ class Leds:
 
 
 def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
-    """Check whether a body blocks the light from an origin to points.
+    """Whether a body blocks light from an origin (3,) [m] to points (N, 3) [m].
 
-    Origin (3,) [m], points (N, 3) [m], `square` (N,) [m^2]: their squared distances.
+    `square` (N,) [m^2] are their squared distances.
     """
     far = np.sqrt(square)
     ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)
@@ -163,7 +143,7 @@ def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) ->
 
 
 class Sensor:
-    """Adds noise, and cuts at what a byte holds. Holds a tile of noise, drawn once."""
+    """Adds noise, from a tile drawn once, and cuts at what a byte holds."""
 
     def __init__(self, height: int, width: int, seed: int) -> None:
         """Of so many pixels."""
@@ -174,10 +154,7 @@ class Sensor:
         self._sigma = np.sqrt(read_variance + shot_variance * np.maximum(level - BLACK_LEVEL, 0.0))
 
     def bytes_of(self, level: Plane, key: int) -> Image:
-        """Convert levels to an image, black at BLACK_LEVEL.
-
-        Levels and image (H, W); the same key gives the same noise.
-        """
+        """Image (H, W) of levels, black at BLACK_LEVEL; one key, one noise."""
         height, width = level.shape
         mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
         mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
@@ -191,10 +168,10 @@ LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
 
 
 def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) -> None:
-    """Add the laser line to the levels in place.
+    """Add the laser line to the levels (H, W) in place.
 
-    Levels (H, W); the line glows where skin is, by `hand` (h, w), a coarser grid: what skin gives back, about 1, and
-    0 where none is. Things glow as little as they give back, so not at all here.
+    The line glows where skin is, by `hand` (h, w), a coarser grid: what skin gives back, about 1, and 0 where
+    none is. Things glow as little as they give back, so not at all here.
     """
     sheet, optics = scene.sheet, scene.optics
     curve = sheet.cross(bodies)
@@ -222,10 +199,7 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) 
 
 
 def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
-    """Add light at image places, blurred as the lens and skin do.
-
-    Places (N, 2) [px], each shared by four pixels.
-    """
+    """Add light at places (N, 2) [px], each on four pixels, blurred by lens and skin."""
     height, width = level.shape
     inside = ((place > 1.0) & (place < np.array([width - 2.0, height - 2.0]))).all(axis=1)
     place, amount = place[inside], amount[inside]
@@ -252,10 +226,7 @@ def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
 
 
 def _glow(line: Plane, hand: Plane, box: tuple[int, int, int, int], width: int) -> Plane:
-    """Return the glow of the skin around a line, at a quarter of its size.
-
-    None where there is no skin.
-    """
+    """Glow of the skin around a line, at a quarter of its size; none off the skin."""
     h, w = line.shape
     size = -(-w // 4), -(-h // 4)
     coarse = cv2.resize(line, size, interpolation=cv2.INTER_AREA)
@@ -270,34 +241,25 @@ def _glow(line: Plane, hand: Plane, box: tuple[int, int, int, int], width: int) 
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
 LIVE_STEP = 4
-LIVE_WRIST_RAD = np.radians(
-    0.25
-)  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
+# the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
+LIVE_WRIST_RAD = np.radians(0.25)
 _ILLUMINATIONS = tuple(Illumination)  # frames of one strobe cycle differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 
 class WristRenderer:
-    """Renderer of one wrist scene.
+    """Renderer of one wrist scene; a frame is a pure function of t.
 
-    It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure function of t.
+    Holds prepared rays, the palm of a straight wrist, the room and noise.
     """
 
-    def __init__(
-        # px between the rays that shade skin; 1 is twice as sharp and four times slower
-        self,
-        scene: WristScene,
-        camera: str,
-        step: int = 2,
-        wrist_step_rad: float = 0.0,
-    ) -> None:
+    def __init__(self, scene: WristScene, camera: str, step: int = 2, wrist_step_rad: float = 0.0) -> None:
         """Prepare all that stands still (some tenths of a second).
 
         Args:
-            scene: What it looks at.
-            camera: The one camera of its rig.
-            step: Pixels between the rays that shade skin.
-            wrist_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
+            step: Pixels between the rays that shade skin; 1 is twice as sharp and four times slower.
+            wrist_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at
+                all.
 
         Raises:
             CalibrationError: No such camera.
@@ -320,21 +282,15 @@ class WristRenderer:
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "WristRenderer":
         """Return a renderer of the same scene for a camera with other settings.
 
-        It shares everything that was prepared.
-
-        Args:
-            exposure_us: Exposure [us]; so short that nothing smears.
-            gains_bgr: Brightness (3,) against that of the camera file; the middle one counts, as the camera is grey.
+        The exposure is so short that nothing smears; of the gains (3,), against the camera file, the middle
+        one counts, as the camera is grey.
         """
         other = copy(self)
         other._gain = float(gains_bgr[1])
         return other
 
     def render(self, t_s: float, lit: Illumination) -> Image:
-        """Render the frame at mid-exposure at scene time `t_s`.
-
-        Image (H, W), grey; `t_s` in [s]; lit by the room and by `lit`.
-        """
+        """Image (H, W), grey, mid-exposure at scene time `t_s` [s]: room and `lit`."""
         state = self._scene.motion.at(t_s)
         bodies = self._scene.bodies_of(state)
         palm = self._surface.palm(bodies, state.wrist_angles_rad)
@@ -362,10 +318,7 @@ class WristRenderer:
     def _shaded(
         self, behind: Plane, surface: SurfaceView, lit: Illumination, things: Capsules | None = None
     ) -> Plane:
-        """Return the shaded levels on the coarse grid.
-
-        `behind` with skin in front of it, and things in the light of the LEDs.
-        """
+        """Levels on the coarse grid: `behind` with skin in front, and things lit by LEDs."""
         shade = self._room.on_surface(surface.normals)
         if lit is Illumination.LED:
             shade += (
@@ -378,9 +331,6 @@ class WristRenderer:
 
 
 def _sharp(coarse: Plane, size: tuple[int, int]) -> Plane:
-    """Upsample levels to the full grid with edges as soft as the lens makes them.
-
-    This concerns edges of skin in front of a window; they are not as coarse as the grid.
-    """
+    """Upsample levels to the full grid, edges of skin as soft as the lens has them."""
     cut = cv2.GaussianBlur(np.minimum(coarse, SATURATED), (3, 3), 0.6)
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)

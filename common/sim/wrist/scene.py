@@ -1,17 +1,9 @@
 """A wrist scene holds hand, motion, device and the exact laser line.
 
-Exact laser line on the hand.
-
-Where the sheet of light first meets the hand, and which of that the camera sees.
-
-The sheet is a fan of rays from the laser's origin. What each ray meets first is lit, so shadows need no thought; a lit
-point is seen where the ray from the camera meets nothing before it. Consecutive rays that meet the same part of the
-hand are joined by chords, whose lengths are those of the line. Where a part ends the laser grazes it, and a little of
-angle is much of line: there the rays are cast more densely.
-
-Wrist scene of hand, motion, light and device, exact at every time.
-
-It keeps no state.
+The sheet of light is a fan of rays from the laser's origin. What each ray meets first is lit, so shadows need no
+thought; a lit point is seen where the ray from the camera meets nothing before it. Consecutive rays that meet the
+same part of the hand are joined by chords, whose lengths are those of the line. Where a part ends the laser grazes
+it, and a little of angle is much of line: there the rays are cast more densely.
 """
 
 from collections.abc import Mapping
@@ -68,7 +60,6 @@ class LaserSheet:
         normal, offset_m: The plane, normal . X = offset_m.
         forward, across: Unit vectors (3,) of the plane: the middle of the fan, and towards its second edge.
         angle_rad: (RAYS,) of the rays to the middle, from one edge of the fan to the other.
-        capsules: The hand.
         still: The palm of a straight wrist, which was met beforehand.
         still_m: How far along each ray that begins (RAYS,) [m]; inf: nowhere.
         still_body: Which body of it that is (RAYS,).
@@ -117,10 +108,7 @@ class LaserSheet:
         return cls(origin, normal, offset, forward, across, angle, capsules, still, near, body)
 
     def cross(self, bodies: Capsules) -> LaserCurve:
-        """Intersect the laser sheet with the hand and the things that follow it.
-
-        The flesh of the hand is at `bodies`; the things come after it in that list.
-        """
+        """Intersect the laser sheet with the bodies: the hand, after it the things."""
         capsules, first = self.capsules, self.capsules.still
         rays = _fan(self.forward, self.across, self.angle_rad)
         if capsules.same_palm(bodies, self.still):
@@ -150,10 +138,9 @@ class LaserSheet:
         return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
 
     def _meet(self, bodies: Capsules, rays: Float, first: int = 0) -> tuple[Float, Int]:
-        """Return where rays of the sheet meet the nearest body, and which body that is.
+        """Distances (N,) [m] along rays (N, 3) to the nearest body, and which it is.
 
-        Distances (N,) [m] along rays (N, 3) and body indices (N,), of the bodies from `first` on; only those that the
-        sheet passes through are tested.
+        Of the bodies from `first` on; only those that the sheet passes through are tested.
         """
         middle = 0.5 * (bodies.start_m + bodies.stop_m)
         reach = 0.5 * np.linalg.norm(bodies.stop_m - bodies.start_m, axis=1)
@@ -173,10 +160,7 @@ class LaserSheet:
         return near, which[body]
 
     def seen(self, bodies: Capsules, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
-        """Check which points are visible to the camera.
-
-        Result (K,) for points (K, 3) [m]: nothing hides them that is more than `within_m` in front of them.
-        """
+        """Whether (K,) the camera sees points (K, 3) [m]: at most `within_m` behind."""
         far = np.linalg.norm(points, axis=1)
         front = points[:, 2] > 0.0
         reach = distances(bodies, np.zeros(3), points / far[:, None])
@@ -207,10 +191,7 @@ class LineTruth:
 
     @classmethod
     def of(cls, curve: LaserCurve, optics: CameraModel, sheet: LaserSheet) -> "LineTruth":
-        """Sum up the chords on the hand.
-
-        Those with both ends in the image and seen count as visible.
-        """
+        """Sum up the chords on the hand; visible where both ends are seen in the image."""
         uv = optics.project(curve.points)
         size = np.array([optics.width_px, optics.height_px])
         seen = curve.seen & ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)
@@ -247,22 +228,23 @@ WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMB
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristTruth:
-    """Complete ground truth of a wrist scene at one time.
+    """Complete ground truth of a wrist scene at one time, camera frame.
 
-    In the frame of the wrist camera; groups palm, thumb ... little, thenar.
+    Groups are palm, thumb ... little, thenar.
 
     Attributes:
         t_s: Time [s], scene time.
         angles_rad: (5, 4).
-        joints: All joints, camera frame.
-        laser_uv: (7, 2) centroid [px] of the lit and seen part of the laser line, by its length in the image; NaN
-            where less than 0.2 mm of it is seen.
+        laser_uv: (7, 2) centroid [px] of the lit and seen part of the laser line, by its length in the image;
+            NaN where less than 0.2 mm of it is seen.
         laser_pt: (7, 3) that pixel on the laser plane [m].
         laser_xyz: (7, 3) centroid of the same part by its length in space [m].
         laser_len_vis, laser_len_lit: (7,) length that is lit and seen, length that is lit [m].
-        laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
+        laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1:
+            none.
         tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
-        tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
+        tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own
+            finger.
         wrist_angles_rad: (2,) how the wrist is bent (`common.hand.wrist`).
     """
 
@@ -283,22 +265,15 @@ class WristTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristScene:
-    """Hand, motion, light and the device that looks at the hand.
-
-    The frame of the rig is that of its camera.
+    """Hand, motion, light and the device on its forearm; rig frame = camera frame.
 
     Attributes:
         rig: Laser, LEDs, palm pose.
-        cameras: Camera name -> its file.
-        model: The hand.
-        motion: How it moves; its `T_rig_palm` is the palm's way through the room, which with the bend of the wrist is
-            that of the forearm, where camera and IMU sit.
+        motion: How it moves; its `T_rig_palm` is the palm's way through the room, which with the bend of the
+            wrist is that of the forearm, where camera and IMU sit.
         ambient: The light of the room.
-        seed: Of flesh, skin, room and noise.
+        seed: Of hand, skin, room and noise.
         reflectance: How much light the skin gives back, of whatever light, against usual skin.
-        optics: The camera.
-        capsules: The hand's surface.
-        sheet: The laser.
         T_camera_palm: (4, 4) of a straight wrist [m].
     """
 
@@ -375,10 +350,7 @@ class WristScene:
         return self._joints(self.motion.at(t_s))
 
     def bodies_at(self, t_s: float) -> Capsules:
-        """Return all bodies that camera and laser meet at scene time `t_s`.
-
-        In [s], camera frame: the flesh, after it the things.
-        """
+        """Bodies that camera and laser meet at scene time `t_s` [s]: hand, things."""
         return self.bodies_of(self.motion.at(t_s))
 
     def bodies_of(self, state: HandState) -> Capsules:
@@ -390,10 +362,7 @@ class WristScene:
         return self.capsules.bodies(self._straight)
 
     def flexed_bodies(self, wrist_angles_rad: Float) -> Capsules:
-        """Return the flesh of straight fingers while the wrist is flexed.
-
-        Flexed by `wrist_angles_rad` (2,), camera frame.
-        """
+        """Bodies of straight fingers with the wrist flexed by (2,) [rad], camera frame."""
         return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), wrist_angles_rad))
 
     def truth(self, t_s: float) -> WristTruth:
@@ -403,8 +372,7 @@ class WristScene:
         bodies = self._bodies(state, joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
         tips = self.capsules.tips(bodies)
-        # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
-        tip_within_m = 0.003
+        tip_within_m = 0.003  # a tip 12 degrees behind the edge of its own round end is visible
         return WristTruth(
             t_s,
             state.angles_rad,

@@ -1,4 +1,4 @@
-"""Visible skin surface: rays of a grid against the flesh, and its appearance.
+"""Visible skin surface: rays of a grid against the hand, and its appearance.
 
 While the wrist is straight the palm stands still in the picture: it is looked at once, and its gaps between bones are
 filled up. Of a bent wrist that is done for every picture. Each part of a finger is looked for only inside the box of
@@ -40,19 +40,14 @@ class SurfaceView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Palm:
-    """Palm with no finger in front of it: its visible surface and depth.
-
-    The depth is how far along each ray it begins (H * W,) [m].
-    """
+    """Palm with no finger in front of it: its surface, and its depth (H * W,) [m]."""
 
     seen: SurfaceView
     depth: Plane
 
 
 class HandSurface:
-    """Grid and palm of one scene.
-
-    It holds what was prepared by the constructor, and the last palm by its flexion.
+    """Grid and palm of one scene; holds the last palm by its flexion.
 
     Attributes:
         size: Of the grid, (W, H).
@@ -79,10 +74,7 @@ class HandSurface:
         self._rotated = [body for body in range(scene.capsules.still) if body not in outside]
 
     def palm(self, bodies: Capsules, wrist_angles_rad: Float) -> Palm:
-        """Return the palm of a hand whose flesh is at `bodies`.
-
-        The wrist is flexed by `wrist_angles_rad` (2,); `straight` itself while the wrist is straight.
-        """
+        """Palm of a hand at `bodies`, wrist flexed by (2,) [rad]; `straight` itself at 0."""
         if self._scene.capsules.same_palm(bodies, self._straight_bodies):
             return self.straight
         if self._wrist_step_rad <= 0.0:
@@ -94,10 +86,7 @@ class HandSurface:
         return self._flexed[1]
 
     def appearance(self, bodies: Capsules, palm: Palm) -> SurfaceView:
-        """Return the visible surface of fingers, thumb and things in front of the palm.
-
-        The flesh of the hand is at `bodies`.
-        """
+        """Visible surface of fingers, thumb and things in front of the palm."""
         depth = palm.depth.copy()
         hit = self._cast(bodies, range(self._scene.capsules.still, len(bodies.start_m)), depth)
         return self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)
@@ -114,10 +103,7 @@ class HandSurface:
         return SurfaceView(pixel, points, normals, self._albedo(bodies, body, points, normals))
 
     def _cast(self, bodies: Capsules, which: Iterable[int], depth: Plane) -> Int:
-        """Update the depth along the rays where a body is nearer, and return the bodies.
-
-        `depth` (H * W,) [m]; the result (H * W,) is the body, -1: none of them.
-        """
+        """Lower `depth` (H * W,) [m] where a body is nearer; return that body, -1: none."""
         low, high = self._boxes(bodies)
         known = terms(bodies, _ORIGIN, np.float32)
         shape = self.size[::-1]
@@ -162,9 +148,9 @@ class HandSurface:
         return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
 
     def _albedo(self, bodies: Capsules, body: Int, points: Plane, normals: Plane) -> Plane:
-        """Return the albedo of skin and things.
+        """Albedo of skin and things; things are even.
 
-        Skin is never even: blotches that stay on their body, dark lines across it where a joint is. Things are even.
+        Skin never is: blotches stay on their body, dark lines go across it where a joint is.
         """
         axis = bodies.stop_m - bodies.start_m
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -207,20 +193,14 @@ class HandSurface:
 
 
 def _flat_field(scene: WristScene, rays: Float) -> Float:
-    """Return the rig file's brightness across the image along the given rays.
-
-    Rays (N, 3); 1 where the file states nothing.
-    """
+    """The rig file's brightness along rays (N, 3); 1 where the file states nothing."""
     if scene.rig.flat_field is None:
         return np.ones(len(rays))
     return flat_of(scene.rig.flat_field, rays[:, :2] / rays[:, 2:])
 
 
 def _texture(rng: np.random.Generator) -> Plane:
-    """Return a brightness texture of skin.
-
-    Shape (256, 256), about 1, half a millimetre a texel, closed at its edges.
-    """
+    """Skin's brightness (256, 256), about 1; half a millimetre a texel, closed."""
     out = np.ones((256, 256), dtype=np.float32)
     for sigma, depth in ((1.0, 0.03), (5.0, 0.03), (20.0, 0.04)):
         noise = np.tile(rng.standard_normal((256, 256), dtype=np.float32), (2, 2))

@@ -1,10 +1,6 @@
 """The command `phalanx calibrate board` draws a board at true scale.
 
-Drawing of a board at true scale.
-
-A vector page, a ruler to check the printer by, and the options to calibrate with it.
-
-`phalanx calibrate board`: a board to print.
+A vector page: the board, a ruler to check the printer by, and the options to calibrate with it.
 """
 
 from argparse import Namespace
@@ -25,12 +21,7 @@ from common.command_line import UsageError, echo
 from common.errors import CalibrationError
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_of, options_of
 
-PAPERS_MM = {
-    "A4": (297.0, 210.0),
-    "A3": (420.0, 297.0),
-    "A2": (594.0, 420.0),
-    "letter": (279.4, 215.9),
-}
+PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "letter": (279.4, 215.9)}
 _EDGE_MM = 8.0  # printers leave some millimetres blank, and a board needs white about it
 _FOOT_MM = 20.0  # ruler and text
 Rectangle = tuple[float, float, float, float]
@@ -103,9 +94,7 @@ def _marker_rectangles(board: Charuco) -> list[Rectangle]:
 
 
 def print_board(path: Path, board: Board, paper: str) -> None:
-    """Write the page as PDF or SVG.
-
-    The ending of the file decides which.
+    """Write the page as PDF or SVG, by the ending of the file.
 
     Raises:
         CalibrationError: It does not fit, the ending is another, or the file cannot be written.
@@ -139,7 +128,6 @@ def _fill(axes: Axes, rectangles: list[Rectangle]) -> None:
 
 
 def _foot(axes: Axes, page: Page, board: Board) -> None:
-    """The ruler, and what to type."""
     left, top = _EDGE_MM + 2, page.height_mm - _FOOT_MM + 6
     ruler_mm = 100.0
     marks = [(left, top, ruler_mm, 0.3)]
@@ -149,23 +137,15 @@ def _foot(axes: Axes, page: Page, board: Board) -> None:
         marks.append((left + at, top, 0.2, length))
     _fill(axes, marks)
     axes.text(left, top + 7, f"{board}:   {options_of(board)}", fontsize=7, va="center")
-    axes.text(
-        left + ruler_mm + 3,
-        top + 1.2,
-        "100 mm: measure it. Print at 100 %, not fitted to the page; if it differs, give the measured square.",
-        fontsize=6,
-        va="center",
+    note = (
+        "100 mm: measure it. Print at 100 %, not fitted to the page; if it differs, give the measured square."
     )
+    axes.text(left + ruler_mm + 3, top + 1.2, note, fontsize=6, va="center")
 
 
 def board(options: Namespace) -> None:
-    """Draw a board at true scale.
-
-    With a ruler of 100 mm and the options to calibrate with it.
-    """
-
-    marker = None
-    side = options.square_mm
+    """Draw a board at true scale, with a ruler and the options to calibrate with."""
+    marker, side = None, options.square_mm
     if options.kind == "charuco":
         side = 29.0 if side is None else side
         marker = 0.75 * side if options.marker_mm is None else options.marker_mm

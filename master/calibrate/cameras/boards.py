@@ -1,22 +1,18 @@
 """A board has known corners, and they are found in an image.
 
-The boards whose corners are known: checkerboard and ChArUco.
+Frame of a board: origin at its first inner corner, x along the columns, y down the rows, z into the board, so
+that a board seen upright from the front is nearly unrotated in the camera's frame. Corners are numbered row
+by row.
 
-Frame of a board: origin at its first inner corner, x along the columns, y down the rows, z into the board, so that a
-board seen upright from the front is nearly unrotated in the camera's frame. Corners are numbered row by row.
-
-How a board is named on the command line.
-
-Finds a board's corners in one image, to a fraction of a pixel.
-
-Checkerboards: OpenCV's classic finder, where it fails the sector-based one; both only locate the corners roughly.
-The place is refined by `cornerSubPix` in a window of half the distance to the next grid line, which on rendered
-boards is twice as good as the sector-based finder's own (0.05 against 0.10 px). Corners of the outermost row look
-out on squares that print shops and scissors often cut to half; their window is smaller. On a ChArUco board the window
-ends where the markers begin.
+Checkerboards are located by OpenCV's classic finder, where it fails by the sector-based one. The place is
+refined by `cornerSubPix` in a window of half the distance to the next grid line, which on rendered boards is
+twice as good as the sector-based finder's own (0.05 against 0.10 px). Corners of the outermost row look out
+on squares that are often cut to half; their window is smaller. On a ChArUco board the window ends where the
+markers begin.
 """
 
 import re
+from argparse import Namespace
 from dataclasses import dataclass
 from typing import cast
 
@@ -35,16 +31,11 @@ DICTIONARIES = {
 
 @dataclass(frozen=True, slots=True)
 class Checkerboard:
-    """A checkerboard by its inner corners.
+    """A checkerboard by its inner corners."""
 
-    Attributes:
-        columns, rows: Inner corners along x and y (squares less one), at least 3.
-        square_m: Side of a square [m].
-    """
-
-    columns: int
+    columns: int  # this and rows: inner corners along x and y (squares less one), at least 3
     rows: int
-    square_m: float
+    square_m: float  # side of a square [m]
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
@@ -57,21 +48,13 @@ class Checkerboard:
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """ChArUco board whose corners are identified by markers.
+    """ChArUco board: markers identify its corners; first square dark (OpenCV's way)."""
 
-    OpenCV's present pattern (first square dark).
-
-    Attributes:
-        columns, rows: Squares along x and y, at least 3.
-        square_m, marker_m: Side of a square and of a marker [m].
-        dictionary: Name of the marker family without `DICT_`, such as 4X4_50.
-    """
-
-    columns: int
+    columns: int  # this and rows: squares along x and y, at least 3
     rows: int
-    square_m: float
+    square_m: float  # this and marker_m: side of a square and of a marker [m]
     marker_m: float
-    dictionary: str = "4X4_50"
+    dictionary: str = "4X4_50"  # name of the marker family without `DICT_`, such as 4X4_50
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
@@ -121,10 +104,7 @@ def board_corners(board: Board) -> Float:
 
 
 def grid_edges(board: Board) -> Int:
-    """Return pairs of corner numbers that are one square apart.
-
-    Shape (E, 2): along the rows first, then down the columns.
-    """
+    """Pairs (E, 2) of corners one square apart: along the rows, then the columns."""
     rows, columns = grid_shape(board)
     n = np.arange(rows * columns).reshape(rows, columns)
     along = np.stack([n[:, :-1].ravel(), n[:, 1:].ravel()], axis=1)
@@ -133,12 +113,11 @@ def grid_edges(board: Board) -> Int:
 
 
 def orderings(board: Board) -> tuple[Int, ...]:
-    """Return the rotations of the pattern that look the same.
+    """Rotations of the pattern that look the same, the unrotated one first.
 
-    Orders (N,) of corner numbers, the unrotated one first.
-
-    A ChArUco board has one. A checkerboard with an odd sum of columns and rows has one too, because its colours set
-    its ends apart; other checkerboards look the same after half a turn, square ones also after a quarter.
+    As orders (N,) of corner numbers. A ChArUco board has one. A checkerboard with an odd sum of columns and
+    rows has one too, because its colours distinguish its ends; others look the same after half a turn, square
+    ones also after a quarter.
     """
     rows, columns = grid_shape(board)
     n = np.arange(rows * columns).reshape(rows, columns)
@@ -174,11 +153,13 @@ def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: s
     return Charuco(columns, rows, square_mm * 1e-3, marker_mm * 1e-3, dictionary)
 
 
-def options_of(board: Board) -> str:
-    """Return the options that specify `board`.
+def board_in(options: Namespace) -> Board:
+    """The board that a command's options name."""
+    return board_of(options.board, options.square_mm, options.marker_mm, options.dictionary)
 
-    `board_of` of them is that board again.
-    """
+
+def options_of(board: Board) -> str:
+    """The options from which `board_of` makes `board`."""
     text = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
     if isinstance(board, Charuco):
         text += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"
@@ -191,15 +172,12 @@ _REFINE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservation:
-    """The board in one image.
+    """The board in one image."""
 
-    Attributes:
-        corners_px: Corners (N, 2) [px], board's order, distorted image, (0, 0) = centre of the top-left pixel.
-            NaN: not seen.
-        blur_px: Standard deviation [px] of the blur of the board's edges, in the direction where it is worse.
-    """
-
+    # corners (N, 2) [px], board's order, distorted image, (0, 0) = centre of the top-left pixel. NaN: not
+    # seen
     corners_px: Float
+    # standard deviation [px] of the blur of the board's edges, in the direction where it is worse
     blur_px: float
 
     @property
@@ -209,17 +187,16 @@ class ImageObservation:
 
 
 def find_board(board: Board, image: Image) -> ImageObservation | None:
-    """Detect the board in an image.
+    """Detect the board in an image (H, W) or (H, W, 3) BGR.
 
-    Image (H, W) or (H, W, 3) BGR; None where it is not found whole (ChArUco: 8 corners of it).
+    None where it is not found whole (ChArUco: 8 corners of it).
     """
     grey = image if image.ndim == 2 else cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
     if corners is None:
         return None
     corners = _refine(board, grey, corners)
-    min_corners = 8  # a pose and a few corners to check it
-    if np.isfinite(corners[:, 0]).sum() < min_corners:
+    if np.isfinite(corners[:, 0]).sum() < 8:  # a pose and a few corners to check it
         return None
     return ImageObservation(corners, _blur(board, grey, corners))
 
@@ -238,10 +215,7 @@ def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:
 
 
 def _upright(board: Checkerboard, grey: Image, corners: Float) -> Float:
-    """Return the same corners in the board's own order.
-
-    Never mirrored, and square (0, 0) dark where that is a choice.
-    """
+    """The corners in the board's order: not mirrored, square (0, 0) dark if a choice."""
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
@@ -271,10 +245,7 @@ def _charuco(board: Charuco, grey: Image) -> Float | None:
 
 
 def _refine(board: Board, grey: Image, corners: Float) -> Float:
-    """Refine rough corners to sub-pixel positions.
-
-    One that moves by more than its window was none and becomes NaN.
-    """
+    """Refine rough corners; NaN: one that moves by more than its window."""
     half = _windows(board, corners)
     refined = np.full_like(corners, np.nan)
     for i in np.flatnonzero(np.isfinite(half)):
@@ -284,17 +255,12 @@ def _refine(board: Board, grey: Image, corners: Float) -> Float:
         if np.abs(place - corners[i]).max() <= window:
             refined[i] = place
     if isinstance(board, Checkerboard) and np.isnan(refined).any():
-        return np.full_like(
-            corners, np.nan
-        )  # found whole or not at all: one strayed corner condemns the grid
+        return np.full_like(corners, np.nan)  # found whole or not at all: one wrong corner condemns the grid
     return refined
 
 
 def _windows(board: Board, corners: Float) -> Float:
-    """Return half the side of each corner's window.
-
-    Shape (N,) [px]; NaN where no square beside the corner is complete.
-    """
+    """Half the side (N,) [px] of each corner's window; NaN: no whole square beside."""
     rows, columns = grid_shape(board)
     grid = corners.reshape(rows, columns, 2)
     along, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
@@ -306,10 +272,8 @@ def _windows(board: Board, corners: Float) -> Float:
         for j in (0, 1):
             part = reach[i : rows - 1 + i, j : columns - 1 + j]
             np.fmin(part, height, out=part)
-    outer_window = 0.3
-    share = np.full((rows, columns), outer_window)
-    inner_window = 0.5  # of the distance to the next grid line
-    share[1:-1, 1:-1] = inner_window
+    share = np.full((rows, columns), 0.3)  # of the distance to the next grid line
+    share[1:-1, 1:-1] = 0.5
     if isinstance(board, Charuco):
         share = np.minimum(share, 0.5 * (1.0 - board.marker_m / board.square_m))
     half = np.minimum(np.maximum(np.round(share * reach), _WINDOW_PX[0]), _WINDOW_PX[1])
@@ -318,9 +282,7 @@ def _windows(board: Board, corners: Float) -> Float:
 
 
 def _blur(board: Board, grey: Image, corners: Float) -> float:
-    """Return the blur across the board's edges.
-
-    Standard deviation [px], the worse of its two directions.
+    """Standard deviation [px] of the blur across the board's edges, the worse way.
 
     A step blurred by a Gaussian has the steepest slope step / (sigma sqrt(2 pi)).
     """
@@ -350,6 +312,6 @@ def _blur(board: Board, grey: Image, corners: Float) -> float:
 
 
 def _sample(grey: Image, points: Float) -> Float:
-    """Brightness (A, B) at pixels (A, B, 2), between pixels interpolated."""
+    """Brightness (A, B) at pixels (A, B, 2), interpolated."""
     u, v = np.moveaxis(points.astype(np.float32), -1, 0)
     return cast(Image, cv2.remap(grey, u, v, cv2.INTER_LINEAR)).astype(np.float64)

@@ -1,19 +1,10 @@
 """A bundle adjustment fits lenses, camera poses, board poses and board shape.
 
-Bundle adjustment of lenses, camera poses, board poses and the board's shape.
-
-Least squares over all of these at once.
-
-Every image sees corners i of the board through  X_rig = T_rig_board (c_i + s_i),  X = T_camera_rig X_rig,  pixel =
-lens(X), where c_i is the drawn corner and s_i how far it lies from there on the real, never quite flat board. Poses of
-the board touch only their own view, so they are eliminated view by view (Schur complement; Triggs et al., Bundle
-adjustment - a modern synthesis, 2000, section 6) and the step is solved in what all views share. Damping by
-Marquardt. The shape has a prior of standard deviation `SHAPE_SD_M` about the drawn one, which also settles where the
-board's frame lies and how large it is: few views leave it as drawn.
-
-Initial guess of a bundle.
-
-A lens by trial of focal lengths, boards by PnP; bad views do not mislead it.
+Corner i of an image is seen at pixel = lens(T_camera_rig T_rig_board (c_i + s_i)), where c_i is the drawn
+corner and s_i its offset on the real, never quite flat board. A board pose touches only its own view, so the
+poses are eliminated view by view (Schur complement; Triggs et al., Bundle adjustment - a modern synthesis,
+2000, section 6), and the step is solved in what all views share. Damping by Marquardt. A prior of the shape
+about the drawn one also fixes the board's frame and size: few views leave it as drawn.
 """
 
 from collections.abc import Sequence
@@ -31,84 +22,65 @@ LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Corners of one image.
+    """Corners of one image."""
 
-    Attributes:
-        camera, view: Indices into the bundle.
-        corners: Numbers (n,) of the corners seen.
-        uv: Where (n, 2) [px].
-    """
-
-    camera: int
+    camera: int  # this and view: indices into the bundle
     view: int
-    corners: Int
-    uv: Float
+    corners: Int  # numbers (n,) of the corners seen
+    uv: Float  # their places (n, 2) [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """What is estimated.
+    """What is estimated."""
 
-    Attributes:
-        lenses: (C, 9) in the order `LENS`.
-        T_camera_rig: (C, 4, 4) [m].
-        T_rig_board: (V, 4, 4) [m].
-        drawn_m: Corners of the board as drawn (N, 3) [m].
-        shape_m: How far the real ones lie from there (N, 3) [m].
-    """
-
-    lenses: Float
-    T_camera_rig: Float
-    T_rig_board: Float
+    lenses: Float  # (C, 9) in the order `LENS`
+    T_camera_rig: Float  # (C, 4, 4) [m]
+    T_rig_board: Float  # (V, 4, 4) [m]
+    # this and shape_m: (N, 3) [m] corners of the board as drawn, and the offsets of the real ones
     drawn_m: Float
     shape_m: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Free:
-    """Which of the shared numbers are estimated; poses of the board always are.
+    """What is estimated of lenses (C, 9), camera poses (C,) and the board's shape.
 
-    Attributes:
-        lenses: (C, 9).
-        cameras: (C,): the camera's place.
-        shape: The board's shape.
+    Poses of the board always are.
     """
 
     lenses: Bool
     cameras: Bool
     shape: bool
 
+    @classmethod
+    def only_boards(cls, bundle: Bundle) -> "Free":
+        """Neither lenses, camera poses nor shape."""
+        lenses = np.zeros_like(bundle.lenses, dtype=np.bool_)
+        return cls(lenses, np.zeros(len(lenses), dtype=np.bool_), shape=False)
+
     def mask(self, corners: int) -> Bool:
-        """The shared numbers in a row: lenses, places, shape."""
-        parts = (self.lenses.ravel(), np.repeat(self.cameras, 6), np.full(3 * corners, self.shape))
-        return np.concatenate(parts)
+        """The shared parameters in a row: lenses, camera poses, shape."""
+        return np.concatenate(
+            [self.lenses.ravel(), np.repeat(self.cameras, 6), np.full(3 * corners, self.shape)]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A bundle at its optimum.
-
-    Attributes:
-        bundle: The estimate.
-        residuals: Measured less predicted corners (n, 2) [px] of each observation.
-        sigma_px: Standard deviation of one coordinate, from the residuals and what was spent on the estimate.
-        covariance: (S, S) of the shared numbers, zero where not free.
-    """
+    """A bundle at its optimum."""
 
     bundle: Bundle
-    residuals: tuple[Float, ...]
-    sigma_px: float
-    covariance: Float
+    residuals: tuple[Float, ...]  # measured minus predicted corners (n, 2) [px] of each observation
+    sigma_px: float  # standard deviation of one coordinate, from the residuals and the degrees of freedom
+    covariance: Float  # (S, S) of the shared parameters, zero where not free
 
     def lens_sd(self, camera: int) -> Float:
         """Standard deviations (9,) of a lens; 0: held."""
         return np.sqrt(np.diag(self.covariance)[9 * camera : 9 * camera + 9])
 
     def place_sd(self, camera: int) -> Float:
-        """Return the standard deviations of a camera's pose.
-
-        Shape (6,): rotation vector [rad], translation [m]; 0: held.
-        """
+        """Standard deviations (6,) of a camera's rotation [rad] and shift [m]; 0: held."""
         at = 9 * len(self.bundle.lenses) + 6 * camera
         return np.sqrt(np.diag(self.covariance)[at : at + 6])
 
@@ -120,17 +92,10 @@ def solve(
     cauchy_px: float | None = None,
     sigma_px: float = 0.2,
 ) -> Solution:
-    """Minimise the sum of squared residuals or of Cauchy losses.
+    """Minimise the sum of squared residuals, or of Cauchy losses per corner.
 
-    With `cauchy_px` it is the sum of Cauchy losses per corner.
-
-    Args:
-        observations: At least one; every view of `start` is in one of them.
-        start: Near the optimum.
-        free: What to estimate.
-        cauchy_px: Residual [px] at which a corner begins to lose its weight; None: plain least squares.
-        sigma_px: Standard deviation of a corner [px], against which the prior of the shape is weighed.
-
+    Every view of `start` is in an observation. With `cauchy_px` a corner begins to lose its weight at that
+    residual. `sigma_px` is a corner's standard deviation, against which the prior of the shape is weighed.
     What the observations do not determine has an enormous standard deviation in the result.
     """
     mask = free.mask(len(start.drawn_m))
@@ -138,8 +103,7 @@ def solve(
     prior = (sigma_px / shape_sd_m) ** 2 if free.shape else 0.0
     now, damping = start, 1e-3
     cost, normal = _normal_equations(observations, now, prior, cauchy_px)
-    most_steps = 100
-    for _ in range(most_steps):
+    for _ in range(100):
         step = _step(normal, mask, damping)
         tried = now if step is None else _retracted(now, *step)
         new_cost, new_normal = _normal_equations(observations, tried, prior, cauchy_px)
@@ -147,15 +111,13 @@ def solve(
             gain = cost - new_cost
             now, cost, normal = tried, new_cost, new_normal
             damping = max(damping / 10, 1e-10)
-            stop = 1e-9  # relative gain of a step
-            stop_robust = 1e-6  # robust fits only judge
-            if gain <= (stop if cauchy_px is None else stop_robust) * cost:
+            if gain <= (1e-9 if cauchy_px is None else 1e-6) * cost:  # robust fits only judge
                 break
         else:
             damping *= 10
             if damping > 1e8:
                 break
-    residuals = tuple(_residual(seen, now) for seen in observations)
+    residuals = tuple(seen.uv - predict(now, seen) for seen in observations)
     return _solution(now, residuals, normal, mask, free)
 
 
@@ -168,9 +130,9 @@ def predict(bundle: Bundle, seen: Observation) -> Float:
 
 
 def rms(residuals: Sequence[Float]) -> float:
-    """Return the root mean square distance [px] of corners.
+    """Root mean square distance [px] of corners, both coordinates under one root.
 
-    OpenCV's measure: both coordinates under one root.
+    As OpenCV has it.
     """
     return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals]))))
 
@@ -191,10 +153,6 @@ def _camera_points(bundle: Bundle, seen: Observation) -> tuple[Float, Float, Flo
     return on_board, in_rig, transform(bundle.T_camera_rig[seen.camera], in_rig)
 
 
-def _residual(seen: Observation, bundle: Bundle) -> Float:
-    return seen.uv - predict(bundle, seen)
-
-
 def _skews(vectors: Float) -> Float:
     """Matrices (n, 3, 3) with `_skews(a)[i] @ b == cross(a[i], b)`."""
     out = np.zeros((len(vectors), 3, 3))
@@ -204,10 +162,10 @@ def _skews(vectors: Float) -> Float:
 
 
 def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
-    """Return the residuals and the derivatives of the prediction.
+    """Residuals (n, 2), and derivatives of the prediction.
 
-    Residuals (n, 2); derivatives by lens (n, 2, 9), pose of the camera and of the board (n, 2, 6) each, shape (n, 2,
-    3). A pose rotates by exp(w) on its left and moves by t.
+    By lens (n, 2, 9), pose of camera and of board (n, 2, 6) each, shape (n, 2, 3). A pose rotates by exp(w)
+    on its left and moves by t.
     """
     on_board, in_rig, points = _camera_points(bundle, seen)
     lens = bundle.lenses[seen.camera]
@@ -226,7 +184,7 @@ def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, F
 def _normal_equations(
     observations: Sequence[Observation], bundle: Bundle, prior: float, cauchy_px: float | None
 ) -> tuple[float, Normal]:
-    """Cost and the Gauss-Newton equations at a bundle."""
+    """Cost and Gauss-Newton equations at a bundle."""
     cameras, views, corners = len(bundle.lenses), len(bundle.T_rig_board), len(bundle.drawn_m)
     size, shape_at = 15 * cameras + 3 * corners, 15 * cameras
     shared, right = np.zeros((size, size)), np.zeros(size)
@@ -269,10 +227,7 @@ def _normal_equations(
 
 
 def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, Float, Float]:
-    """Return the reduced (Schur) equations of the free shared parameters.
-
-    Also what leads back to the views' own parameters.
-    """
+    """Schur's equations of the free shared parameters, and what leads back to views."""
     shared, mixed, own, right, right_own = normal
     shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
     almost_nothing = 1e-3  # px^2 per rad^2 or m^2, where one view has 10^7 and more
@@ -286,10 +241,7 @@ def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, 
 
 
 def _step(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float] | None:
-    """Return Marquardt's step, or None where it is not determined.
-
-    Shared (S,) and per view (V, 6); None: more damping is needed.
-    """
+    """Marquardt's step, shared (S,) and per view (V, 6); None: needs more damping."""
     schur, right, by_shared, by_right = _reduced(normal, mask, damping)
     step = np.zeros(len(mask))
     if mask.any():
@@ -341,16 +293,10 @@ _FOCAL = np.geomspace(0.35, 6.0, 24)  # of the image's width: 110 to 10 degrees 
 
 
 def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
-    """Return an initial lens without distortion.
+    """Initial lens (9,) without distortion: that which fits the middle image best.
 
-    Shape (9,), by the focal length under which the middle image fits best.
-
-    The middle one: up to half of the images may be wrong altogether.
-
-    Args:
-        observations: Numbers (n,) and places (n, 2) [px] of the corners of each image.
-        drawn_m: Corners of the board (N, 3) [m].
-        size_px: Width and height of the images.
+    The middle one, since up to half of the images may be wrong altogether. Observations are the numbers (n,)
+    and places (n, 2) [px] of the corners (N, 3) [m] in each image.
     """
     width, height = size_px
     lenses = [
@@ -366,15 +312,10 @@ def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_p
 def place_board(corners_m: Float, uv: Float, lens: Float) -> tuple[Float, float]:
     """T_camera_board (4, 4) [m] and rms [px] of one image of a flat board.
 
-    Args:
-        corners_m: Corners (n, 3) [m], z = 0, at least four.
-        uv: Where they are seen (n, 2) [px].
-        lens: (9,) in the order of `bundle.LENS`.
-
-    A plane seen from afar has two poses that look alike (Schweighofer and Pinz, 2006): both are refined.
+    From corners (n, 3) [m], z = 0, at least four, seen at (n, 2) [px] by a lens (9,). A plane seen from afar
+    has two poses that look alike (Schweighofer and Pinz, 2006): both are refined.
     """
-    matrix = np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
-    best = np.eye(4), np.inf
+    matrix, best = _matrix(lens), (np.eye(4), np.inf)
     _, rotation_vectors, moves, _ = cv2.solvePnPGeneric(
         corners_m, uv, matrix, lens[4:], flags=cv2.SOLVEPNP_IPPE
     )

@@ -1,15 +1,8 @@
 """The command `calibrate cameras capture` keeps board images of slaves.
 
-Image capture for a calibration from running slaves.
-
-Whole frames over the bus, on a person's pace.
-
-While it runs it *is* the rig's master: it gives the start and keeps the clocks, so that slaves need not know that
-nobody tracks. Nothing is calibrated here; its folder is what `calibrate cameras intrinsics` and `stereo` read.
-
-Command `phalanx calibrate cameras capture`: board images from running slaves.
-
-They are for `intrinsics` and `stereo`.
+Whole frames come over the bus, at a person's pace. While it runs it *is* the rig's master: it gives the start
+and keeps the clocks, so that slaves need not know that nobody tracks. Nothing is calibrated here; its folder
+is what `calibrate cameras intrinsics` and `stereo` read.
 """
 
 import os
@@ -32,12 +25,10 @@ from common.command_line import echo
 from common.errors import BusError, CalibrationError, PictureError
 from common.messages import Command, Still
 from common.recording.pictures import Size, decode
-from master.calibrate.cameras.boards import board_of, options_of
+from master.calibrate.cameras.boards import board_in, options_of
 from master.calibrate.cameras.coverage import LiveViews, Verdict
 from master.calibrate.tree_files import date_now
-from master.commands.options import (
-    address,
-)
+from master.commands.options import address
 from master.run.ingest import Ingest
 from master.run.process import host_bus, stop_on_signals
 
@@ -47,18 +38,12 @@ NOTES = "capture.json"
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Pictures that were asked for together.
-
-    Attributes:
-        stills: Camera -> what it sent.
-        images: Camera -> the same, decoded.
-        spread_ms: Time between the first and the last of them [ms]; NaN while a clock is not known.
-        refused: Camera -> why its picture was not decoded.
-    """
+    """Pictures that were requested together."""
 
     stills: Mapping[str, Still]
     images: Mapping[str, Image]  # (H, W, 3) BGR
-    spread_ms: float
+    spread_ms: float  # time between the first and the last of them [ms]; NaN while a clock is not known
+    # camera -> why its picture was not decoded
     refused: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
@@ -73,14 +58,8 @@ def capture(
 ) -> int:
     """Keep views until there are enough or `stop` is set; return how many.
 
-    Args:
-        take: Gives the next round.
-        live: Judges it.
-        folder: Where CAMERA/NUMBER.jpg go, as they came; made by `new_folder`.
-        wanted: Views to keep.
-        stop: Ends it early.
-        notify: Called with what the person should read.
-        advise: Called after each view that was kept: what is still missing.
+    They are CAMERA/NUMBER.jpg of `folder`, which `new_folder` made, as they came. `notify` is called with
+    what the person should read, `advise` after each view that was kept.
 
     Raises:
         CalibrationError: The folder cannot be written.
@@ -97,12 +76,12 @@ def capture(
             view = live.views[-1]
             spread.append(round_.spread_ms)
             _keep(folder, view.name, {name: round_.stills[name] for name in view.observations})
-            notify(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
+            hint = advise()
+            notify(f"view {len(live.views)} of {wanted}: {text}{'; ' * bool(hint)}{hint}")
         elif text != previous or began_ns - notified_ns > log_ns:
             notify(text)
             previous, notified_ns = text, began_ns
-        round_s = 0.3
-        stop.wait(max(0.0, round_s - (now_ns() - began_ns) * 1e-9))
+        stop.wait(max(0.0, 0.3 - (now_ns() - began_ns) * 1e-9))
     if live.views:
         _note(folder, live, spread)
     return len(live.views)
@@ -115,27 +94,20 @@ class StillTaker:
     """
 
     def __init__(self, bus: Bus, ingest: Ingest, sizes: Mapping[str, Size]) -> None:
-        """Listen for stills from now on.
-
-        Of the cameras in `sizes`, whose files state these widths and heights [px].
-        """
+        """Subscribe to stills of the cameras in `sizes`: camera -> width and height [px]."""
         self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
         self._cameras = tuple(sizes)
         self._next_round: Subscription = bus.subscribe("still", depth=4 * len(sizes))
 
     def take(self) -> Round:
-        """Take one round of images.
-
-        Ask all, then wait until all that answered have sent, at most a second.
-        """
+        """Ask all cameras, then wait until all that answered have sent, at most a second."""
         while self._next_round.get(0.0) is not None:
             pass  # what came too late for its own round
         askers = [threading.Thread(target=self._ask, args=(name,), daemon=True) for name in self._cameras]
         for thread in askers:
             thread.start()
         stills: dict[str, Still] = {}
-        answer_ns = 1_000_000_000
-        end_ns = now_ns() + answer_ns
+        end_ns = now_ns() + 1_000_000_000
         while len(stills) < len(self._cameras) and (left_ns := end_ns - now_ns()) > 0:
             message = self._next_round.get(left_ns * 1e-9)
             if isinstance(message, Still) and message.camera in self._cameras:
@@ -147,7 +119,7 @@ class StillTaker:
         return self._round(stills)
 
     def close(self) -> None:
-        """Listen no more. Safe to call twice."""
+        """End the subscription. Safe to call twice."""
         self._next_round.close()
 
     def _ask(self, camera: str) -> None:
@@ -173,10 +145,6 @@ class StillTaker:
                 return float("nan")
             times.append(estimate.to_local(still.t_ns))
         return (max(times) - min(times)) * 1e-6 if times else float("nan")
-
-
-def _then(advice: str) -> str:
-    return f"; {advice}" if advice else ""
 
 
 def _without(cameras: tuple[str, ...], round_: Round) -> str:
@@ -215,7 +183,6 @@ def _keep(folder: Path, view: str, stills: Mapping[str, Still]) -> None:
 
 
 def _note(folder: Path, live: LiveViews, spread_ms: list[float]) -> None:
-    """What the pictures are of, for whoever finds the folder."""
     known = [value for value in spread_ms if np.isfinite(value)]
     notes = {
         "date": date_now(),
@@ -231,16 +198,11 @@ def _note(folder: Path, live: LiveViews, spread_ms: list[float]) -> None:
 
 
 def capture_views(options: Namespace) -> None:
-    """Keep an image whenever the board is held still somewhere new.
-
-    All running slaves of the rig at once.
-    """
+    """Keep images of all running slaves when the board is still somewhere new."""
     ends = address(options.beacon, "--beacon"), address(options.bind, "--bind")
     cameras = cameras_of(options.calibration, options.rig)
     sizes = _sizes(options.calibration, cameras)
-    live = LiveViews(
-        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary), cameras
-    )
+    live = LiveViews(board_in(options), cameras)
     key = link_key(os.environ, options.key_file)
     clock = SystemClock()
     new_folder(options.out)
@@ -248,8 +210,7 @@ def capture_views(options: Namespace) -> None:
     with ExitStack() as stack:
         link = host_bus(options.bus, live.cameras)
         stack.callback(link.close)
-        start_s = 5.0
-        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, start_s)
+        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, 5.0)
         stack.callback(ingest.close)
         _wait(ingest, live.cameras, stop)
         taker = StillTaker(link, ingest, sizes)
@@ -264,32 +225,24 @@ def capture_views(options: Namespace) -> None:
 
 
 def _next(live: LiveViews, out: Path, rig: str) -> str:
-    """The command that makes a calibration of what was kept."""
     several = len(live.cameras) > 1
     what, of_rig = ("stereo", f" --rig {rig}") if several else ("intrinsics", "")
     return f"cameras {what} {out} {options_of(live.board)}{of_rig} --out DIR"
 
 
 def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
-    """The cameras of a rig, which need not have lenses or places yet."""
+    """The cameras of a rig, which need not have lenses or poses yet."""
     return load(calibration / "rigs" / f"{rig}.json", RigCalibration).cameras
 
 
 def _sizes(calibration: Path, cameras: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Return the image sizes that the camera files state.
-
-    Width and height [px].
-    """
+    """Camera -> width and height [px], as the camera files state."""
     files = (load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in cameras)
     return {file.name: (file.width_px, file.height_px) for file in files}
 
 
 def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> None:
-    """Wait until the start is given, and print whom it waits for.
-
-    Raises:
-        CalibrationError: Called with to stop before.
-    """
+    """Wait until the start is given, and print whom it waits for."""
     previous: frozenset[str] | None = None
     rounds = 0
     while not ingest.started:
@@ -299,11 +252,9 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
             echo(f"waiting for {absent or 'the start'}")
             previous = here
         rounds += 1
-        hint_rounds = 50  # ten seconds
-        if rounds % hint_rounds == 0 and not here:
+        if rounds % 50 == 0 and not here:  # ten seconds
             echo(
                 "no slave answers: is it running, with the same rig key, and does --beacon reach it? See its log"
             )
-        poll_s = 0.2
-        if stop.wait(poll_s):
+        if stop.wait(0.2):
             raise CalibrationError("stopped before any slave was there")

@@ -1,16 +1,11 @@
 """The commands `intrinsics` and `stereo` fit cameras and write their files.
 
-Writing calibrations into the calibration tree, each with its provenance.
-
-Lenses into cameras/NAME.json, poses into rigs/RIG.json.
-
-Calibration of lenses and camera poses from images of a board.
-
-`phalanx calibrate cameras intrinsics | stereo`.
+Images of a board enter; lenses into cameras/NAME.json and poses into rigs/RIG.json leave, each with its
+provenance.
 """
 
 from argparse import Namespace
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +18,12 @@ from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import invert
-from master.calibrate.cameras.boards import Board, board_of
+from master.calibrate.cameras.boards import board_in
+from master.calibrate.cameras.coverage import draw_views
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
 from master.calibrate.cameras.result import CamerasResult, report_json, report_lines, result
 from master.calibrate.cameras.views import BoardViews, View, image_sets, look
-from master.calibrate.tree_files import lens_of, matrix_of, provenance, write_camera, write_rig
+from master.calibrate.tree_files import lens_of, matrix_of, print_lines, provenance, write_camera, write_rig
 from master.commands.summary import write_summary
 from master.fabrik.depth import law_contradicts
 
@@ -35,10 +31,7 @@ NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not me
 
 
 def known_camera(name: str, calibration: Path, out: Path | None) -> CameraCalibration | None:
-    """Return the camera's file, or None if there is none.
-
-    The file of `out`, else that of `calibration`.
-    """
+    """The camera's file of `out`, else of `calibration`; None: there is none."""
     for tree in (out, calibration):
         if tree is not None and (path := tree / "cameras" / f"{name}.json").exists():
             return load(path, CameraCalibration)
@@ -46,7 +39,7 @@ def known_camera(name: str, calibration: Path, out: Path | None) -> CameraCalibr
 
 
 def known_rig(name: str, calibration: Path, out: Path | None) -> RigCalibration | None:
-    """The rig's file: that of `out`, else that of `calibration`; None: there is none."""
+    """The rig's file of `out`, else of `calibration`; None: there is none."""
     for tree in (out, calibration):
         if tree is not None and (path := tree / "rigs" / f"{name}.json").exists():
             return load(path, RigCalibration)
@@ -54,11 +47,7 @@ def known_rig(name: str, calibration: Path, out: Path | None) -> RigCalibration 
 
 
 def check_size(camera: CameraCalibration, size_px: tuple[int, int]) -> None:
-    """Refuse images of another mode than the file's: a lens in pixels holds for one.
-
-    Raises:
-        CalibrationError: Naming both sizes.
-    """
+    """Refuse images of another mode than the file's: a lens holds for one."""
     if (camera.width_px, camera.height_px) != size_px:
         raise CalibrationError(
             f"camera {camera.name!r}: the images are {size_px[0]} x {size_px[1]} px, its file says"
@@ -69,10 +58,7 @@ def check_size(camera: CameraCalibration, size_px: tuple[int, int]) -> None:
 def camera_with_lens(
     known: CameraCalibration | None, name: str, size_px: tuple[int, int], lens: Intrinsics, how: Provenance
 ) -> CameraCalibration:
-    """Return the camera's file with a new lens.
-
-    A new file with neutral settings where there is none.
-    """
+    """The camera's file with a new lens; a new one has neutral settings."""
     if known is None:
         how = msgspec.structs.replace(how, note=f"{how.note}; new file: {NEUTRAL}")
         return CameraCalibration(
@@ -94,15 +80,9 @@ def camera_with_lens(
 def rig_with_places(
     known: RigCalibration | None, name: str, places: dict[str, Matrix4], how: Provenance
 ) -> RigCalibration:
-    """Return the rig's file with new camera poses.
+    """The rig's file with new camera poses; all else stays, and so does its frame.
 
-    Everything else in it stays, and so does its frame.
-
-    Args:
-        known: The rig so far; None: a new marker rig.
-        name: Of the rig.
-        places: Camera -> T_first_camera (4, 4), of all cameras measured.
-        how: Provenance.
+    `places` are camera -> T_first_camera (4, 4), of all cameras measured; `known` None: a new marker rig.
     """
     if known is None:
         return RigCalibration(
@@ -137,13 +117,9 @@ def rig_with_places(
 def without_wrong_law(
     rig: RigCalibration, cameras: Mapping[str, CameraCalibration | None]
 ) -> tuple[RigCalibration, str]:
-    """Return the rig without a law that contradicts its places, and why.
+    """The rig without a depth law that contradicts its camera poses, and why.
 
-    Its `depth_model` is "stereo" then; the numbers of the law stay.
-
-    Args:
-        rig: With new places.
-        cameras: Camera files by name; None: not known.
+    Its `depth_model` is "stereo" then; the numbers of the law stay. A camera file may be None.
     """
     files = [cameras.get(name) for name in rig.cameras]
     if rig.depth_model == "stereo" or any(file is None or file.intrinsics is None for file in files):
@@ -160,7 +136,7 @@ def without_wrong_law(
 
 
 def lens_provenance(result: CamerasResult, camera: str, tool: str, data: tuple[str, ...]) -> Provenance:
-    """Of one camera's lens."""
+    """Provenance of one camera's lens."""
     lens = result.lenses[camera]
     residual = {
         "rms_px": round(lens.rms_px, 4),
@@ -173,7 +149,7 @@ def lens_provenance(result: CamerasResult, camera: str, tool: str, data: tuple[s
 
 
 def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -> Provenance:
-    """Of the places of the cameras."""
+    """Provenance of the camera poses."""
     residual = {"rms_px": round(result.rms_px, 4)}
     for pair in result.pairs:
         names = f"{pair.first}_{pair.second}"
@@ -192,12 +168,10 @@ def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -
 def write_files(
     out: Path, cameras: Mapping[str, CameraCalibration], rigs: Mapping[str, RigCalibration]
 ) -> list[Path]:
-    """Save files, by their names in the tree.
-
-    Each is replaced whole or not at all, and none is written where one is impossible.
+    """Save files by their names in the tree; none is written where one is invalid.
 
     Raises:
-        CalibrationError: A folder or file cannot be written, or what is measured cannot be.
+        CalibrationError: A folder or file cannot be written, or a measured value is invalid.
     """
     for folder, files in (("cameras", cameras), ("rigs", rigs)):
         for name, value in files.items():
@@ -212,17 +186,13 @@ def _array(matrix: Matrix4) -> Float:
 
 def intrinsics(options: Namespace) -> None:
     """Measure the lens of each camera by itself."""
-    views = _views(
-        options.source,
-        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
-        options.camera,
-    )
+    views = _views(options)
     known = _known_cameras(views, options.calibration, options.out)
     results: dict[str, CamerasResult] = {}
     for name in views.cameras:
         fit = fit_cameras(_only(views, name), bent=_bent(flat=options.flat_board, bent=options.bent_board))
         results[name] = result(fit, {})
-        _print_all(report_lines(results[name]))
+        print_lines(report_lines(results[name]))
         _draw(options.picture if len(views.cameras) == 1 else _named(options.picture, name), fit)
     files: dict[str, CameraCalibration] = {}
     for name, own in results.items():
@@ -237,16 +207,9 @@ def intrinsics(options: Namespace) -> None:
 
 
 def stereo(options: Namespace) -> None:
-    """Calibrate the poses and lenses of all cameras of a rig in one bundle.
-
-    Two cameras or more.
-    """
+    """Calibrate poses and lenses of a rig's cameras, two or more, in one bundle."""
     rig_known = known_rig(options.rig, options.calibration, options.out)
-    views = _views(
-        options.source,
-        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
-        options.camera,
-    )
+    views = _views(options)
     if rig_known is not None:
         order = sorted(views.cameras, key=[*rig_known.cameras, *views.cameras].index)
         views = replace(views, sizes_px={name: views.sizes_px[name] for name in order})
@@ -261,20 +224,14 @@ def stereo(options: Namespace) -> None:
             held[name] = lens_of(file.intrinsics)
     fit = fit_cameras(views, held, bent=_bent(flat=options.flat_board, bent=options.bent_board))
     found = result(fit, held)
-    _print_all(report_lines(found))
+    print_lines(report_lines(found))
     _draw(options.picture, fit)
     data = (_source_name(options.source),)
-    files = {
-        name: camera_with_lens(
-            known[name],
-            name,
-            views.sizes_px[name],
-            found.lenses[name].intrinsics,
-            lens_provenance(found, name, "calibrate cameras stereo", data),
-        )
-        for name in views.cameras
-        if name not in held
-    }
+    files: dict[str, CameraCalibration] = {}
+    for name in (name for name in views.cameras if name not in held):
+        how = lens_provenance(found, name, "calibrate cameras stereo", data)
+        lens = found.lenses[name].intrinsics
+        files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
     how = places_provenance(found, "calibrate cameras stereo", data)
     new, dropped = without_wrong_law(
         rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
@@ -290,20 +247,14 @@ def stereo(options: Namespace) -> None:
 
 
 def _bent(*, flat: bool, bent: bool) -> bool | None:
-    """Return whether the options declare the board bent.
-
-    None: views held out decide.
-
-    Raises:
-        FitError: It is both.
-    """
+    """Whether the options declare the board bent; None: held-out views decide."""
     if flat and bent:
         raise FitError("--flat-board and --bent-board: a board is one of both")
     return bent if flat or bent else None
 
 
-def _views(source: Path, board: Board, cameras: list[str] | None) -> BoardViews:
-    sets = image_sets(source, cameras or ())
+def _views(options: Namespace) -> BoardViews:
+    board, sets = board_in(options), image_sets(options.source, options.camera or ())
     images = sum(len(own) for _, own in sets)
     done = 0
 
@@ -330,16 +281,12 @@ def _known_cameras(
 
 
 def _only(views: BoardViews, camera: str) -> BoardViews:
-    """The views of one camera."""
     own = tuple(View(name, {camera: observation}) for name, observation in views.of(camera))
     return replace(views, views=own, sizes_px={camera: views.sizes_px[camera]})
 
 
 def _source_name(source: Path) -> str:
-    """Return the folder's name as data are named in provenance.
-
-    Its own name, not where this machine keeps it.
-    """
+    """The folder's own name: provenance does not name where this machine keeps it."""
     return source.resolve().name
 
 
@@ -350,15 +297,8 @@ def _named(picture: Path | None, camera: str) -> Path | None:
 def _draw(picture: Path | None, fit: CamerasFit) -> None:
     if picture is None:
         return
-    from master.calibrate.cameras.coverage import draw_views
-
     draw_views(picture, fit)
     echo(f"drew {picture}")
-
-
-def _print_all(lines: Iterable[str]) -> None:
-    for line in lines:
-        echo(line)
 
 
 def _written(paths: list[Path], known: dict[str, CameraCalibration | None]) -> None:

@@ -1,22 +1,9 @@
 """Measure and draw which parts of the image the board has covered.
 
-The coverage of a camera's views decides which live image is kept.
-
-Coverage of a camera's views, and the view that is missing most.
-
-How well they cover what its lens can do.
-
-Selection of images of a hand-held board that are worth keeping.
-
-Held still, in focus of the fit, and unlike those kept before.
-
-Cameras that are not synchronised see a moving board in two places, so a view counts only where every camera that
-sees the board sees it where it was in the round before. Rounds are a fraction of a second apart and cameras less, so
-what moves less than `STILL_PX` between rounds moves far less between cameras.
-
-Plot of a camera calibration.
-
-Where corners were seen, their residuals, and which views fit how well.
+It also decides which live images of a hand-held board are kept. Cameras that are not synchronised see a
+moving board in two places, so a view counts only where every camera that sees the board sees it where it was
+in the round before. Rounds are a fraction of a second apart and cameras less, so what is still between rounds
+is so between cameras.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,38 +12,27 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from common.arrays import Bool, Float, Image
-from common.calibration.files import replacing
-from common.errors import RecordingError
 from master.calibrate.cameras.boards import Board, ImageObservation, board_corners, find_board
 from master.calibrate.cameras.bundle import guess_lens, place_board, rms
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
 from master.calibrate.cameras.views import BoardViews, View
+from master.calibrate.figures import figure_of, save_figure
 
 CELLS = (6, 8)  # rows and columns: a cell is about as large as a board's square seen near
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """What the views of one camera cover.
+    """What the views of one camera cover."""
 
-    Attributes:
-        cells: Whether a corner was seen in that part of the image (6, 8), rows from the top.
-        tilt_deg: Angle [deg] between the board's normal and the camera's axis (V,).
-        tilt_spread_deg: Largest angle [deg] between two views' normals: what determines the focal length.
-        across: Spread [deg] of the normals to the sides and up and down.
-        distance_m: Distance [m] of the board's middle (V,).
-    """
-
-    cells: Bool
-    tilt_deg: Float
-    tilt_spread_deg: float
-    across: tuple[float, float]
-    distance_m: Float
+    cells: Bool  # whether a corner was seen in that part of the image (6, 8), rows from the top
+    tilt_deg: Float  # angle [deg] between the board's normal and the camera's axis (V,)
+    tilt_spread_deg: float  # largest angle [deg] between two views' normals: what determines the focal length
+    across: tuple[float, float]  # spread [deg] of the normals to the sides and up and down
+    distance_m: Float  # distance [m] of the board's middle (V,)
 
     @property
     def share(self) -> float:
@@ -67,26 +43,16 @@ class Coverage:
 def coverage(
     size_px: tuple[int, int], uv: Sequence[Float], T_camera_board: Float, middle_m: Float
 ) -> Coverage:
-    """Coverage of views.
+    """Coverage of views with corners (n, 2) [px] and board poses (V, 4, 4) [m].
 
-    Args:
-        size_px: Width and height of the image.
-        uv: Corners (n, 2) [px] of each view.
-        T_camera_board: Places of the board (V, 4, 4) [m].
-        middle_m: Middle of the board (3,) [m] in its frame.
+    `middle_m` (3,) [m] is the middle of the board in its frame.
     """
-    rows, columns = CELLS
-    points = np.concatenate(uv)
-    u = np.clip((points[:, 0] + 0.5) * columns / size_px[0], 0, columns - 1).astype(int)
-    v = np.clip((points[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
-    cells = np.zeros(CELLS, dtype=np.bool_)
-    cells[v, u] = True
     normals = T_camera_board[:, :3, 2]
     cosines = np.clip(normals @ normals.T, -1.0, 1.0)
     sides = np.degrees(np.arctan2(normals[:, :2], normals[:, 2:]))
     places = T_camera_board[:, :3, :3] @ middle_m + T_camera_board[:, :3, 3]
     return Coverage(
-        cells=cells,
+        cells=_cells(size_px, np.concatenate(uv)),
         tilt_deg=np.degrees(np.arccos(np.clip(normals[:, 2], -1.0, 1.0))),
         tilt_spread_deg=float(np.degrees(np.arccos(cosines.min()))),
         across=(float(np.ptp(sides[:, 0])), float(np.ptp(sides[:, 1]))),
@@ -94,17 +60,25 @@ def coverage(
     )
 
 
+def _cells(size_px: tuple[int, int], uv: Float) -> Bool:
+    """Which of the image's cells (6, 8) hold one of the corners (n, 2) [px]."""
+    rows, columns = CELLS
+    u = np.clip((uv[:, 0] + 0.5) * columns / size_px[0], 0, columns - 1).astype(int)
+    v = np.clip((uv[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
+    cells = np.zeros(CELLS, dtype=np.bool_)
+    cells[v, u] = True
+    return cells
+
+
 def advice(covered: Coverage) -> str:
     """The view that would help most, or "" where all is covered."""
-    enough_tilt_deg = 40.0
-    if covered.tilt_spread_deg < enough_tilt_deg:
+    if covered.tilt_spread_deg < 40.0:
         sideways, upright = covered.across
         about = "its upright axis (left edge nearer, then right edge)"
         if upright < sideways:
             about = "its level axis (top edge nearer, then bottom edge)"
         return f"tilt the board 20 to 40° about {about}"
-    enough_share = 0.7
-    if covered.share < enough_share:
+    if covered.share < 0.7:
         return f"show the board {_emptiest(covered.cells)}"
     enough_range = 1.5
     if covered.distance_m.max() < enough_range * covered.distance_m.min():
@@ -144,12 +118,7 @@ def _emptiest(cells: Bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of one round of pictures.
-
-    Attributes:
-        kept: Whether it is worth keeping.
-        text: For the person who holds the board.
-    """
+    """Whether a round of pictures is kept, and the text for who holds the board."""
 
     kept: bool
     text: str
@@ -158,11 +127,10 @@ class Verdict:
 class LiveViews:
     """Push machine for live views.
 
-    It holds the views kept so far and where each camera saw the board in the last round.
+    State: the views kept so far, and where each camera saw the board in the last round.
     """
 
     def __init__(self, board: Board, cameras: tuple[str, ...]) -> None:
-        """Begin without views."""
         self.board, self.cameras = board, cameras
         self.views: list[View] = []
         self._sizes: dict[str, tuple[int, int]] = {}
@@ -179,8 +147,7 @@ class LiveViews:
             return Verdict(False, "no camera sees the board")
         by = " and ".join(seen)
         moved = {name: _moved(seen[name], last[name]) if name in last else float("inf") for name in seen}
-        still_px = 0.5
-        if max(moved.values()) > still_px:
+        if max(moved.values()) > 0.5:
             return Verdict(False, f"{by}: hold it still")
         if not self._is_new(seen):
             return Verdict(False, f"{by}: seen there already; move, turn or tilt it")
@@ -192,10 +159,7 @@ class LiveViews:
         return BoardViews(self.board, dict(self._sizes), tuple(self.views))
 
     def missing(self) -> str:
-        """Return the view that would help most now.
-
-        For the camera that needs one most; what to do once none is missing.
-        """
+        """The view that would help most now, for the camera that needs one most."""
         views = self.board_views()
         for name in sorted(self.cameras, key=lambda name: len(views.of(name))):
             if wish := advice_so_far(views, name):
@@ -208,29 +172,19 @@ class LiveViews:
         return "nothing is missing any more; more views make it more certain"
 
     def _is_new(self, seen: Mapping[str, ImageObservation]) -> bool:
-        """Check whether some camera sees the board as in no view before.
-
-        A set of cameras that is new counts as new as well.
-        """
+        """Some camera sees the board as in no view before, or this set of cameras is new."""
         for view in self.views:
             if not set(seen) <= set(view.observations):
                 continue
-            change = [
-                _moved(observation, view.observations[name]) / self._sizes[name][0]
-                for name, observation in seen.items()
-            ]
-            # of the image's width: how far corners must be from where an earlier view had them
-            new_share = 0.06
-            if max(change) < new_share:
+            pairs = ((name, now, view.observations[name]) for name, now in seen.items())
+            # Of the image's width: how far corners must be from where an earlier view had them.
+            if max(_moved(now, then) / self._sizes[name][0] for name, now, then in pairs) < 0.06:
                 return False
         return True
 
 
 def _moved(now: ImageObservation, then: ImageObservation) -> float:
-    """Return how far the corners seen both times moved.
-
-    Root mean square [px]; inf where there are none.
-    """
+    """Rms motion [px] of the corners seen both times; inf: there are none."""
     step: Float = now.corners_px - then.corners_px
     both = np.isfinite(step[:, 0])
     return float(np.sqrt((step[both] ** 2).sum(axis=1).mean())) if both.any() else float("inf")
@@ -240,27 +194,20 @@ _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
 def draw_views(path: Path, fit: CamerasFit) -> None:
-    """Write the plot as PNG, one row per camera.
-
-    Corners, residuals enlarged, rms of each view.
+    """Draw one row per camera as PNG: corners, enlarged residuals, rms of each view.
 
     Raises:
         RecordingError: The file cannot be written.
     """
     cameras = fit.views.cameras
-    figure = Figure(figsize=(15.0, 0.6 + 3.7 * len(cameras)), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figure_of((15.0, 0.6 + 3.7 * len(cameras)))
     figure.suptitle(f"{fit.views.board}: {len(fit.shots)} images, rms {fit.rms_px:.3f} px")
     axes = figure.subplots(len(cameras), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.1))
     for row, camera in zip(axes, cameras, strict=True):
         _corners(row[0], fit, camera)
         _residuals(row[1], fit, camera)
         _bars(row[2], fit, camera)
-    try:
-        with replacing(path) as file:
-            figure.savefig(file, format="png")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write the picture: {error.strerror}") from error
+    save_figure(figure, path)
 
 
 def _image(axes: Axes, fit: CamerasFit, camera: str, title: str) -> None:
@@ -272,14 +219,10 @@ def _image(axes: Axes, fit: CamerasFit, camera: str, title: str) -> None:
 def _corners(axes: Axes, fit: CamerasFit, camera: str) -> None:
     _image(axes, fit, camera, "corners; shaded: cells without any")
     width, height = fit.views.sizes_px[camera]
-    rows, columns = CELLS
-    seen = np.zeros(CELLS, dtype=np.bool_)
-    for i in fit.of(camera):
-        uv = fit.observations[i].uv
+    corners = [fit.observations[i].uv for i in fit.of(camera)]
+    for uv in corners:
         axes.plot(uv[:, 0], uv[:, 1], ".", markersize=3)
-        u = np.clip((uv[:, 0] + 0.5) * columns / width, 0, columns - 1).astype(int)
-        v = np.clip((uv[:, 1] + 0.5) * rows / height, 0, rows - 1).astype(int)
-        seen[v, u] = True
+    seen = _cells((width, height), np.concatenate(corners))
     axes.imshow(~seen, extent=(0, width, height, 0), cmap="Greys", alpha=0.25, vmin=0, vmax=1, aspect="equal")
 
 

@@ -1,15 +1,7 @@
-"""A fit joins the cameras by shared views, and solves them in one bundle.
-
-Relative poses of the cameras, from views that two of them share.
-
-Wrong views are outvoted.
-
-Fit of all cameras that saw a board in one bundle.
-
-Lenses, poses, and the board's shape; what is wrong is rejected.
+"""A fit finds all cameras that saw a board in one bundle.
 
 every camera alone -> links between them -> robust bundle <-> judge images and views -> plain least squares,
-with the board as drawn and with a shape of its own -> the one that predicts views held out better
+with the board as drawn and with a shape of its own -> the one that predicts held-out views better
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,14 +35,10 @@ Places = Mapping[str, Mapping[str, Float]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
-    """First estimate of a rig.
+    """First estimate of a rig."""
 
-    Attributes:
-        T_camera_rig: Camera -> (4, 4) [m]; the rig's frame is that of the first camera.
-        corner_order: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
-    """
-
-    T_camera_rig: Mapping[str, Float]
+    T_camera_rig: Mapping[str, Float]  # camera -> (4, 4) [m]; the rig's frame is that of the first camera
+    # view -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view
     corner_order: Mapping[str, Mapping[str, Int]]
 
 
@@ -85,20 +73,14 @@ def _relative(
     of: Mapping[str, Float],
     views: list[str],
 ) -> Float:
-    """Return the view estimate of T_to_of with the least median distance.
-
-    Shape (4, 4) [m]: of all views' estimates, the one with the least median distance from the others.
-    """
+    """T_to_of (4, 4) [m]: the view's estimate with the least median distance."""
     candidates = [
         np.stack([to[view] @ rotation @ invert(of[view]) for _, rotation in turns]) for view in views
     ]
     points = [transform(of[view], drawn) for view in views]
 
     def distance(T: Float) -> float:
-        """Return the median distance of the board from where T puts it.
-
-        Median over views in [m], in the ordering that suits.
-        """
+        """Median over views [m] of the board's distance, in the ordering that suits."""
         off = [
             min(float(np.linalg.norm(transform(T, p) - transform(other, p), axis=1).mean()) for other in own)
             for own, p in zip(candidates, points, strict=True)
@@ -111,10 +93,7 @@ def _relative(
 def _corner_orders(
     drawn: Float, turns: list[tuple[Int, Float]], known: Mapping[str, Float], places: Places
 ) -> dict[str, dict[str, Int]]:
-    """Return the order of each camera's corners for each view.
-
-    The order that agrees best with the first camera of the view.
-    """
+    """Order of each camera's corners that agrees best with the view's first camera."""
     corner_order: dict[str, dict[str, Int]] = {}
     for view in sorted(set[str]().union(*places.values())):
         first: Float | None = None
@@ -137,9 +116,8 @@ def _islands(cameras: Sequence[str], places: Places) -> str:
     groups: list[list[str]] = []
     for camera in cameras:
         touching = [g for g in groups if any(places[camera].keys() & places[other].keys() for other in g)]
-        groups = [g for g in groups if g not in touching] + [
-            [*(name for g in touching for name in g), camera]
-        ]
+        joined = [*(name for g in touching for name in g), camera]
+        groups = [*(g for g in groups if g not in touching), joined]
     named = " and ".join("{" + ", ".join(group) + "}" for group in groups)
     return f"the cameras {named} share no view of the board: show it to both groups at once"
 
@@ -151,25 +129,15 @@ _TERMS = ((8,), _TANGENTIAL, (5,), (4,))  # k3, p1 and p2, k2, k1: in this order
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CamerasFit:
-    """The result.
-
-    Attributes:
-        views: What was seen.
-        shots: The accepted images.
-        observations: Their corners, in the order of `shots`.
-        solution: Plain least squares over them; the rig's frame is that of the first camera.
-        free: What was estimated.
-        rejected: Images that are not used, and views whose cameras do not agree.
-        board: Whether the board's shape was estimated, and why.
-    """
+    """The result."""
 
     views: BoardViews
-    shots: tuple[Shot, ...]
-    observations: tuple[Observation, ...]
-    solution: Solution
-    free: Free
-    rejected: tuple[Rejection, ...]
-    board: BoardChoice
+    shots: tuple[Shot, ...]  # the accepted images
+    observations: tuple[Observation, ...]  # their corners, in the order of `shots`
+    solution: Solution  # plain least squares over them; the rig's frame is that of the first camera
+    free: Free  # what was estimated
+    rejected: tuple[Rejection, ...]  # images that are not used, and views whose cameras do not agree
+    board: BoardChoice  # whether the board's shape was estimated, and why
 
     @property
     def rms_px(self) -> float:
@@ -181,10 +149,7 @@ class CamerasFit:
         return tuple(i for i, shot in enumerate(self.shots) if shot.camera == camera)
 
     def shared(self) -> tuple[int, ...]:
-        """Return the indices of accepted images whose board pose another camera shares.
-
-        The other camera has an accepted image of the same place of the board.
-        """
+        """Indices of accepted images whose board pose another camera shares."""
         places = [shot.place for shot in self.shots]
         return tuple(i for i, place in enumerate(places) if places.count(place) > 1)
 
@@ -192,13 +157,12 @@ class CamerasFit:
 def fit_cameras(
     views: BoardViews, held: Mapping[str, Float] | None = None, *, bent: bool | None = None
 ) -> CamerasFit:
-    """Lenses and places of all cameras of `views`.
+    """Lenses and poses of all cameras of `views`.
 
     Args:
-        views: What was seen.
         held: Camera -> known lens (9,), in the order of `bundle.LENS`; those of the others are estimated.
-        bent: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen); None: the
-            one that predicts views better that were held out of the fit, flat where that is not certain.
+        bent: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen);
+            None: the one that predicts held-out views better, flat where that is not certain.
 
     Raises:
         FitError: The views do not determine what is asked for; the message states what is missing.
@@ -238,11 +202,7 @@ def _model(fit: CamerasFit) -> Model:
 def _fit(
     seen: Seen, alone: Mapping[str, Alone], start: Bundle, held: Mapping[str, Float], board: BoardChoice
 ) -> CamerasFit:
-    """The fit with one kind of board.
-
-    Raises:
-        FitError: Too little is left, or too few views for the shape of a board.
-    """
+    """The fit with one kind of board."""
     views, bundle = seen.views, start
     candidates = tuple(
         Shot(view.name, camera, view.name)
@@ -268,10 +228,7 @@ def _fit(
 
 
 def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
-    """Return the free parameters of the bundle.
-
-    Everything but what is held, the pose of the first camera, and the last term of the distortion.
-    """
+    """All but what is held, the first camera's pose, and k3."""
     lenses = np.array([[camera not in held and term < 8 for term in range(9)] for camera in views.cameras])
     return Free(lenses, np.arange(len(views.cameras)) > 0, shape=False)
 
@@ -279,10 +236,7 @@ def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
 def _robust(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle, free: Free, sigma: float, *, bent: bool
 ) -> tuple[Bundle, float]:
-    """Solve the bundle with Cauchy's loss, first flat and then with its shape.
-
-    The scale of the loss is three robust standard deviations.
-    """
+    """Fit with Cauchy's loss at three robust deviations, first flat, then shaped."""
     observations = seen.observations(shots)
     bundle = place_boards(observations, bundle)
     for shape in (False, True) if bent else (False,):
@@ -307,7 +261,8 @@ def _final(
     lenses: Bool = np.repeat(estimated, 9, axis=1)
     while True:
         # From the start anew each time: what a term that is not determined did to the others must not stay.
-        begin = replace(start, lenses=np.where(lenses | ~estimated, start.lenses, _bare(start.lenses)))
+        bare = np.where(np.arange(9) < 4, start.lenses, 0.0)  # without distortion
+        begin = replace(start, lenses=np.where(lenses | ~estimated, start.lenses, bare))
         solution = solve(observations, begin, replace(free, lenses=lenses), None, sigma)
         fewer = _determined(solution, lenses)
         if np.array_equal(fewer, lenses):
@@ -318,16 +273,8 @@ def _final(
     )
 
 
-def _bare(lenses: Float) -> Float:
-    """The lenses without distortion."""
-    return np.where(np.arange(9) < 4, lenses, 0.0)
-
-
 def _determined(solution: Solution, lenses: Bool) -> Bool:
-    """Return the free terms without the next insignificant one of each camera.
-
-    Terms (C, 9); the removed term may as well be zero.
-    """
+    """The free terms (C, 9) without the next insignificant one of each camera."""
     kept = lenses.copy()
     for camera, lens in enumerate(solution.bundle.lenses):
         for term in _TERMS:
@@ -349,11 +296,7 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
 def _check_enough(
     views: BoardViews, shots: Sequence[Shot], held: Mapping[str, Float], board: BoardChoice
 ) -> None:
-    """Refuse where too little is left.
-
-    Raises:
-        FitError: A camera has too few images, or shares too few views, or they are too few for the board's shape.
-    """
+    """Refuse too few images, shared views, or views for the board's shape."""
     places = [shot.place for shot in shots]
     if board.bent and len(set(places)) < MIN_SHAPE_VIEWS:
         raise FitError(

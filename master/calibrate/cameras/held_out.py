@@ -1,14 +1,12 @@
 """Decision whether the board is flat or bent, by cross validation.
 
-Views that were held out of the fit decide.
-
-A shape of its own always lowers the residuals of the views that it is fitted to: three numbers a corner see to that.
-So the views are dealt into folds. Lenses, places of the cameras and shape are fitted to all folds but one; in the
-views of that one only the board may move. It is placed by one half of its corners, and the other half is scored,
-then the other way round. Both boards are scored on the same corners, view by view, and the simpler one is
-taken unless the other is better by more than the views scatter (the rule of one standard error: Breiman et al.,
-Classification and Regression Trees, 1984, section 3.4; Hastie et al., The Elements of Statistical Learning, 2009,
-section 7.10; here paired, and with the quantile of Student's t in place of one).
+A shape of its own always lowers the residuals of the views that it is fitted to, by three numbers a corner.
+So the views are dealt into folds. Lenses, camera poses and shape are fitted to all folds but one; in the
+views of that one only the board may move. It is placed by one half of its corners and the other half is
+scored, then the other way round. Both boards are scored on the same corners, view by view, and the simpler
+one is taken unless the other is better by more than the views scatter (the rule of one standard error:
+Breiman et al., Classification and Regression Trees, 1984, section 3.4; Hastie et al., The Elements of
+Statistical Learning, 2009, section 7.10; here paired, and with the quantile of Student's t in place of one).
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,54 +20,36 @@ from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, solve
 from master.calibrate.cameras.outliers import Seen, Shot, place_boards
 
-MIN_VIEWS = (
-    8  # dealt into five folds they leave six to fit: fewer cannot distinguish a bent board from a bent lens
-)
+# Dealt into five folds they leave six to fit: fewer cannot distinguish a bent board from a bent lens.
+MIN_VIEWS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class BoardChoice:
-    """Which board was taken, and by what.
+    """Which board was taken, and why."""
 
-    Attributes:
-        bent: The board's own shape was estimated; False: the board is as drawn.
-        flat_px, bent_px: Error at the corners of held-out views (rms over a view's corners, geometric mean over the
-            views) with either board; NaN: not compared.
-        views: Number of views that were held out, each once.
-        reason: Why nothing was compared; empty: it was.
-    """
-
-    bent: bool
+    bent: bool  # the board's own shape was estimated; False: the board is as drawn
+    # this and bent_px: error at the corners of held-out views (rms over a view's corners, geometric mean over
+    # the views) with either board; NaN: not compared
     flat_px: float = float("nan")
     bent_px: float = float("nan")
-    views: int = 0
-    reason: str = ""
+    views: int = 0  # number of views that were held out, each once
+    reason: str = ""  # why nothing was compared; empty: it was
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """One of the fits that are compared.
+    """One of the fits that are compared."""
 
-    Attributes:
-        bundle: Its optimum over all views, where the fits to fewer views begin.
-        free: What it estimates.
-        sigma_px: Standard deviation of a corner [px] in it.
-    """
-
-    bundle: Bundle
+    bundle: Bundle  # its optimum over all views, where the fits to fewer views begin
     free: Free
-    sigma_px: float
+    sigma_px: float  # standard deviation of a corner [px] in it
 
 
 def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> BoardChoice:
-    """Choose the board that predicts the corners of held-out views better.
+    """Choose the board that predicts held-out corners better; flat where not certain.
 
-    The flat one where that is not certain.
-
-    Args:
-        seen: What was seen.
-        shots: The images that both fits accept.
-        flat, bent: The fits.
+    `shots` are the images that both fits accept.
     """
     errors: list[Float] = []
     for training, held_out in _folds(shots):
@@ -96,10 +76,7 @@ def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> Board
 
 
 def _folds(shots: Sequence[Shot]) -> Iterator[tuple[list[Shot], list[Shot]]]:
-    """Yield images to fit and images held out, in turn.
-
-    Views that the same cameras saw are dealt evenly.
-    """
+    """Yield images to fit and to hold out; equal sets of cameras are dealt evenly."""
     cameras: dict[str, tuple[str, ...]] = {}
     for shot in shots:
         cameras[shot.place] = (*cameras.get(shot.place, ()), shot.camera)
@@ -123,10 +100,7 @@ def _lacking(seen: Seen, training: Sequence[Shot], free: Free) -> str:
 
 
 def _errors(seen: Seen, training: Sequence[Shot], held_out: Sequence[Shot], model: Model) -> Float:
-    """Return the rms corner distance of each held-out view.
-
-    Shape (V,) [px]; NaN: too few to place the board by half of them.
-    """
+    """Rms corner distance (V,) [px] of held-out views; NaN: too few corners."""
     observations = seen.observations(training)
     start = place_boards(observations, model.bundle)
     fitted = solve(observations, start, model.free, sigma_px=model.sigma_px).bundle
@@ -144,24 +118,20 @@ def _errors(seen: Seen, training: Sequence[Shot], held_out: Sequence[Shot], mode
 def _predicted(
     observations: Sequence[Observation], fitted: Bundle, is_odd: Bool, *, odd: bool
 ) -> Iterator[tuple[int, Float]]:
-    """Yield views and squared corner distances, with boards placed by one half.
+    """Views and squared distances (n,) of the corners that did not place the boards.
 
-    The odd corners place the boards (or the even ones); squared distances (n,) are of the other corners.
+    The odd corners place the boards, or the even ones.
     """
     halves: dict[int, list[Observation]] = {}
     for o in observations:
         half = _only(o, is_odd[o.corners] == odd)
-        min_half = 4  # corners that place a board
-        if len(half.corners) >= min_half:
+        if len(half.corners) >= 4:  # corners that place a board
             halves.setdefault(o.view, []).append(half)
     if not halves:
         return
     number = {view: i for i, view in enumerate(sorted(halves))}
     placing = [replace(half, view=number[view]) for view, own in halves.items() for half in own]
-    still = Free(
-        np.zeros_like(fitted.lenses, dtype=np.bool_), np.zeros(len(fitted.lenses), np.bool_), shape=False
-    )
-    placed = solve(placing, place_boards(placing, fitted), still).bundle
+    placed = solve(placing, place_boards(placing, fitted), Free.only_boards(fitted)).bundle
     for o in observations:
         rest = _only(o, is_odd[o.corners] != odd)
         if o.view in number and len(rest.corners):
@@ -174,9 +144,6 @@ def _only(seen: Observation, which: Bool) -> Observation:
 
 
 def _odd(board: Board) -> Bool:
-    """Return one half of the corners, as a mask.
-
-    Shape (N,): every second along and down, so that either half spans the board.
-    """
+    """Mask (N,) of every second corner, so that either half spans the board."""
     row, column = np.indices(grid_shape(board))
     return np.asarray((row + column) % 2 == 1, dtype=np.bool_).ravel()

@@ -1,16 +1,9 @@
 """A robust fit calibrates one camera, and rejects wrong images and views.
 
-Which views are wrong, judged by the others.
-
-Calibration of one camera by itself, the start of every fit.
-
-Its lens, where the board was, and which of its images are wrong.
-
-Which images and views are wrong, given lenses and places of the cameras.
-
-An image is judged by its own camera, whatever the others saw: one that fails is not used at all. A view is judged by
-whether its cameras agree on where the board is: where they do not, the board moved between the exposures or images of
-two epochs were put together. Such images are good in themselves, so each still helps the lens of its own camera.
+An image is judged by its own camera, whatever the others saw: one that fails is not used at all. A view is
+judged by whether its cameras agree on where the board is: where they do not, the board moved between the
+exposures or images of two epochs were put together. Such images are good in themselves, so each still helps
+the lens of its own camera.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Float, Int
 from common.errors import FitError
 from common.geometry.transforms import invert
 from master.calibrate.cameras.boards import ImageObservation, board_corners
@@ -40,18 +33,12 @@ GOOD_PX = 0.12  # as well as corners can be found: such a view is right, however
 
 
 def limit(errors: Float, dof: Float) -> float:
-    """Return the error above which a view is an outlier.
+    """Error [px] above which a view is an outlier; infinite below four views.
 
-    Infinite below four views.
-
-    The logarithms of good views' rms errors scatter about a common middle, more than chi-square alone would have it
-    (light, blur and tilt differ). Middle and spread are the median and the median absolute deviation of all views, so
-    up to half of them may be wrong; the quantile is Student's for as many views, at the level of `FALSE_ALARM`
-    for the whole set.
-
-    Args:
-        errors: Rms error (V,) [px] of each view.
-        dof: Degrees of freedom (V,) of each error.
+    The logarithms of good views' rms errors (V,) scatter about a common middle, more than chi-square alone
+    would have it (light, blur and tilt differ). Middle and spread are median and median absolute deviation,
+    so up to half of the views may be wrong; the quantile is Student's for as many views, at the level
+    `FALSE_ALARM` for the whole set. `dof` (V,) are the degrees of freedom of each error.
     """
     if len(errors) < 4:
         return float("inf")
@@ -83,19 +70,12 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alone:
-    """A camera's own fit.
+    """A camera's own fit."""
 
-    Attributes:
-        lens: (9,) in the order of `bundle.LENS`.
-        T_camera_board: View -> place of the board (4, 4) [m], accepted images only.
-        rejected: The other images.
-        sigma_px: Robust standard deviation of a coordinate.
-    """
-
-    lens: Float
-    T_camera_board: Mapping[str, Float]
+    lens: Float  # (9,) in the order of `bundle.LENS`
+    T_camera_board: Mapping[str, Float]  # view -> board pose (4, 4) [m], accepted images only
     rejected: tuple[Rejection, ...]
-    sigma_px: float
+    sigma_px: float  # robust standard deviation of a coordinate
 
 
 def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
@@ -105,16 +85,11 @@ def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
 
 
 def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alone:
-    """Lens and places of the board from one camera's images, without the wrong ones.
+    """Lens and board poses from one camera's images, without the wrong ones.
 
-    Images are judged by a robust fit to all of them: blurred ones and those whose corners lie off further than the
-    other images' do (`outliers.limit`). Then it is fitted to the good ones, and all are judged anew, until nothing
-    changes; so an image may come back.
-
-    Args:
-        views: What was seen.
-        camera: One of its cameras.
-        held: A known lens (9,), then only the images are judged.
+    Images are judged by a robust fit to all: blurred ones are out, and those with errors beyond `limit`. Then
+    the lens is fitted to the good ones and all are judged again until nothing changes, so an image may come
+    back. With a known lens `held` (9,) the images are judged only.
 
     Raises:
         FitError: Too few images, or too few that agree with each other.
@@ -148,7 +123,7 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
             break
     typical = float(np.median(errors))
     rejected = tuple(
-        Rejection(names[i], camera, _reason(blurred.get(i), errors[i], typical, bound))
+        Rejection(names[i], camera, blurred.get(i) or _off(errors[i], typical, bound))
         for i in range(len(seen))
         if i not in good
     )
@@ -164,10 +139,7 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
 def _robust(
     good: list[int], seen: list[tuple[Int, Float]], drawn: Float, lens: Float, *, first: bool
 ) -> tuple[Float, float]:
-    """Fit a lens with Cauchy's loss.
-
-    The scale of the loss is three times the robust standard deviation of the residuals.
-    """
+    """Fit a lens with Cauchy's loss at three robust deviations of the residuals."""
     observations = [Observation(0, view, *seen[i]) for view, i in enumerate(good)]
     places = np.stack([place_board(drawn[seen[i][0]], seen[i][1], lens)[0] for i in good])
     bundle = Bundle(lens[None], np.eye(4)[None], places, drawn, np.zeros_like(drawn))
@@ -190,16 +162,12 @@ def _blurred(blur_px: Float) -> dict[int, str]:
     blurred = 2.5  # times the blur of the camera's other images: more of the edge than a window holds
     blurred_px = 1.5  # less is no harm, however sharp the others are
     return {
-        int(
-            i
-        ): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
-        for i in np.flatnonzero(blur_px > max(blurred * typical, blurred_px))
+        i: f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
+        for i in np.flatnonzero(blur_px > max(blurred * typical, blurred_px)).tolist()
     }
 
 
-def _reason(blurred: str | None, error: float, typical: float, bound: float) -> str:
-    if blurred is not None:
-        return blurred
+def _off(error: float, typical: float, bound: float) -> str:
     return f"corners are off by {error:.2f} px rms, usually {typical:.2f} px (limit {bound:.2f} px)"
 
 
@@ -217,21 +185,14 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What was seen, with the turned boards put right.
-
-    Attributes:
-        views: As found in the images.
-        corner_order: View -> camera -> order of the corner numbers, as of `links.Links`.
-    """
+    """What was seen, with the turned boards put right."""
 
     views: BoardViews
+    # view -> camera -> order of the corner numbers, as of `fit.Links`
     corner_order: Mapping[str, Mapping[str, Int]]
 
     def observations(self, shots: Sequence[Shot]) -> tuple[Observation, ...]:
-        """Return the corners of the shots.
-
-        Views are numbered by the shots' places, in order of appearance.
-        """
+        """Corners of the shots; views are numbered by the shots' places, in order."""
         cameras = self.views.cameras
         number = {place: i for i, place in enumerate(dict.fromkeys(shot.place for shot in shots))}
         by_name = {view.name: view for view in self.views.views}
@@ -244,7 +205,7 @@ class Seen:
 
 
 def place_boards(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
-    """The bundle with each board where the middle camera of its view likes it best."""
+    """The bundle with each board where the median camera of its view fits it best."""
     views: dict[int, list[Observation]] = {}
     for seen in observations:
         views.setdefault(seen.view, []).append(seen)
@@ -264,12 +225,9 @@ def place_boards(observations: Sequence[Observation], bundle: Bundle) -> Bundle:
 def judge(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle
 ) -> tuple[tuple[Shot, ...], tuple[Rejection, ...]]:
-    """The shots that are good, each at its place, and what is wrong with the others.
+    """The good shots, each at its place, and why the others are rejected.
 
-    Args:
-        seen: What was seen.
-        shots: All that may be good, every view at one place.
-        bundle: Lenses, places of the cameras and shape of the board; its places of the board are not used.
+    `shots` are all that may be good, every view at one place; the board poses of `bundle` are not used.
     """
     good, rejected, sigma = _judge_images(seen, shots, bundle)
     views: dict[str, list[Shot]] = {}
@@ -288,23 +246,19 @@ def judge(
             parted[view] = _to_part(seen, own, bundle, sigma, bound)
             cameras = "" if len(parted[view]) == len(own) else "".join(parted[view])
             notes.append(Rejection(view, cameras, _disagreement(own, parted[view], error / typical)))
-    placed = tuple(
-        replace(shot, place=f"{shot.view} {shot.camera}")
-        if shot.camera in parted.get(shot.view, ())
-        else shot
-        for shot in good
-    )
-    return placed, tuple(notes)
+    placed = (_apart(shot) if shot.camera in parted.get(shot.view, ()) else shot for shot in good)
+    return tuple(placed), tuple(notes)
+
+
+def _apart(shot: Shot) -> Shot:
+    return replace(shot, place=f"{shot.view} {shot.camera}")
 
 
 def _judge_images(
     seen: Seen, shots: Sequence[Shot], bundle: Bundle
 ) -> tuple[tuple[Shot, ...], tuple[Rejection, ...], Float]:
-    """Return good shots, rejections, and each camera's robust standard deviation.
-
-    Reasons are given for the rejections; the standard deviation is (C,) [px].
-    """
-    residuals = _settled(seen, [replace(shot, place=f"{shot.view} {shot.camera}") for shot in shots], bundle)
+    """Good shots, rejections, and each camera's robust standard deviation (C,) [px]."""
+    residuals = _settled(seen, [_apart(shot) for shot in shots], bundle)
     errors = np.array([rms([r]) for r in residuals])
     dof = np.array([2.0 * len(r) - 6.0 for r in residuals])
     good = np.ones(len(shots), dtype=np.bool_)
@@ -318,10 +272,7 @@ def _judge_images(
         distances = np.concatenate([np.linalg.norm(residuals[i], axis=1) for i in own])
         sigma[c] = max(float(np.median(distances)) / 1.1774, 1e-3)
         for i in (i for i in own if errors[i] > bound):
-            text = (
-                f"corners are off by {errors[i]:.2f} px rms, usually {typical:.2f} px (limit {bound:.2f} px)"
-            )
-            reasons[i] = Rejection(shots[i].view, camera, text)
+            reasons[i] = Rejection(shots[i].view, camera, _off(errors[i], typical, bound))
             good[i] = False
     kept = tuple(shot for shot, yes in zip(shots, good, strict=True) if yes)
     return kept, tuple(reasons.values()), sigma
@@ -330,19 +281,11 @@ def _judge_images(
 def _settled(seen: Seen, shots: Sequence[Shot], bundle: Bundle) -> tuple[Float, ...]:
     """Residuals (n, 2) [px] of each shot when only the boards may move."""
     observations = seen.observations(shots)
-    nothing = Free(np.zeros_like(bundle.lenses, dtype=np.bool_), _none(bundle), shape=False)
-    return solve(observations, place_boards(observations, bundle), nothing).residuals
-
-
-def _none(bundle: Bundle) -> Bool:
-    return np.zeros(len(bundle.lenses), dtype=np.bool_)
+    return solve(observations, place_boards(observations, bundle), Free.only_boards(bundle)).residuals
 
 
 def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, sigma: Float) -> Float:
-    """Return the rms residual of each view.
-
-    Shape (V,) [px], as if all cameras were as good as the middle one.
-    """
+    """Rms residual (V,) [px] of each view, scaled to the median camera's noise."""
     shots = [shot for own in views for shot in own]
     residuals = iter(_settled(seen, shots, bundle))
     cameras = seen.views.cameras
@@ -352,10 +295,7 @@ def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, si
 
 
 def _to_part(seen: Seen, own: Sequence[Shot], bundle: Bundle, sigma: Float, bound: float) -> set[str]:
-    """Return the cameras to separate from a view.
-
-    The one without which the others agree, or else all.
-    """
+    """Cameras to separate: the one without which the others agree, or else all."""
     if len(own) < 3:
         return {shot.camera for shot in own}
     without = [[shot for shot in own if shot != rejected] for rejected in own]

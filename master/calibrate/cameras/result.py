@@ -1,18 +1,10 @@
 """A result holds lenses and poses, their audited accuracy, and the report.
 
-Accuracy of a calibration, measured from the values as written to the files.
-
-Results of the camera fits.
-
-Lenses and poses with their uncertainty, or why the views are not enough.
-
-Report table of a camera calibration.
-
-A person reads it after the calibration; the same numbers are given for a machine.
+The audit measures accuracy from the values as they are written to the files.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
@@ -34,27 +26,19 @@ from master.calibrate.tree_files import camera_model, intrinsics_of, lens_of, ma
 
 @dataclass(frozen=True, slots=True)
 class PairAudit:
-    """Two cameras, over all views that both see.
-
-    Attributes:
-        first, second: Their names.
-        views: Number of views.
-        baseline_m: Distance of the optical centres.
-        epipolar_rms_px: Distance of undistorted corners from the epipolar lines of the other camera's.
-        edge_mean_mm, edge_sd_mm, edge_worst_mm: Sides of squares, triangulated: mean, standard deviation, and the
-            largest difference from the drawn side.
-        edges: Number of sides.
-    """
+    """Two cameras, over all views that both see."""
 
     first: str
     second: str
     views: int
-    baseline_m: float
-    epipolar_rms_px: float
+    baseline_m: float  # distance of the optical centres
+    epipolar_rms_px: float  # distance of undistorted corners from the epipolar lines of the other camera's
+    # this, edge_sd_mm and edge_worst_mm: triangulated sides of squares: mean, standard deviation, and
+    # largest difference from the drawn side
     edge_mean_mm: float
     edge_sd_mm: float
     edge_worst_mm: float
-    edges: int
+    edges: int  # number of sides
 
 
 def audit_pair(
@@ -63,13 +47,9 @@ def audit_pair(
     models: tuple[CameraModel, CameraModel],
     views: Sequence[tuple[Float, Float]],
 ) -> PairAudit:
-    """Epipolar error and triangulated squares of two cameras.
+    """Epipolar error and triangulated squares of two cameras as written to files.
 
-    Args:
-        board: The board.
-        names: Of the cameras.
-        models: Of the cameras, as read from their files.
-        views: Corners (N, 2) [px] in both, NaN = not seen, at least one view.
+    `views`: Corners (N, 2) [px] in both, NaN = not seen, at least one view.
     """
     T = invert(models[1].T_rig_camera) @ models[0].T_rig_camera
     essential = skew(T[:3, 3]) @ T[:3, :3]
@@ -100,10 +80,7 @@ def audit_pair(
 
 
 def _epipolar(essential: Float, a: Float, b: Float) -> Float:
-    """Return the distances of normalized points from their epipolar lines.
-
-    Distances (2n,) of points (n, 2) from the lines of their partners, in both images.
-    """
+    """Distances (2n,) of normalized points (n, 2) from epipolar lines, both ways."""
     a1, b1 = np.column_stack([a, np.ones(len(a))]), np.column_stack([b, np.ones(len(b))])
     in_b, in_a = a1 @ essential.T, b1 @ essential
     product = (b1 * in_b).sum(axis=1)
@@ -122,10 +99,9 @@ def _triangulate(T_b_a: Float, a: Float, b: Float) -> Float:
 def pairs_with_views(
     shared: Mapping[str, Mapping[str, Float]],
 ) -> dict[tuple[str, str], list[tuple[Float, Float]]]:
-    """Pairs of cameras, with the corners of each place of the board that both see.
+    """Pairs of cameras, with the corners of each board place that both see.
 
-    Args:
-        shared: Place -> camera -> corners (N, 2) [px].
+    `shared`: Place -> camera -> corners (N, 2) [px].
     """
     pairs: dict[tuple[str, str], list[tuple[Float, Float]]] = {}
     for cameras in shared.values():
@@ -138,59 +114,40 @@ def pairs_with_views(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensResult:
-    """One camera.
+    """One camera."""
 
-    Attributes:
-        intrinsics: As written to the file.
-        sd: Standard deviations (9,) in the order of `bundle.LENS`; 0: held or left at zero.
-        rms_px: Reprojection rms over its accepted images.
-        views: Number of accepted images.
-        covered: What they cover.
-        estimated: False: the lens was given, only used.
-    """
-
-    intrinsics: Intrinsics
-    sd: Float
-    rms_px: float
-    views: int
+    intrinsics: Intrinsics  # as written to the file
+    sd: Float  # standard deviations (9,) in the order of `bundle.LENS`; 0: held or left at zero
+    rms_px: float  # reprojection rms over its accepted images
+    views: int  # number of accepted images
     covered: Coverage
-    estimated: bool
+    estimated: bool  # False: the lens was given, only used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CamerasResult:
-    """All cameras.
-
-    Attributes:
-        lenses: Camera -> its lens.
-        T_rig_camera: Camera -> its place, as written to the file; the first camera is the rig's frame.
-        place_sd: Camera -> standard deviations of its centre (3,) [m] and turn (3,) [rad].
-        baseline_sd_m: Camera -> standard deviation of its distance from the first [m].
-        rms_px: Reprojection rms over all accepted images that share their view; one camera: over all.
-        board: Whether the board's shape was estimated, and why.
-        shape_mm: How far the board's corners are from the drawn ones, in its plane and out of it, root mean square.
-        pairs: Audit of each two cameras that share views.
-        views: Number of views that cameras share; one camera: of all.
-        rejected: What was excluded, and why.
-    """
+    """All cameras."""
 
     lenses: Mapping[str, LensResult]
+    # camera -> its pose, as written to the file; the first camera is the rig's frame
     T_rig_camera: Mapping[str, Matrix4]
+    # camera -> standard deviations of its centre (3,) [m] and rotation (3,) [rad]
     place_sd: Mapping[str, Float]
-    baseline_sd_m: Mapping[str, float]
-    rms_px: float
-    board: BoardChoice
+    baseline_sd_m: Mapping[str, float]  # camera -> standard deviation of its distance from the first [m]
+    rms_px: float  # reprojection rms over all accepted images that share their view; one camera: over all
+    board: BoardChoice  # whether the board's shape was estimated, and why
+    # rms offset of the board's corners from the drawn ones, in its plane and out of it
     shape_mm: tuple[float, float]
     pairs: tuple[PairAudit, ...]
-    views: int
-    rejected: tuple[Rejection, ...]
+    views: int  # number of views that cameras share; one camera: of all
+    rejected: tuple[Rejection, ...]  # what was excluded, and why
 
 
 def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
     """The numbers of a fit.
 
     Raises:
-        FitError: They are not worth writing: a focal length is not determined, a lens barely covered, or it folds.
+        FitError: A focal length is not determined, a lens is barely covered, or it folds.
     """
     names = fit.views.cameras
     bundle = fit.solution.bundle
@@ -250,14 +207,7 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
         check_lens(intrinsics_of(lens), fit.views.sizes_px[name], f"camera {name!r}: the fit cannot be used")
     except CalibrationError as error:
         raise FitError(str(error)) from error
-    return LensResult(
-        intrinsics=intrinsics_of(lens),
-        sd=sd,
-        rms_px=error,
-        views=len(own),
-        covered=covered,
-        estimated=estimated,
-    )
+    return LensResult(intrinsics_of(lens), sd, error, len(own), covered, estimated)
 
 
 def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: int) -> None:
@@ -281,11 +231,9 @@ def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: in
 
 
 def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
-    """Return the standard deviations of a camera's position, rotation and distance.
+    """Standard deviations (6,) [m, rad] of centre and rotation, and of baseline [m].
 
-    Centre (3,) [m] and rotation (3,) [rad]; the distance is from the first camera [m].
-
-    The centre is -R' t of T_camera_rig; turning by w on the left and moving by d moves it by -R' (d + t x w).
+    The centre is -R' t of T_camera_rig; rotation by w on the left and shift by d move it by -R' (d + t x w).
     """
     bundle = fit.solution.bundle
     rotation, t = bundle.T_camera_rig[index][:3, :3], bundle.T_camera_rig[index][:3, 3]
@@ -332,7 +280,6 @@ def report_lines(result: CamerasResult) -> Iterator[str]:
 
 
 def _board_line(result: CamerasResult) -> str:
-    """Which board was taken, and by what it was chosen."""
     board, (along, out) = result.board, result.shape_mm
     taken = (
         f"corners {along:.2f} mm in its plane and {out:.2f} mm out of it from where they are drawn (rms)"
@@ -383,22 +330,15 @@ def report_json(result: CamerasResult) -> dict[str, object]:
             name: {"centre_m": sd[:3].tolist(), "rotation_rad": sd[3:].tolist()}
             for name, sd in result.place_sd.items()
         },
-        "pairs": [
-            {
-                "cameras": [pair.first, pair.second],
-                "views": pair.views,
-                "baseline_m": pair.baseline_m,
-                "epipolar_rms_px": pair.epipolar_rms_px,
-                "edge_mean_mm": pair.edge_mean_mm,
-                "edge_sd_mm": pair.edge_sd_mm,
-                "edge_worst_mm": pair.edge_worst_mm,
-                "edges": pair.edges,
-            }
-            for pair in result.pairs
-        ],
+        "pairs": [_pair_json(pair) for pair in result.pairs],
         "board": _board_json(result),
         "rejected": [{"view": no.view, "camera": no.camera, "reason": no.reason} for no in result.rejected],
     }
+
+
+def _pair_json(pair: PairAudit) -> dict[str, object]:
+    numbers: dict[str, object] = asdict(pair)
+    return {"cameras": [numbers.pop("first"), numbers.pop("second")]} | numbers
 
 
 def _board_json(result: CamerasResult) -> dict[str, object]:

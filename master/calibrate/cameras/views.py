@@ -1,10 +1,6 @@
 """A view is one board seen by several cameras at once, loaded from images.
 
-What the cameras saw of a board: the observations of all fits of cameras.
-
-Sources of board images.
-
-A folder of files, a folder per camera, or a recording of ours.
+Sources: a folder of files, a folder per camera, or a recording of ours.
 """
 
 import re
@@ -27,32 +23,21 @@ ImageSet = Mapping[str, Callable[[], Image]]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Board in one place, as seen by one or more cameras at the same epoch.
+    """Board in one place, as seen by one or more cameras at the same epoch."""
 
-    Attributes:
-        name: How the view is called in reports, such as "07".
-        observations: Camera -> the board in its image; a camera that did not see it is absent.
-    """
-
-    name: str
+    name: str  # how the view is called in reports, such as "07"
+    # camera -> the board in its image; a camera that did not see it is absent
     observations: Mapping[str, ImageObservation]
 
 
 @dataclass(frozen=True, slots=True)
 class BoardViews:
-    """All views of one board.
-
-    Attributes:
-        board: The board.
-        sizes_px: Camera -> width and height of its images.
-        views: The views in which at least one camera saw the board.
-        unseen: "view camera" of each image without the board.
-    """
+    """All views of one board."""
 
     board: Board
-    sizes_px: Mapping[str, tuple[int, int]]
-    views: tuple[View, ...]
-    unseen: tuple[str, ...] = ()
+    sizes_px: Mapping[str, tuple[int, int]]  # camera -> width and height of its images
+    views: tuple[View, ...]  # the views in which at least one camera saw the board
+    unseen: tuple[str, ...] = ()  # "view camera" of each image without the board
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -60,27 +45,22 @@ class BoardViews:
         return tuple(self.sizes_px)
 
     def of(self, camera: str) -> tuple[tuple[str, ImageObservation], ...]:
-        """Return the name and observation of every view that `camera` has."""
+        """Name and observation of every view that `camera` has."""
         return tuple(
             (view.name, view.observations[camera]) for view in self.views if camera in view.observations
         )
 
 
 def look(
-    board: Board,
-    sets: Iterable[tuple[str, ImageSet]],
-    progress: Callable[[str], None] = lambda _: None,
+    board: Board, sets: Iterable[tuple[str, ImageSet]], progress: Callable[[str], None] = lambda _: None
 ) -> BoardViews:
-    """Find the board in all images.
+    """Find the board in all images of `sets`: name of each view and its images.
 
-    Args:
-        board: The board to look for.
-        sets: Name of each view and its images.
-        progress: Called after each image with "view camera".
+    `progress` is called after each image with "view camera".
 
     Raises:
-        FitError: There is no image, images of one camera differ in size, or the board is in none of them; then the
-            message states which board was looked for, and which one is there instead, if one was recognised.
+        FitError: There is no image, images of one camera differ in size, or the board is in none of them;
+            then the message states which board was looked for, and which one is there instead.
     """
     sizes: dict[str, tuple[int, int]] = {}
     views: list[View] = []
@@ -124,10 +104,7 @@ def _advice(board: Board, images: list[Image]) -> str:
 
 
 def _likely_mistakes(board: Board) -> Iterator[Board]:
-    """Yield boards that a user may mean who asked for `board`.
-
-    Squares counted for corners, sides swapped, another family.
-    """
+    """Boards that a user may mean: squares counted, sides swapped, other family."""
     c, r = board.columns, board.rows
     if isinstance(board, Checkerboard):
         # The larger first: a part of a board can be taken for a smaller one.
@@ -146,23 +123,21 @@ def _likely_mistakes(board: Board) -> Iterator[Board]:
             continue
 
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _NUMBER = re.compile(r"[-_ .]?\d+$")
 MOST_VIEWS = 60  # of a recording: more of the same motion adds time, not knowledge
 
 
 def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, ImageSet]]:
-    """Return the views of a folder, by name.
-
-    Each is the images of all cameras taken at one epoch.
+    """The views of a folder by name: images of all cameras taken at one epoch.
 
     Args:
-        folder: Holds `recording.json`; or one sub-folder of images per camera, views matched by file name; or images
-            named CAMERA*.png|jpg|…, matched by the rest of the name (left01.jpg, right01.jpg).
-        cameras: Names of the cameras wanted; none: those the folder has, a name being what stands before the number.
+        folder: Holds `recording.json`; or one sub-folder of images per camera, views matched by file name; or
+            images named CAMERA*.png|jpg|…, matched by the rest of the name (left01.jpg, right01.jpg).
+        cameras: Those wanted; none: those the folder has, a name being what stands before the number.
 
     Raises:
-        RecordingError: No folder, no image in it, or none of a camera asked for.
+        RecordingError: No folder, no image in it, or none of a requested camera.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is not a folder")
@@ -174,7 +149,7 @@ def image_sets(folder: Path, cameras: Sequence[str] = ()) -> list[tuple[str, Ima
     nested = {sub.name: _images(sub) for sub in sorted(folder.iterdir()) if sub.is_dir()}
     nested = {name: found for name, found in nested.items() if found}
     if not nested:
-        raise RecordingError(f"{folder}: no images here, nor in a folder per camera ({', '.join(_ENDINGS)})")
+        raise RecordingError(f"{folder}: no images here, nor in a folder per camera ({', '.join(ENDINGS)})")
     if missing := [camera for camera in cameras if camera not in nested]:
         raise RecordingError(
             f"{folder}: no folder of images for {missing[0]!r}; there are {', '.join(nested)}"
@@ -188,7 +163,7 @@ def _images(folder: Path) -> list[Path]:
     return sorted(
         file
         for file in folder.iterdir()
-        if file.suffix.lower() in _ENDINGS and file.is_file() and not file.name.startswith(".")
+        if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
     )
 
 
@@ -197,9 +172,7 @@ def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[
     prefixes = sorted({_NUMBER.sub("", file.stem) for file in files} - {""})
     names = list(cameras) or prefixes
     if len(names) == 1 and not any(file.stem.startswith(names[0]) for file in files) and len(prefixes) <= 1:
-        return {
-            names[0]: {file.stem: file for file in files}
-        }  # a folder of one camera need not repeat its name
+        return {names[0]: {file.stem: file for file in files}}  # one camera's folder need not repeat its name
     found: dict[str, dict[str, Path]] = {name: {} for name in names}
     longest_first = sorted(names, key=len, reverse=True)
     for file in files:
@@ -219,7 +192,7 @@ def _by_prefix(folder: Path, files: list[Path], cameras: Sequence[str]) -> dict[
 def _matched(folder: Path, files: dict[str, dict[str, Path]]) -> list[tuple[str, ImageSet]]:
     names = sorted(set[str]().union(*files.values()), key=_natural)
     return [
-        (name, {camera: partial(_load, own[name]) for camera, own in files.items() if name in own})
+        (name, {camera: partial(load_image, own[name]) for camera, own in files.items() if name in own})
         for name in names
     ]
 
@@ -231,9 +204,14 @@ def _natural(name: str) -> tuple[tuple[int, str], ...]:
     )
 
 
-def _load(file: Path) -> Image:
+def load_image(file: Path, *, grey: bool = False) -> Image:
+    """An image (H, W, 3), or (H, W) if grey, 8 bits.
+
+    Raises:
+        RecordingError: The file cannot be read, or is no image.
+    """
     try:
-        return decode_file(read_picture(file))
+        return decode_file(read_picture(file), grey=grey)
     except OSError as error:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
     except PictureError as error:
@@ -241,10 +219,10 @@ def _load(file: Path) -> Image:
 
 
 def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
-    """Return the frames that show a board.
+    """The frames that show a board.
 
-    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same moment;
-    never those with a laser's line across the corners.
+    Of strobed ones those with the LEDs on, which are there in the dark too, and no second frame of the same
+    moment; never those with a laser's line across the corners.
     """
     lit = {row.illumination for row in rows}
     for best in (Illumination.LED, Illumination.AMBIENT):
@@ -254,10 +232,7 @@ def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
 
 
 def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, ImageSet]]:
-    """Return views spread evenly over a recording.
-
-    Frames of the first camera, with those of the others nearest in time.
-    """
+    """Views spread evenly: frames of the first camera, and the others' nearest."""
     recording = open_recording(folder)
     names = list(cameras) or list(recording.manifest.cameras)
     rows = {name: _showing(recording.frames_of(name)) for name in names}

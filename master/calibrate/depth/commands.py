@@ -1,19 +1,9 @@
 """The commands `calibrate depth` and `calibrate verify` fit and check depth.
 
-Writing of the fitted depth laws into the rig file.
-
-With date, data and residual, and the notes to print about it.
-
-Command `phalanx calibrate depth`: two laws of raw disparity.
-
-The published session, from known distances to the two laws.
-
-`phalanx calibrate verify`: measured and predicted depth error of this rig.
-
-Prints the published table.
+Known distances of a target enter; `depth` leaves two laws of raw disparity in the rig file, with date, data
+and residual, `verify` the table of measured and predicted depth error.
 """
 
-import os
 from argparse import Namespace
 from pathlib import Path
 
@@ -21,13 +11,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.bus.keys import link_key
-from common.calibration import (
-    AffineDisparityCalibration,
-    PowerLawCalibration,
-    Provenance,
-    RigCalibration,
-)
+from common.calibration import AffineDisparityCalibration, PowerLawCalibration, Provenance, RigCalibration
 from common.command_line import echo
 from common.errors import CalibrationError
 from common.recording.frame_recording import FrameRecording
@@ -48,6 +32,7 @@ from master.calibrate.depth.verify import (
     Verified,
     budget,
     budget_lines,
+    draw_errors,
     expected_json,
     laws_of,
     measured_lines,
@@ -56,18 +41,13 @@ from master.calibrate.depth.verify import (
     verified_json,
     verify,
 )
-from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
-from master.commands.options import (
-    address,
-)
+from master.calibrate.tree_files import print_lines, provenance, rig_in_tree, write_report, write_rig
 from master.commands.summary import write_summary
 from master.fabrik.depth import DepthLaw, tolerable_skew_s
 
 
 def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
-    """Return the rig file that receives the new laws.
-
-    The one in `out` where there is one, else the one in use.
+    """The rig file that receives the new laws: that in `out`, else the one in use.
 
     Raises:
         CalibrationError: No rig is known, it has not two cameras, or other ones than the file in `out`.
@@ -88,9 +68,7 @@ def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
 def write_laws(
     out: Path, rig: RigCalibration | None, report: DepthReport, measured: Measured, use: str | None
 ) -> Path:
-    """Write the rig file with both laws and their provenance.
-
-    Includes the depth model if asked for.
+    """Write the rig file with both laws, provenance, and the model `use` if any.
 
     Raises:
         CalibrationError: The file cannot be written; the old one is untouched.
@@ -129,115 +107,67 @@ def conclusion(report: DepthReport, rig: RigCalibration | None, use: str | None,
     if written is None:
         return f"{text}\nnothing written: give --out DIR"
     model = use if use is not None else "" if rig is None else rig.depth_model
-    hint = (
-        ""
-        if use is not None or model == report.best
-        else f"; --use {report.best} would switch it"
-        + (
-            " (stereo, if calibrated, is better off the axis: see `calibrate verify`)"
-            if model == "stereo"
-            else ""
-        )
-    )
+    hint = ""
+    if use is None and model != report.best:
+        hint = f"; --use {report.best} would switch it"
+        if model == "stereo":
+            hint += " (stereo, if calibrated, is better off the axis: see `calibrate verify`)"
     return f"{text}\nwrote {written}; its depth_model is {model}{hint}"
 
 
-_SWEEP = "1.00:0.20:-0.05"  # the published one
-
-
 def depth(options: Namespace) -> None:
-    """Fit depth to disparity from a target at known distances.
-
-    The power law D = k x^z, and x = a/D + x0.
-    """
+    """Fit depth to disparity from a target at known distances, by two laws."""
     outline = parse_target(options.target)
-    _refuse_idle(
-        "--live", source=options.live and options.source, detections=options.live and options.detections
-    )
-    _refuse_idle("a measurement without --live", save=not options.live and options.save_table)
     if options.live:
-        link = (
-            address(options.beacon, "--beacon"),
-            address(options.bind, "--bind"),
-            link_key(os.environ, options.key_file),
-        )
-        pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
-        measured = sweep_live(
-            pair,
-            options.marker,
-            options.distances or _SWEEP,
-            options.frames,
-            options.seconds,
-            link,
-            options.save_table,
-            outline,
-        )
+        _refuse_idle("--live", source=options.source, detections=options.detections)
     else:
-        measured = measured_from(
-            options.source,
-            options.detections,
-            options.marker,
-            options.distances,
-            options.rig,
-            options.calibration,
-            options.fov_deg,
-            outline,
-        )
+        _refuse_idle("a measurement without --live", save=options.save_table)
+    measured = sweep_live(options, outline) if options.live else measured_from(options, outline)
     pair = measured.pair
     base = rig_to_write(pair, options.out)
     with measured.named():
         sweep = checked(measured.sweep, pair.cameras, pair.size_px)
         report = fit_depth(sweep, laws_before(pair, base))
     echo(measured.about)
-    for line in report_lines(report):
-        echo(line)
+    print_lines(report_lines(report))
     written = None if options.out is None else write_laws(options.out, base, report, measured, options.use)
     echo(conclusion(report, base, options.use, written))
-    if options.json_file is not None:
-        write_summary(
-            options.json_file, report_json(report) | {"written": None if written is None else str(written)}
-        )
+    write_report(options.json_file, report_json(report), written)
     if options.picture is not None:
-        from master.calibrate.depth.verify import draw_errors
-
         draw_errors(options.picture, measured.about, sweep.distance_m, report.errors, used=report.used)
 
 
-def measured_from(
-    source: Path | None,
-    detections: Path | None,
-    marker: str | None,
-    distances: str | None,
-    rig: str | None,
-    calibration: Path,
-    fov_deg: float | None,
-    outline: Float,
-) -> Measured:
+def measured_from(options: Namespace, outline: Float) -> Measured:
     """The sweep of a recording or a table.
 
     Raises:
         PhalanxError: What the user gave does not make one; the message states what is missing.
     """
+    source: Path | None = options.source
+    rig: str | None = options.rig
     if source is None:
         raise CalibrationError("what to read is missing: give the folder of a recording, a .csv, or --live")
     if source.is_dir():
 
         def pair_for(recording: FrameRecording) -> Pair:
             manifest = recording.manifest
-            return (
-                pair_of(manifest.marker_rig(), manifest.cameras)
-                if rig is None
-                else load_pair(calibration, rig, fov_deg, manifest.cameras)
-            )
+            if rig is None:
+                return pair_of(manifest.marker_rig(), manifest.cameras)
+            return load_pair(options.calibration, rig, options.fov_deg, manifest.cameras)
 
-        return from_recording(source, detections, marker, distances, pair_for, outline)
-    if source.suffix.lower() != ".csv":
-        raise CalibrationError(
-            f"{source}: {'neither' if source.exists() else 'does not exist; give'} the folder of a recording"
-            f" {'nor' if source.exists() else 'or'} a .csv"
+        return from_recording(
+            source, options.detections, options.marker, options.distances, pair_for, outline
         )
-    _refuse_idle(f"{source}, a table", detections=detections, marker=marker, distances=distances)
-    return from_table(source, Pair() if rig is None else load_pair(calibration, rig, fov_deg), outline)
+    if source.suffix.lower() != ".csv":
+        there = source.exists()
+        raise CalibrationError(
+            f"{source}: {'neither' if there else 'does not exist; give'} the folder of a recording"
+            f" {'nor' if there else 'or'} a .csv"
+        )
+    idle = {name: vars(options)[name] for name in ("detections", "marker", "distances")}
+    _refuse_idle(f"{source}, a table", **idle)
+    pair = Pair() if rig is None else load_pair(options.calibration, rig, options.fov_deg)
+    return from_table(source, pair, outline)
 
 
 def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
@@ -250,10 +180,7 @@ def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
 
 
 def _refuse_idle(where: str, **given: object) -> None:
-    """Reject options that `where` does not use.
-
-    They are not ignored silently.
-    """
+    """Reject options that `where` does not use, rather than ignore them."""
     for name, value in given.items():
         if value:
             option = "a recording or a table" if name == "source" else f"--{name}"
@@ -264,10 +191,7 @@ _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
 def verify_command(options: Namespace) -> None:
-    """Report the error of each depth model at known distances.
-
-    Also prints the error budget, that is, what to expect of the rig.
-    """
+    """Report each depth model's error at known distances, and the error budget."""
     noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
     numbers: dict[str, object] = {}
     found: Verified | None = None
@@ -275,17 +199,7 @@ def verify_command(options: Namespace) -> None:
         pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
         distance = parse_distances(options.distances or _TABLE)
     else:
-        outline = parse_target(options.target)
-        measured = measured_from(
-            options.source,
-            options.detections,
-            options.marker,
-            options.distances,
-            options.rig,
-            options.calibration,
-            options.fov_deg,
-            outline,
-        )
+        measured = measured_from(options, parse_target(options.target))
         pair = measured.pair
         found = _measured(measured, noise)
         numbers |= verified_json(found)
@@ -298,8 +212,6 @@ def verify_command(options: Namespace) -> None:
             raise CalibrationError(
                 "--picture: there are no measured errors to draw; give a recording or a .csv"
             )
-        from master.calibrate.depth.verify import draw_errors
-
         errors = {name: found.relative(name) for name in found.error_m}
         title = f"Depth of rig {pair.rig.name if pair.rig is not None else ''!r}"
         d = found.sweep.distance_m
@@ -307,12 +219,7 @@ def verify_command(options: Namespace) -> None:
 
 
 def _measured(measured: Measured, noise: Noise) -> Verified:
-    """Hold a sweep against its rig and print the table.
-
-    Raises:
-        CalibrationError: The rig has no depth model at all.
-        FitError: The sweep is unfit.
-    """
+    """Compare a sweep with its rig and print the table."""
     pair = measured.pair
     laws = {} if pair.rig is None else laws_of(pair.rig)
     if not laws and pair.models is None:
@@ -333,16 +240,12 @@ def _measured(measured: Measured, noise: Noise) -> Verified:
         known = pair.rig.provenance.get(name) if pair.rig is not None else None
         if known is not None and set(known.data) & set(measured.data):
             echo(f"{name} was fitted to this very sweep ({known.date}): its error for other places is larger")
-    for line in measured_lines(found):
-        echo(line)
+    print_lines(measured_lines(found))
     return found
 
 
 def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[str, object]:
-    """Print the error budget and the off-axis table, and return them as numbers.
-
-    Only where the cameras are known.
-    """
+    """Print budget and off-axis table where the cameras are known; return numbers."""
     if pair.models is None or pair.rig is None:
         echo("no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)")
         return {}
@@ -355,17 +258,12 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[s
         f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
         f" {100 * wanted:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
     )
-    for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
-        echo(line)
+    print_lines([*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)])
     return expected_json(distance, expected, noise, angle, errors)
 
 
 def _angles(text: str) -> Float:
-    """Angles [deg] of --angles.
-
-    Raises:
-        CalibrationError: Not numbers, or not in front of the cameras.
-    """
+    """Angles [deg] of --angles, in front of the cameras."""
     angles = parse_numbers(
         text, "--angles", "FIRST:LAST:STEP in degrees, such as -20:20:10, or a list -20,0,20"
     )

@@ -1,31 +1,24 @@
 """A fit finds the laws of raw disparity, and reports their accuracy.
 
-Fits of the laws of raw disparity from a sweep of known distances.
-
-Pure fits, (disparity, distance) -> (law, residual).
-
-What is made small is the *relative* error of depth, every distance alike. Two errors add up in a sweep: that of the
-disparity, s_x, costs s_x D / a of the depth and grows with the distance; that of the ruler,
-s_D, costs s_D / D and shrinks with it. They are equal at D = sqrt(a s_D / s_x): 0.6 m for the published rig (a = 37
-m px), 1 mm and 0.1 px, the middle of 20...100 cm. So the relative error is nearly the same everywhere, and equal
-weights are nearly the best ones; least squares in disparity would give the nearest points 25 times the weight of the
-farthest, which a ruler never deserves. Simulated, 17 distances, mean error of the fitted affine law over 20...100 cm:
+What is made small is the *relative* error of depth, every distance alike. Two errors add up in a sweep: that
+of the disparity, s_x, costs s_x D / a of the depth and grows with the distance; that of the ruler, s_D, costs
+s_D / D and shrinks with it. They are equal at D = sqrt(a s_D / s_x): 0.6 m for the published rig (a = 37 m
+px), 1 mm and 0.1 px, the middle of 20...100 cm. So equal weights are nearly the best ones; least squares in
+disparity would give the nearest points 25 times the weight of the farthest. Simulated, 17 distances, mean
+error of the affine law over 20...100 cm:
 
     noise              relative   in disparity
     0.1 px             0.044 %    0.039 %
     0.1 px and 1 mm    0.083 %    0.123 %
     0.1 px and 2 mm    0.140 %    0.237 %
 
-The power law has a third reason: it is not the law of two cameras, and misses a yawed pair by 0.3 % on average; equal
-relative weights spread that over all distances (max 0.74 %; in disparity 1.1 %, all of it far away). They are also how
-the published constants come out: k = 45.28 m for the pair that the published law describes, against 44.05.
-
-Accuracy of the fitted depth laws.
-
-Every law at every distance, before and after the fit, and which one is best.
+The power law has a third reason: it is not the law of two cameras, and misses a yawed pair by 0.3 % on
+average; equal relative weights spread that over all distances (max 0.74 %; in disparity 1.1 %, all of it far
+away). They also give the published constants: k = 45.28 m for the pair that the published law describes,
+against 44.05.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import atan
 
@@ -41,14 +34,11 @@ Fit = Callable[[Float, Float], tuple[DepthLaw, Float]]
 
 
 def fit_power_law(disparity: Float, distance: Float) -> tuple[PowerLaw, Float]:
-    """D = k x^z by least squares in ln D (Kalbfleisch, eq. 12).
+    """D = k x^z by least squares in ln D (Kalbfleisch, eq. 12), and relative errors.
 
     Args:
         disparity: u_left - u_right [px], (N,), positive, at least two different ones.
         distance: Along the first camera's axis [m], (N,).
-
-    Returns:
-        The law, and its relative errors of depth (N,) at these points.
     """
     slope, offset = _line(np.log(disparity), np.log(distance), np.ones_like(distance))
     law = PowerLaw(float(np.exp(offset)), slope)
@@ -56,11 +46,9 @@ def fit_power_law(disparity: Float, distance: Float) -> tuple[PowerLaw, Float]:
 
 
 def fit_affine_disparity(disparity: Float, distance: Float) -> tuple[AffineDisparity, Float]:
-    """Fit x = a / D + x0 by least squares in relative depth.
+    """x = a / D + x0 by least squares in relative depth; as `fit_power_law`.
 
     An error dx of x is dx D / a of D.
-
-    Args and returns as `fit_power_law`.
     """
     a, x0 = _line(1.0 / distance, disparity, distance)
     law = AffineDisparity(a, x0)
@@ -72,18 +60,12 @@ FITS: dict[str, Fit] = {"power_law": fit_power_law, "affine_disparity": fit_affi
 
 
 def relative_error(law: DepthLaw, disparity: Float, distance: Float) -> Float:
-    """Return the relative depth error of a law.
-
-    (depth by the law - distance) / distance, (N,); NaN where the law has no depth for the disparity.
-    """
+    """(law's depth - distance) / distance, (N,); NaN: no depth for the disparity."""
     return law.depth(disparity) / distance - 1.0
 
 
 def leave_one_out(fit: Fit, disparity: Float, distance: Float) -> Float:
-    """Return the leave-one-out relative error of each point.
-
-    Shape (N,), by the law of all the other points: how accurate the law is for a new distance.
-    """
+    """Relative error (N,) of each point by the law of all others."""
     out = np.empty_like(distance)
     for i in range(distance.size):
         others = np.arange(distance.size) != i
@@ -95,8 +77,8 @@ def leave_one_out(fit: Fit, disparity: Float, distance: Float) -> Float:
 def outliers(disparity: Float, distance: Float) -> Bool:
     """Which points (N,) contradict the others, whichever of the two laws is taken.
 
-    Of the laws through two points each, the one with the least median of squares is taken (Rousseeuw 1984: half of
-    the points may be wrong); a point is out beyond three of its robust standard deviations and 1 % of depth.
+    Of the laws through two points each, the one with the least median of squares is taken (Rousseeuw 1984:
+    half of the points may be wrong); a point is out beyond three robust deviations and 1 % of depth.
     """
     power = _least_median(np.log(disparity), np.log(distance), np.ones_like(distance))
     affine = _least_median(1.0 / distance, disparity, distance)
@@ -106,10 +88,7 @@ def outliers(disparity: Float, distance: Float) -> Bool:
 
 
 def ideal_of(left: CameraModel, right: CameraModel) -> AffineDisparity:
-    """Return the law of two perfectly parallel pinhole cameras.
-
-    Of this focal length and baseline (eq. 13).
-    """
+    """The law of parallel pinholes of this focal length and baseline (eq. 13)."""
     baseline_m = float(np.linalg.norm(right.centre - left.centre))
     return ideal_law(baseline_m, 2.0 * atan(0.5 * left.width_px / left.matrix[0, 0]), left.width_px)
 
@@ -122,10 +101,7 @@ def _line(x: Float, y: Float, weight: Float) -> tuple[float, float]:
 
 
 def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
-    """Return the line through two points with the least median weighted residual.
-
-    Slope and offset.
-    """
+    """Slope and offset of the line through two points with least median residual."""
     i, j = np.triu_indices(x.size, 1)
     max_pairs = 5000  # of points, from which robust laws are drawn: all of them for up to 100 points
     some = slice(None, None, -(-i.size // max_pairs))
@@ -138,33 +114,22 @@ def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
 
 
 def _beyond(error: Float) -> Bool:
-    """Return which relative errors are gross.
-
-    Shape (N,); robust scale with the small sample factor of Rousseeuw & Leroy 1987.
-    """
+    """Which relative errors (N,) are gross, by the scale of Rousseeuw & Leroy 1987."""
     scale = 1.4826 * (1.0 + 5.0 / max(error.size - 2, 1)) * float(np.median(error))
     gross = 0.01  # error of depth below which a point is never called an outlier: a ruler's, a mount's
-    scales = 3.0  # robust standard deviations beyond which a point is an outlier
-    return error > max(scales * scale, gross)
+    return error > max(3.0 * scale, gross)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthReport:
-    """The outcome of `calibrate depth`.
+    """The outcome of `calibrate depth`."""
 
-    Attributes:
-        sweep: What was measured, nearest first.
-        used: (N,) False: contradicts the others and was rejected from the fits.
-        power_law, affine_disparity: Fitted.
-        errors: Law -> relative error of depth (N,), of the laws before the fit and after.
-        rejected: Fitted law -> relative error (K,) of each used point by the law of the others.
-    """
-
-    sweep: Sweep
-    used: Bool
+    sweep: Sweep  # what was measured, nearest first
+    used: Bool  # (N,) False: contradicts the others and was rejected from the fits
     power_law: PowerLaw
     affine_disparity: AffineDisparity
-    errors: Mapping[str, Float]
+    errors: Mapping[str, Float]  # law -> relative error of depth (N,), of the laws before the fit and after
+    # fitted law -> relative error (K,) of each used point by the law of the others
     rejected: Mapping[str, Float]
 
     @property
@@ -173,20 +138,15 @@ class DepthReport:
         return min(self.rejected, key=lambda name: float(np.abs(self.rejected[name]).mean()))
 
     def mean_max(self, name: str) -> tuple[float, float]:
-        """Return the mean and largest |error| of a law over the used distances.
-
-        Errors are a share of the distance.
-        """
+        """Mean and largest |error| of a law over the used distances, as a share."""
         error = np.abs(self.errors[name][self.used])
         return float(error.mean()), float(error.max())
 
 
 def fit_depth(sweep: Sweep, before: Mapping[str, DepthLaw]) -> DepthReport:
-    """Fit both laws to a sweep that `depth_sweep.checked` let pass.
+    """Fit both laws to a sweep that `sweep.checked` let pass.
 
-    Args:
-        sweep: The points.
-        before: Laws to compare with, by the name they are shown under.
+    `before` are laws to compare with, by name.
 
     Raises:
         FitError: Too many points contradict the others, or too few are left.
@@ -206,42 +166,30 @@ def fit_depth(sweep: Sweep, before: Mapping[str, DepthLaw]) -> DepthReport:
     power, _ = fit_power_law(kept.disparity_px, kept.distance_m)
     affine, _ = fit_affine_disparity(kept.disparity_px, kept.distance_m)
     laws = {**before, "power_law": power, "affine_disparity": affine}
-    return DepthReport(
-        sweep,
-        ~out,
-        power,
-        affine,
-        {name: relative_error(law, sweep.disparity_px, sweep.distance_m) for name, law in laws.items()},
-        {name: leave_one_out(fit, kept.disparity_px, kept.distance_m) for name, fit in FITS.items()},
-    )
+    errors = {name: relative_error(law, sweep.disparity_px, sweep.distance_m) for name, law in laws.items()}
+    rejected = {name: leave_one_out(fit, kept.disparity_px, kept.distance_m) for name, fit in FITS.items()}
+    return DepthReport(sweep, ~out, power, affine, errors, rejected)
 
 
 def report_lines(report: DepthReport) -> list[str]:
-    """Format a readable table of relative errors by distance and by law.
-
-    Errors are in per cent.
-    """
+    """A table of relative errors [%] by distance and by law."""
     names = list(report.errors)
     widths = [max(len(name), 9) for name in names]
-    lines = [
-        "  distance    disparity  " + "  ".join(f"{n:>{w}s}" for n, w in zip(names, widths, strict=True))
-    ]
+
+    def row(cells: Iterable[str]) -> str:
+        return "  ".join(f"{cell:>{w}s}" for cell, w in zip(cells, widths, strict=True))
+
+    lines = [f"  distance    disparity  {row(names)}"]
     for i in range(report.sweep.size):
-        errors = (f"{_signed(report.errors[n][i]):>{w}s}" for n, w in zip(names, widths, strict=True))
+        errors = row(_signed(report.errors[n][i]) for n in names)
         mark = "" if report.used[i] else f"  left out: contradicts the others ({report.sweep.place[i]})"
         lines.append(
-            f"  {report.sweep.distance_m[i]:6.3f} m  {report.sweep.disparity_px[i]:8.2f} px  {'  '.join(errors)}{mark}"
+            f"  {report.sweep.distance_m[i]:6.3f} m  {report.sweep.disparity_px[i]:8.2f} px  {errors}{mark}"
         )
     for title, which in (("mean |error|", 0), ("max |error|", 1)):
-        cells = (f"{100 * report.mean_max(n)[which]:.2f} %" for n in names)
-        lines.append(f"  {title:21s}  " + "  ".join(f"{c:>{w}s}" for c, w in zip(cells, widths, strict=True)))
-    cells = (
-        f"{100 * np.abs(report.rejected[n]).mean():.2f} %" if n in report.rejected else "" for n in names
-    )
-    lines.append(
-        f"  {'mean, left out in turn':21s} "
-        + "  ".join(f"{c:>{w}s}" for c, w in zip(cells, widths, strict=True))
-    )
+        lines.append(f"  {title:21s}  " + row(f"{100 * report.mean_max(n)[which]:.2f} %" for n in names))
+    in_turn = {n: f"{100 * np.abs(error).mean():.2f} %" for n, error in report.rejected.items()}
+    lines.append(f"  {'mean, left out in turn':21s} " + row(in_turn.get(n, "") for n in names))
     power, affine = report.power_law, report.affine_disparity
     return [
         *lines,

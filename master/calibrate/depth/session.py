@@ -1,17 +1,12 @@
 """A session guides a person through a depth sweep with running slaves.
 
-Manual depth sweep with a target that is moved by hand.
-
-The target is put at one distance after another, and measured there while it stands still.
-
-Nothing is paired: the target stands still, so each camera's centroids are averaged on their own.
-
-Depth sweep with the running slaves.
-
-It opens the link as a master does, and a person is at the keyboard.
+The target is put at one distance after another, and measured there while it stands still: so nothing is
+paired, each camera's centroids are averaged on their own. The session opens the link as a master does.
 """
 
+import os
 import sys
+from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,49 +15,40 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float, Int
+from common.bus.keys import link_key
 from common.clock import Clock, SystemClock
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
-from common.link.datagram import LinkKey
 from common.messages import Detections, MarkerDetections
-from master.calibrate.depth.source import Measured, Pair, straightened
+from master.calibrate.depth.source import Measured, load_pair, straightened
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep, parse_distances, write_table
+from master.commands.options import address
 from master.run.app import Source
 from master.run.ingest import Ingest
 
 _QUARTERS = 4
+_PUBLISHED = "1.00:0.20:-0.05"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """The target at rest.
+    """The target at rest."""
 
-    Attributes:
-        uv: (2, 2) mean centroids [px] in the two cameras.
-        area_px2: (2,) mean areas.
-        sigma_px: Standard deviation of one frame pair's disparity [px].
-        frames: (2,) frames averaged.
-        rate_hz: (2,) rate of the cameras, by their stamps.
-    """
-
-    uv: Float
-    area_px2: Float
-    sigma_px: float
-    frames: Int
-    rate_hz: Float
+    uv: Float  # (2, 2) mean centroids [px] in the two cameras
+    area_px2: Float  # (2,) mean areas
+    sigma_px: float  # standard deviation of one frame pair's disparity [px]
+    frames: Int  # (2,) frames averaged
+    rate_hz: Float  # (2,) rate of the cameras, by their stamps
 
 
 class Meter:
     """Push machine that averages one marker in two cameras.
 
-    Holds the frames of the last `seconds`, and the reason why it waits.
+    State: the frames of the last `seconds`, and the reason why it waits (`trouble`).
     """
 
     def __init__(self, cameras: tuple[str, str], marker: int, frames: int, seconds: float) -> None:
-        """Wait for `frames` frames of each camera while the marker stands still.
-
-        The marker must stand still over `seconds`.
-        """
+        """Wait for `frames` frames of each camera at rest over `seconds`."""
         self._cameras, self._marker = cameras, marker
         self._frames, self._span_ns = max(frames, 2 * _QUARTERS), round(seconds * 1e9)
         self._kept: tuple[deque[tuple[int, Float]], ...] = (deque(), deque())
@@ -137,8 +123,7 @@ def measure(
     while source.get(0.0) is not None:  # what was seen while it was being put there
         pass
     since_ns = clock.now_ns()
-    patience_s = 10.0
-    while clock.now_ns() - since_ns < patience_s * 1e9:
+    while clock.now_ns() - since_ns < 10.0 * 1e9:
         message = source.get(0.1)
         if not isinstance(message, MarkerDetections) or message.t_ns < since_ns:
             continue
@@ -163,23 +148,16 @@ def run_session(
     progress: Callable[[float], None],
     keep: Callable[[Sweep], None],
 ) -> Sweep:
-    """Lead a person through a sweep.
+    """Lead a person through a sweep; return all places in the order of measurement.
 
     Args:
-        source: Detections, times on `clock`.
+        source: Detections, times on `clock`, the master's.
         cameras: First (left) and second camera.
         marker: Index of the target's marker.
-        distances: Where to put the target [m].
-        frames: Frames of each camera to average, at least.
-        seconds: Time over which, at least.
-        clock: The master's.
+        frames, seconds: Frames of each camera to average, and time over which, at least.
         ask: Shows a prompt and returns the answer; None: nobody answers any more.
-        notify: Called with one line for each result.
         progress: Called with the share of a reading that is done.
         keep: Given the sweep so far after each reading, to save it.
-
-    Returns:
-        All places measured, in the order of measurement; it may be empty.
     """
     done: list[tuple[float, Reading]] = []
     waiting = deque(distances)
@@ -237,26 +215,18 @@ def _sweep(done: Sequence[tuple[float, Reading]]) -> Sweep:
     )
 
 
-Link = tuple[tuple[str, int], tuple[str, int], LinkKey]
-
-
-def sweep_live(
-    pair: Pair,
-    marker: str | None,
-    distances: str,
-    frames: int,
-    seconds: float,
-    link: Link,
-    table: Path | None,
-    outline: Float,
-) -> Measured:
+def sweep_live(options: Namespace, outline: Float) -> Measured:
     """Lead the user through a sweep with the slaves that run."""
+    beacon, bind = address(options.beacon, "--beacon"), address(options.bind, "--bind")
+    key = link_key(os.environ, options.key_file)
+    pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
     assert pair.rig is not None
+    marker: str | None = options.marker
+    table: Path | None = options.save_table
     names = pair.rig.markers
     if marker is None or marker not in names:
         raise CalibrationError(f"--marker: which paint has the target? one of {', '.join(names)}")
-    wanted: list[float] = parse_distances(distances).tolist()
-    beacon, bind, key = link
+    wanted: list[float] = parse_distances(options.distances or _PUBLISHED).tolist()
     clock = SystemClock()
 
     def keep(sweep: Sweep) -> None:
@@ -265,16 +235,15 @@ def sweep_live(
 
     ingest = Ingest(pair.rig.cameras, key, clock, beacon, bind, "")
     try:
-        echo(
-            f"listening on {ingest.address[0]}:{ingest.address[1]}; {len(wanted)} distances, marker {marker!r}"
-        )
+        host, port = ingest.address
+        echo(f"listening on {host}:{port}; {len(wanted)} distances, marker {marker!r}")
         sweep = run_session(
             ingest,
             pair.cameras,
             names.index(marker),
             wanted,
-            frames=frames,
-            seconds=seconds,
+            frames=options.frames,
+            seconds=options.seconds,
             clock=clock,
             ask=_ask,
             notify=_print,

@@ -1,20 +1,12 @@
 """The inputs of a depth fit are read from a rig, a recording or a table.
 
-Depth sweep from a recording.
-
-Its detections, and the distances that belong to them.
-
-The frames of the two cameras are paired by time. The target stands still while a distance is measured, so neither
-interpolation nor the rolling shutter matters; what does matter is that no frame of its way from one place to the next
-is taken, which `still_runs` sees to.
-
-Inputs of the depth commands: the sweep, the camera pair and the rig.
-
-Read from the files that the user names.
+Frames of the two cameras are paired by time. The target stands still while a distance is measured, so neither
+interpolation nor the rolling shutter matters; `still_runs` excludes the frames of its way from place to
+place.
 """
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,13 +15,13 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, load
-from common.errors import CalibrationError, FitError, RecordingError
+from common.errors import CalibrationError, RecordingError
 from common.geometry.camera_model import CameraModel
 from common.messages import MarkerDetections
 from common.recording.frame_recording import FrameRecording, open_recording
 from common.recording.recorded_files import TRUTH, has_truth, read_truth
 from master.calibrate.depth.sweep import Sweep, column, parse_distances, read_table, rows_of
-from master.calibrate.tree_files import load_marker_rig
+from master.calibrate.tree_files import load_marker_rig, refusals_named
 from master.fabrik.caps import card_outline, centre_of_blob, round_outline
 from master.replay.recorded import recorded_detections
 
@@ -39,35 +31,21 @@ STILL_FRAMES = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Frame pairs of two cameras in which one marker is looked for; T pairs.
+    """T frame pairs of two cameras in which one marker is looked for."""
 
-    Attributes:
-        t_ns: (T,) of the first camera's frame.
-        seq: (T,) its frame counter.
-        uv: (2, T, 2) [px]; NaN: not seen.
-        area_px2: (2, T) [px^2].
-        sigma_px: (2, T) stated standard deviations of the centroids [px].
-    """
-
-    t_ns: Int
+    t_ns: Int  # this and seq: (T,) time and frame counter of the first camera's frame
     seq: Int
-    uv: Float
-    area_px2: Float
-    sigma_px: Float
+    uv: Float  # (2, T, 2) [px]; NaN: not seen
+    area_px2: Float  # (2, T) [px^2]
+    sigma_px: Float  # (2, T) stated standard deviations of the centroids [px]
 
 
 def read_pairs(
     recording: FrameRecording, detections: Path, cameras: tuple[str, str], marker: str | None
 ) -> tuple[Pairs, str]:
-    """Return the frame pairs of two cameras of a recording and the target's name.
+    """Frame pairs of two cameras, left first, and the target's marker.
 
-    The name is that of the marker that is the target.
-
-    Args:
-        recording: The recording.
-        detections: Folder with detections_<camera>.npz.
-        cameras: First (left) and second camera.
-        marker: The target; None: the only marker that both cameras see.
+    `marker` None: the only one that both cameras see, by detections_<camera>.npz of the folder.
 
     Raises:
         RecordingError: Detections are missing or broken, or no frames belong together.
@@ -95,9 +73,7 @@ def read_pairs(
 
 
 def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
-    """Return each pair at its true distance from truth.npz of a rendered recording.
-
-    None where truth.npz has no `depth`.
+    """Each pair at its true distance in truth.npz; None: it has no `depth`.
 
     Raises:
         RecordingError: truth.npz is broken, leads out of the folder, or has another number of frames.
@@ -124,9 +100,7 @@ def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
 
 
 def by_list(pairs: Pairs, distances: Float) -> Sweep:
-    """Assign the given distances to the pairs of the recording.
-
-    Distances (N,) in the order of the recording: one for each pair, or else one for each still stretch.
+    """Assign distances (N,) in order, to each pair or else to each still stretch.
 
     Raises:
         CalibrationError: The numbers fit neither.
@@ -146,9 +120,8 @@ def by_list(pairs: Pairs, distances: Float) -> Sweep:
 def by_file(pairs: Pairs, path: Path) -> Sweep:
     """Read the distances of the pairs from a CSV.
 
-    Columns: `distance_m`, and one of `t_s` (since the first pair), `frame` (pair, from 0), `seq`.
-
-    A time takes the pairs within a quarter of a second of it.
+    Columns: `distance_m`, and one of `t_s` (since the first pair), `frame` (pair, from 0), `seq`. A time
+    takes the pairs within a quarter of a second of it.
 
     Raises:
         CalibrationError: The file cannot be read, or names what the recording has not; with file and line.
@@ -173,7 +146,7 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
                 f"{path}: line {number}: no frame pair with {key} {v:g}; the recording has {since_s.size} pairs,"
                 f" seq {pairs.seq[0]}...{pairs.seq[-1]}, 0...{since_s[-1]:.2f} s"
             )
-        if run.size > 1 and not _is_still(pairs, run):
+        if run.size > 1 and not _near(pairs, run, run):
             raise CalibrationError(
                 f"{path}: line {number}: the target moves within {around_s} s of t_s {v:g}; still are"
                 f" {_times(pairs, still_runs(pairs))}"
@@ -185,8 +158,8 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
 def still_runs(pairs: Pairs) -> list[Int]:
     """The stretches, as indices of pairs, in which the target stands in both images.
 
-    A pair joins the stretch before it while its centroids lie within six standard deviations, 1.2 px at most, of the
-    stretch's mean. A tenth is cut off each end, where the target may still be settling, or be touched again.
+    A pair joins the stretch before it while its centroids lie within six standard deviations, 1.2 px at most,
+    of the stretch's mean. A tenth is cut off each end, where the target may be settling, or be touched.
     """
     runs: list[Int] = []
     start = 0
@@ -201,21 +174,13 @@ def still_runs(pairs: Pairs) -> list[Int]:
 
 
 def _near(pairs: Pairs, run: Int, new: int | Int) -> bool:
-    """Return true if all pairs `new` lie at the mean position of the pairs `run`.
-
-    False where one is not seen.
-    """
+    """Whether pairs `new` lie at the mean place of pairs `run`; not: one is not seen."""
     off = np.abs(pairs.uv[:, new] - pairs.uv[:, run].mean(axis=1).reshape(2, *([1] * np.ndim(new)), 2))
     noise_px = 0.1  # of a centroid whose sigma is not stated
     # of a target at rest; more is stated of what moves suddenly, and must not excuse that it moves
     unsure_px = 0.2
     sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], noise_px), unsure_px)[..., None]
-    still_sigmas = 6.0  # distance of a frame's centroid from the mean of its stretch
-    return bool((off <= still_sigmas * sigma).all())
-
-
-def _is_still(pairs: Pairs, run: Int) -> bool:
-    return _near(pairs, run, run)
+    return bool((off <= 6.0 * sigma).all())  # distance of a frame's centroid from the mean of its stretch
 
 
 def _times(pairs: Pairs, runs: Sequence[Int]) -> str:
@@ -257,10 +222,7 @@ def _target(messages: Sequence[MarkerDetections], names: tuple[str, ...]) -> int
 def _together(
     first: Sequence[MarkerDetections], second: Sequence[MarkerDetections], limit_ns: int
 ) -> list[tuple[MarkerDetections, MarkerDetections]]:
-    """Match each message of the first camera with the nearest one of the second.
-
-    Matches are not farther apart than `limit_ns`.
-    """
+    """Messages of the first camera with the second's nearest, within `limit_ns`."""
     if not second:
         return []
     times = np.array([message.t_ns for message in second], np.int64)
@@ -277,23 +239,15 @@ _LEFT_RIGHT = ("left", "right")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two cameras and the rig they belong to.
+    """Two cameras and the rig they belong to."""
 
-    Attributes:
-        rig: The rig file; None: nothing is known but the numbers of a table.
-        file_name: Of the rig file in a calib_json tree, without .json.
-        cameras: Names, first the left one.
-        files: Their camera files.
-        models: The same as camera models; None: intrinsics are missing.
-        origin: Where the camera files come from.
-    """
-
-    rig: RigCalibration | None = None
-    file_name: str = ""
-    cameras: tuple[str, str] = _LEFT_RIGHT
+    rig: RigCalibration | None = None  # the rig file; None: nothing is known but the numbers of a table
+    file_name: str = ""  # of the rig file in a calib_json tree, without .json
+    cameras: tuple[str, str] = _LEFT_RIGHT  # names, first the left one
+    # this and models: their camera files, and the same as camera models; None: intrinsics are missing
     files: tuple[CameraCalibration, ...] = ()
     models: tuple[CameraModel, CameraModel] | None = None
-    origin: str = "the recording"
+    origin: str = "the recording"  # where the camera files come from
 
     @property
     def size_px(self) -> tuple[int, int] | None:
@@ -303,31 +257,16 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """A sweep, how it was made, and with what.
+    """A sweep, how it was made, and with what."""
 
-    Attributes:
-        sweep: Unchecked, as measured but for the lens' shift of the centroids.
-        pair: The cameras.
-        data: Names of what it was read from, for the provenance.
-        about: One line that describes it.
-    """
-
-    sweep: Sweep
+    sweep: Sweep  # unchecked, as measured but for the lens' shift of the centroids
     pair: Pair
-    data: tuple[str, ...]
-    about: str
+    data: tuple[str, ...]  # names of what it was read from, for the provenance
+    about: str  # one line that describes it
 
-    @contextmanager
-    def named(self) -> Generator[None, None, None]:
-        """Refusals of the sweep begin with what it was read from.
-
-        Raises:
-            FitError: As the block.
-        """
-        try:
-            yield
-        except FitError as error:
-            raise FitError(f"{', '.join(self.data)}: {error}") from error
+    def named(self) -> AbstractContextManager[None]:
+        """Refusals of the sweep begin with what it was read from."""
+        return refusals_named(", ".join(self.data))
 
 
 def pair_of(
@@ -363,10 +302,8 @@ def load_pair(
     """The pair of CALIBRATION/rigs/<rig>.json with its camera files.
 
     Args:
-        calibration: calib_json tree.
-        rig_name: Rig.
         fov_deg: Nominal horizontal field of view, for camera files without intrinsics.
-        recorded: Camera files of a recording; the tree's are taken where they carry the provenance of a measurement.
+        recorded: Camera files of a recording; the tree's are taken where they were measured (provenance).
 
     Raises:
         CalibrationError: A file is missing or broken, or `fov_deg` is no angle of view.
@@ -400,15 +337,14 @@ def from_recording(
     pair_for: Callable[[FrameRecording], Pair],
     outline: Float,
 ) -> Measured:
-    """The sweep of a recording.
+    """The sweep of a recording, by its detections_<camera>.npz in a folder.
 
     Args:
-        folder: The recording.
-        detections: Folder with detections_<camera>.npz.
         marker: The target; None: the only one that is seen.
-        distances: FIRST:LAST:STEP, a list, or the path of a .csv; None: from the truth.npz of a rendered recording.
+        distances: FIRST:LAST:STEP, a list, or the path of a .csv; None: from truth.npz of a rendered
+            recording.
         pair_for: The rig and cameras to use with this recording.
-        outline: Shape of the target, see `blob_bias`.
+        outline: Shape of the target, see `parse_target`.
 
     Raises:
         RecordingError, CalibrationError: Something is missing; the message states how to make it.
@@ -450,18 +386,11 @@ def parse_target(text: str) -> Float:
 
 
 def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
-    """Replace the sweep's centroids by the projections of the target's centre.
-
-    Also return the note to print about it.
-    """
+    """The sweep with projections of the target's centre, and a note to print."""
     if pair.models is None or np.isnan(sweep.area_px2).all():
         return sweep, ""
-    uv = np.stack(
-        [
-            centre_of_blob(model, sweep.uv[c], sweep.area_px2[c], outline)
-            for c, model in enumerate(pair.models)
-        ]
-    )
+    seen = zip(pair.models, sweep.uv, sweep.area_px2, strict=True)
+    uv = np.stack([centre_of_blob(model, uv, area, outline) for model, uv, area in seen])
     shift = float(np.nanmax(np.abs(uv - sweep.uv), initial=0.0))
     noted_px = 0.02  # shift of a centroid worth a line
     note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > noted_px else ""

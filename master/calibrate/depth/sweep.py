@@ -1,13 +1,7 @@
 """A depth sweep is one target at known distances, also kept as a table.
 
-Depth sweep: one target at known distances, as both cameras of a pair saw it.
-
-Also checks what makes a sweep unfit for a fit.
-
-Refused is what would give a law that looks well and is not: see `checked`. Every refusal names the points and states
-what to do.
-
-Tables that a person writes: a sweep as CSV, and the distances of a sweep.
+Both cameras of a pair see the target. Refused is what would give a law that looks well and is not: see
+`checked`. Every refusal names the points and states what to do.
 """
 
 import csv
@@ -28,25 +22,15 @@ FARTHEST_M = 10.0  # beyond it, 75 mm of baseline give less than 4 px: these are
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """N places of the target.
+    """N places of the target."""
 
-    Attributes:
-        distance_m: (N,) of the target's centre along the first camera's axis [m].
-        disparity_px: (N,) u of the first camera minus u of the second [px].
-        uv: (2, N, 2) centroids [px], distorted images; NaN: only the disparity is known, or not seen.
-        area_px2: (2, N) [px^2]; NaN: not known.
-        sigma_px: (N,) standard deviation of one frame pair's disparity [px]; NaN: not known.
-        frames: (N,) frame pairs that were averaged.
-        place: (N,) where each point comes from, for messages: "line 5", "frame 12".
-    """
-
-    distance_m: Float
-    disparity_px: Float
-    uv: Float
-    area_px2: Float
-    sigma_px: Float
-    frames: Int
-    place: tuple[str, ...]
+    distance_m: Float  # (N,) of the target's centre along the first camera's axis [m]
+    disparity_px: Float  # (N,) u of the first camera minus u of the second [px]
+    uv: Float  # (2, N, 2) centroids [px], distorted images; NaN: only the disparity is known, or not seen
+    area_px2: Float  # (2, N) [px^2]; NaN: not known
+    sigma_px: Float  # (N,) standard deviation of one frame pair's disparity [px]; NaN: not known
+    frames: Int  # (N,) frame pairs that were averaged
+    place: tuple[str, ...]  # (N,) where each point comes from, for messages: "line 5", "frame 12"
 
     @classmethod
     def of_disparity(cls, distance_m: Float, disparity_px: Float, place: Sequence[str]) -> "Sweep":
@@ -85,15 +69,12 @@ class Sweep:
 def checked(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | None = None) -> Sweep:
     """The sweep by distance, nearest first, repeated distances averaged.
 
-    Args:
-        sweep: As measured.
-        cameras: Names of the two cameras, for messages.
-        size_px: Width and height of both images, where the sweep has centroids and areas.
+    `size_px` is the size of both images, where the sweep has centroids and areas.
 
     Raises:
-        FitError: A target that is not seen, or partly outside an image; NaN; swapped cameras; a repeated distance
-            that disagrees; too few points, too narrow or one-sided a range; disparities that do not fall with the
-            distance.
+        FitError: A target that is not seen, or partly outside an image; NaN; swapped cameras; a repeated
+            distance that disagrees; too few points, too narrow or one-sided a range; disparities that do not
+            fall with the distance.
     """
     merged = _merged(check_places(sweep, cameras, size_px))
     _check_falls(merged)
@@ -103,8 +84,6 @@ def checked(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | N
 
 def check_places(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | None = None) -> Sweep:
     """Sort the sweep by distance, nearest first, and check each place on its own.
-
-    The target must be seen, be wholly in the image, and appear in the right order of cameras.
 
     Raises:
         FitError: As `checked`, without what concerns all places together.
@@ -119,10 +98,8 @@ def check_places(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
 def check_enough(sweep: Sweep) -> None:
     """Refuse points that do not determine a law over a range.
 
-    Too few, too near each other, or all at one end.
-
     Raises:
-        FitError: The message states what is missing.
+        FitError: Too few, too near each other, or all at one end; the message states what is missing.
     """
     # two constants, and enough points to distinguish a wrong one from the others; the paper has 17
     points = 8
@@ -138,10 +115,7 @@ def check_enough(sweep: Sweep) -> None:
             f" from a narrow range is wrong outside it; measure the whole range of use, such as 0.20...1.00 m"
         )
     middle = float(np.sqrt(near * far))
-    nearer, farther = (
-        int((sweep.distance_m < middle).sum()),
-        int((sweep.distance_m > middle).sum()),
-    )
+    nearer, farther = int((sweep.distance_m < middle).sum()), int((sweep.distance_m > middle).sum())
     in_each_half = 2  # points nearer, and farther, than the geometric middle of the range
     if min(nearer, farther) < in_each_half:
         side, count = ("nearer", nearer) if nearer < farther else ("farther", farther)
@@ -189,10 +163,7 @@ def _check_signs(sweep: Sweep, cameras: tuple[str, str]) -> None:
 
 
 def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int]) -> None:
-    """Refuse targets that are cut by the border of an image.
-
-    A cut target is too small for its distance, and its centroid lies inward.
-    """
+    """Refuse targets cut by the image's border: their centroid lies inward."""
     nominal = sweep.area_px2 * sweep.distance_m**2
     if sweep.size == 0 or not np.isfinite(nominal).all():
         return
@@ -211,11 +182,7 @@ def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
 
 
 def _merged(sweep: Sweep) -> Sweep:
-    """Equal distances averaged; `sweep` is sorted by distance.
-
-    Raises:
-        FitError: Equal distances whose disparities differ by more than a ruler and noise explain.
-    """
+    """Equal distances averaged, unless ruler and noise do not explain the spread."""
     same_m = 0.0005  # distances that a ruler does not distinguish
     group = np.concatenate([[0], np.cumsum(np.diff(sweep.distance_m) > same_m)]).astype(np.int64)
     parts: list[Sweep] = []
@@ -288,10 +255,9 @@ _MORE = "\0"  # key of what a row has beyond its columns; no name of a column
 def read_table(path: Path) -> Sweep:
     """Read a sweep from a CSV.
 
-    Columns: distance_m and disparity_px, or distance_m, u_left_px and u_right_px.
-
-    With v_left_px and v_right_px beside the u, the full stereo model can be verified on it too; area_left_px2 and
-    area_right_px2 let a target be found out that is not wholly in the picture.
+    Columns: distance_m and disparity_px, or distance_m, u_left_px and u_right_px. With v_left_px and
+    v_right_px the full stereo model can be verified too; area_left_px2 and area_right_px2 reveal a target
+    that is partly outside an image.
 
     Raises:
         CalibrationError: The file cannot be read, or lacks a column; the text names file, line and column.
@@ -341,12 +307,10 @@ def write_table(path: Path, sweep: Sweep) -> None:
 
 
 def parse_distances(text: str) -> Float:
-    """Parse distances [m] from a range or a list.
-
-    Range such as `1.00:0.20:-0.05` (first, last, step), or list such as `1.0,0.8,0.6`.
+    """Distances [m] of a range `1.00:0.20:-0.05` (first, last, step), or a list.
 
     Raises:
-        CalibrationError: Neither of the two, a step that does not lead from the first to the last, or no metres.
+        CalibrationError: Neither of the two, a step that does not lead to the last, or no metres.
     """
     distances = parse_numbers(
         text, "--distances", "FIRST:LAST:STEP in metres, such as 1.00:0.20:-0.05, or a list 1.0,0.8,0.6"
@@ -361,10 +325,7 @@ def parse_distances(text: str) -> Float:
 def parse_numbers(text: str, option: str, wanted: str) -> Float:
     """Numbers of FIRST:LAST:STEP, or of a list with commas.
 
-    Args:
-        text: What the user wrote.
-        option: Where, for the message.
-        wanted: What was expected, for the message.
+    Messages name `option` and what is `wanted`.
 
     Raises:
         CalibrationError: Neither of the two, or a step that does not lead from the first to the last.

@@ -1,21 +1,11 @@
-"""Verify a depth law on a second sweep, and draw both.
+"""A verification compares the measured depth error with the error budget.
 
-A verification compares the measured depth error with the error budget.
-
-Verification of a rig's depth accuracy.
-
-The published table of 20...100 cm for every depth model that the rig has, and the error that was to be expected.
-
-Three things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target
-stood; what *noise and time* cost by the derivatives of the ideal law (`master.fabrik.depth.error_budget`); and what a
-law of raw disparity costs *off the axis*, where it was not fitted, by projecting points with the rig's own cameras.
-The last is exact for the model, and as true as the rig's stereo calibration is.
-
-The tables of `calibrate verify`, as lines and as numbers.
-
-Plots of a sweep: depth error by distance.
-
-One line for each law or model, with the band to be expected.
+It gives the published table of 20...100 cm for every depth model that the rig has, as lines, numbers and a
+plot. Three things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which
+the target stood; what *noise and time* cost by the derivatives of the ideal law
+(`master.fabrik.depth.error_budget`); and what a law of raw disparity costs *off the axis*, where it was not
+fitted, by projecting points with the rig's own cameras. The last is exact for the model, and as true as the
+rig's stereo calibration is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,45 +33,30 @@ Cameras = tuple[CameraModel, CameraModel]
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What is assumed of the cameras.
+    """What is assumed of the cameras."""
 
-    Attributes:
-        sigma_px: Standard deviation of a centroid in one camera, per axis [px].
-        speed_m_s: Sideways speed of a marker [m/s].
-        skew_s: Time between the two exposures that nobody corrects [s].
-    """
-
-    sigma_px: float = 0.1
-    speed_m_s: float = 1.0
-    skew_s: float = 0.0005
+    sigma_px: float = 0.1  # standard deviation of a centroid in one camera, per axis [px]
+    speed_m_s: float = 1.0  # sideways speed of a marker [m/s]
+    skew_s: float = 0.0005  # time between the two exposures that nobody corrects [s]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
-    """A sweep held against the depth models of a rig.
+    """A sweep compared with the depth models of a rig."""
 
-    Attributes:
-        sweep: What was measured, nearest first.
-        off_axis_deg: (N,) angle of the target off the pair's axis, from the middle between both cameras; NaN: not
-            known.
-        error_m: Depth model -> depth - distance (N,) [m]; NaN: the model gives no depth there.
-        expected_m: (N,) standard deviation of the depth by the noise of the centroids [m].
-    """
-
-    sweep: Sweep
+    sweep: Sweep  # what was measured, nearest first
+    # (N,) angle of the target off the pair's axis, from the middle between both cameras; NaN: not known
     off_axis_deg: Float
+    # depth model -> depth - distance (N,) [m]; NaN: the model gives no depth there
     error_m: Mapping[str, Float]
-    expected_m: Float
+    expected_m: Float  # (N,) standard deviation of the depth by the noise of the centroids [m]
 
     def relative(self, model: str) -> Float:
         """Error as a share of the distance (N,)."""
         return self.error_m[model] / self.sweep.distance_m
 
     def figures(self, model: str) -> dict[str, float]:
-        """Return the mean and largest |error| of a depth model.
-
-        In mm and in per cent of the distance, where the model gives a depth; else NaN.
-        """
+        """Mean and largest |error| of a depth model [mm, %]; NaN: it gives no depth."""
         known = np.isfinite(self.error_m[model])
         if not known.any():
             return dict.fromkeys(("mean_mm", "max_mm", "mean_percent", "max_percent"), float("nan"))
@@ -105,13 +80,10 @@ def laws_of(rig: RigCalibration) -> dict[str, DepthLaw]:
 
 
 def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, noise: Noise) -> Verified:
-    """Errors of every depth model at every place of a sweep.
+    """Errors of every depth model at every place of a sweep, nearest first.
 
-    Args:
-        sweep: Nearest first.
-        laws: Laws of raw disparity.
-        cameras: The calibrated pair, for the full stereo model; None: not calibrated.
-        noise: Its sigma is taken where the sweep does not report how much its disparities scatter.
+    By laws of raw disparity, and by the full stereo model of calibrated cameras. `noise` gives the sigma
+    where the sweep does not report how much its disparities scatter.
     """
     d = sweep.distance_m
     errors = {name: law.depth(sweep.disparity_px) - d for name, law in laws.items()}
@@ -130,9 +102,9 @@ def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, 
 
 
 def stereo_points(cameras: Cameras, uv: Float) -> Float:
-    """Triangulate centroids (2, N, 2) [px] in the first camera's frame.
+    """Points (N, 3) [m] of centroids (2, N, 2) [px], first camera's frame.
 
-    Returns points (N, 3) [m]; NaN: not determined.
+    NaN: not determined.
     """
     found = triangulate(CameraArrays.of(cameras), uv)
     return transform(invert(cameras[0].T_rig_camera), found.points_m)
@@ -141,19 +113,17 @@ def stereo_points(cameras: Cameras, uv: Float) -> Float:
 def middle(cameras: Cameras) -> Float:
     """The middle between both optical centres (3,) [m], in the first camera's frame.
 
-    The pair's axis runs through it, parallel to that of the first camera: a target between the cameras is on axis.
+    The pair's axis runs through it, parallel to the first camera's: a target between the cameras is on axis.
     """
     between = 0.5 * (cameras[0].centre + cameras[1].centre)
     return transform(invert(cameras[0].T_rig_camera), between[None])[0]
 
 
 def off_axis(law: DepthLaw, cameras: Cameras, distance_m: Float, angle_deg: Float) -> Float:
-    """Return the relative depth error (A, N) of a law for off-axis targets.
+    """Relative depth error (A, N) of a law off the axis; NaN: outside an image.
 
-    At angles (A,) to the side and distances (N,).
-
-    The angle is that of `middle`, in the plane of the first camera's rows; the points are noiseless, seen by the
-    calibrated pair. NaN: outside an image.
+    At angles (A,) to the side, those of `middle` in the plane of the first camera's rows, and distances (N,);
+    the points are noiseless, seen by the calibrated pair.
     """
     x, y, z = middle(cameras).tolist()
     side = x + np.tan(np.radians(angle_deg))[:, None] * (distance_m - z)
@@ -172,12 +142,7 @@ def budget(cameras: Cameras, distance_m: Float, noise: Noise) -> list[ErrorBudge
     baseline_m = float(np.linalg.norm(cameras[1].centre - cameras[0].centre))
     return [
         error_budget(
-            law,
-            d,
-            baseline_m,
-            sigma_px=noise.sigma_px,
-            speed_m_s=noise.speed_m_s,
-            skew_s=noise.skew_s,
+            law, d, baseline_m, sigma_px=noise.sigma_px, speed_m_s=noise.speed_m_s, skew_s=noise.skew_s
         )
         for d in distance_m.tolist()
     ]
@@ -274,11 +239,7 @@ def expected_json(
         }
         for d, e in zip(distance_m.tolist(), expected, strict=True)
     ]
-    assumed = {
-        "sigma_px": noise.sigma_px,
-        "speed_m_s": noise.speed_m_s,
-        "skew_ms": 1e3 * noise.skew_s,
-    }
+    assumed = {"sigma_px": noise.sigma_px, "speed_m_s": noise.speed_m_s, "skew_ms": 1e3 * noise.skew_s}
     off = {
         "distance_m": distance_m.tolist(),
         "angle_deg": angle_deg.tolist(),
@@ -323,13 +284,9 @@ def draw_errors(
     used: Bool | None = None,
     band: Float | None = None,
 ) -> None:
-    """Write the plot as PNG.
-
-    All models above, the good ones enlarged below where there are bad ones.
+    """Write the plot as PNG: all models above, the good ones enlarged below.
 
     Args:
-        path: The file; replaced only by a complete one.
-        title: Heading.
         distance_m: (N,) [m], rising.
         errors: Model -> relative error of depth (N,).
         used: (N,) False: shown hollow, rejected from a fit.
@@ -356,13 +313,9 @@ def draw_errors(
                     100 * distance_m[~used], 100 * error[~used], "o", markersize=11, mfc="none", color="red"
                 )
         if band is not None:
+            noise = "±2σ of the budget"
             axes.fill_between(
-                100 * distance_m,
-                -200 * band,
-                200 * band,
-                color="black",
-                alpha=0.10,
-                label="±2σ of the budget",
+                100 * distance_m, -200 * band, 200 * band, color="black", alpha=0.1, label=noise
             )
         axes.set_ylabel("error of depth [%]")
         axes.grid(visible=True, alpha=0.3)

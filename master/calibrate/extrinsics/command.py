@@ -1,41 +1,32 @@
 """`phalanx calibrate wrist extrinsics`: how a wrist device sits.
 
-Found by what marker rig and device both see.
+A motion that marker rig and device both see enters; the device's pose, its IMU's and both latencies leave.
 """
 
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.arrays import Float
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.imu.fusion import OrientationFilter
 from common.imu.recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
 from common.recording.frame_recording import FrameRecording, open_recording
-from master.calibrate.wrist.device import device_of, print_line, write_device
-from master.commands.summary import write_summary
-from master.replay.recorded import recorded_cycles, recorded_detections
+from master.calibrate.extrinsics.extrinsics import Extrinsics, calibrate_extrinsics, left_of
+from master.calibrate.time_offsets import detections_of
+from master.calibrate.tree_files import print_lines, refusals_named, write_report
+from master.calibrate.wrist.device import device_of, write_device
+from master.replay.recorded import recorded_cycles
 from master.rig.pipeline import build_pipeline
 from master.rig.setup import RigSetup, load_hand
 from master.run.app import StageTimes
 
-if TYPE_CHECKING:
-    from master.calibrate.extrinsics.extrinsics import Extrinsics
-
 
 def extrinsics(options: Namespace) -> None:
-    """Measure the mounting of the wrist device on the forearm.
-
-    Also how its IMU lies, and how late both clocks are.
-    """
-    # Imported here: scipy.optimize takes a second.
-    from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
-
+    """Measure the mounting of a wrist device and its IMU, and their latencies."""
     device = device_of(options.recording, options.rig, options.calibration, options.out)
     if device.rig.T_camera_palm is None:
         raise CalibrationError(
@@ -53,45 +44,34 @@ def extrinsics(options: Namespace) -> None:
     poses = marker_poses(setup, options.detections)
     samples = imu_samples(opened, device.rig.imu.name, device.rig.imu.rate_hz)
     cycles = list(recorded_cycles(options.detections, device.camera.name))
-    try:
+    with refusals_named(options.recording):
         found = calibrate_extrinsics(
             poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
         )
-    except FitError as error:
-        raise FitError(f"{options.recording}: {error}") from error
-    print_line(found.report)
+    print_lines(found.report)
     if options.picture is not None:
         from master.calibrate.picture import draw_extrinsics
 
         draw_extrinsics(options.picture, found, device.optics)
         echo(f"drew {options.picture}")
     written = write_device(options.out, device, found.rig, "T_camera_palm, imu, stamp_offset_us")
-    if options.json_file is not None:
-        write_summary(
-            options.json_file, summary(found) | {"written": None if written is None else str(written)}
-        )
+    write_report(options.json_file, summary(found), written)
 
 
 def marker_poses(setup: RigSetup, detections: Path) -> list[HandPose]:
-    """What the line of a marker rig makes of recorded detections.
+    """The poses that a marker rig's pipeline makes of recorded detections.
 
     Raises:
         RecordingError: A file of detections is missing or broken.
     """
-    messages = [
-        message
-        for camera in setup.rig.cameras
-        for message in recorded_detections(detections, camera, len(setup.markers))
-    ]
     pipeline = build_pipeline(setup, StageTimes())
-    solved = [one for message in sorted(messages, key=lambda one: one.t_ns) for one in pipeline.push(message)]
+    messages = detections_of(setup.rig, detections)
+    solved = [one for message in messages for one in pipeline.push(message)]
     return [one.pose for one in [*solved, *pipeline.flush()]]
 
 
 def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequence[ImuSample]:
-    """Return the IMU samples with orientations.
-
-    Where the file has no orientation, it is the one that a slave's filter computes from the samples.
+    """The IMU samples with orientations, by a slave's filter where the file has none.
 
     Raises:
         RecordingError: imu.csv is broken.
@@ -106,11 +86,9 @@ def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequenc
     return [fusion.push(one) for one in samples]
 
 
-def summary(found: "Extrinsics") -> dict[str, object]:
+def summary(found: Extrinsics) -> dict[str, object]:
     """What was measured, as numbers."""
-    from master.calibrate.extrinsics.extrinsics import left_of
-
-    imu = found.rig.imu
+    imu, angles = found.rig.imu, np.degrees(found.fit.wrist_angles_rad)
     return {
         "T_camera_palm": [list(row) for row in found.rig.T_camera_palm or ()],
         "q_palm_imu": None if imu is None else imu.q_palm_imu,
@@ -120,9 +98,5 @@ def summary(found: "Extrinsics") -> dict[str, object]:
         "sigma": found.sigma,
         "residual": left_of(found.fit),
         "cycles": len(found.cycles.t_s),
-        "wrist_deg": _span(np.degrees(found.fit.wrist_angles_rad)),
+        "wrist_deg": [[round(float(v), 2) for v in row] for row in (angles.min(axis=0), angles.max(axis=0))],
     }
-
-
-def _span(values: Float) -> list[list[float]]:
-    return [[round(float(v), 2) for v in row] for row in (values.min(axis=0), values.max(axis=0))]

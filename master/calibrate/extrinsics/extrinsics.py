@@ -1,12 +1,7 @@
 """A calibration finds how a wrist device is mounted, and reports on it.
 
-Report on a mounting: uncertainty, residuals, refusals and printed lines.
-
-Mounting of a wrist device on its forearm.
-
-Estimated from ten seconds that marker rig and device see together.
-
-What is made of it is in `start`, `fit` and `unknown`, what is printed of it in `report`; here is what goes in and out.
+Ten seconds that marker rig and device see together enter. `unknown` gives the first guess, `problem` the fit;
+here is what goes in and out: checks, refusals, uncertainty, printed lines.
 """
 
 from collections.abc import Sequence
@@ -43,10 +38,7 @@ _ROTATION_RAD = np.radians(4.0)  # standard deviations, at most
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
-    """Return standard deviations by quantity with its unit.
-
-    Of vectors, that of the worst direction.
-    """
+    """Standard deviations by quantity with its unit; of vectors, the worst direction."""
     unknown, cov = fit.unknown, fit.covariance
     by = np.zeros((3, len(cov)))  # turn of the straight palm, camera axes
     by[:, CAMERA_IMU], by[:, FOREARM_IMU] = np.eye(3), -unknown.T_camera_palm[:3, :3]
@@ -77,9 +69,7 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
             f" {100 * fit.outlier_share:.0f} % outliers. Is the hand file that of this hand and side, the laser plane"
             " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
         )
-    rotation = max(
-        sigma["rotation_sigma_deg"], sigma["imu_rotation_sigma_deg"], sigma["camera_imu_sigma_deg"]
-    )
+    rotation = max(sigma[f"{of}_sigma_deg"] for of in ("rotation", "imu_rotation", "camera_imu"))
     clock = max(sigma["camera_clock_sigma_ms"], sigma["imu_clock_sigma_ms"])
     wanting: list[str] = []
     if np.radians(rotation) > _ROTATION_RAD:
@@ -100,7 +90,7 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
 
 
 def left_of(fit: Fit) -> dict[str, float]:
-    """What is left of sights, by quantity with its unit."""
+    """Residuals by quantity with its unit."""
     off = fit.off * fit.sigma
     laser, tip = (np.sqrt((part**2).sum(axis=-1)) for part in (off[..., :2], off[..., 2:]))
     return {
@@ -116,9 +106,8 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
     unknown, left = fit.unknown, left_of(fit)
     wrist_angles = np.degrees(np.quantile(fit.wrist_angles_rad, [0.02, 0.98], axis=0))
     x, y, z = 1e3 * unknown.shift_m
-    seen = (
-        f"{np.isfinite(fit.off[..., 0]).sum()} laser points, {np.isfinite(fit.off[..., 2]).sum()} fingertips"
-    )
+    points, tips = (np.isfinite(fit.off[..., k]).sum() for k in (0, 2))
+    seen = f"{points} laser points, {tips} fingertips"
     what = (
         f"laser {left['laser_mm']:.2f} mm, tips {left['tip_px']:.1f} px, markers {left['marker_mm']:.2f} mm"
     )
@@ -138,10 +127,8 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
         ("IMU later by", f"{1e3 * unknown.imu_late_s:+.2f} ms", "imu_clock_sigma_ms"),
     ):
         lines.append(f"{name:24} {value:>22} {sigma[key]:16.2f} {key.rsplit('_', 1)[1]}")
-    lines.append(
-        "the heading in q_rig_world is of this recording: it begins anywhere when the IMU starts again"
-    )
-    return tuple(lines)
+    heading = "the heading in q_rig_world is of this recording: it begins anywhere when the IMU starts again"
+    return (*lines, heading)
 
 
 TOOL = "calibrate wrist extrinsics"
@@ -153,21 +140,13 @@ MOTION = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsics:
-    """A mounting that explains what was seen.
+    """A mounting that explains what was seen."""
 
-    Attributes:
-        rig: The wrist rig with its new keys: T_camera_palm, imu, stamp_offset_us.
-        report: Lines for a person.
-        fit: What was fitted.
-        cycles: To what.
-        sigma: Quantity with its unit -> standard deviation.
-    """
-
-    rig: RigCalibration
-    report: tuple[str, ...]
+    rig: RigCalibration  # the wrist rig with its new keys: T_camera_palm, imu, stamp_offset_us
+    report: tuple[str, ...]  # lines for a person
     fit: Fit
-    cycles: StrobeCycles
-    sigma: dict[str, float]
+    cycles: StrobeCycles  # what was fitted to
+    sigma: dict[str, float]  # quantity with its unit -> standard deviation
 
 
 def calibrate_extrinsics(
@@ -183,17 +162,16 @@ def calibrate_extrinsics(
     """Fit the mounting of a wrist device to one motion.
 
     Args:
-        poses: What the line of the marker rig made of it, by markers alone.
-        markers: Their names, in the order of the poses'.
-        model: The hand.
+        poses: By the marker rig's pipeline alone.
+        markers: Names of their markers, in order.
         cycles: What the slave of the device saw, in order.
         samples: What its IMU measured, in order, with the orientation of its filter.
         rig: The device: laser plane, a palm pose that is right to a centimetre and ten degrees, an IMU.
-        camera: Its camera.
         source: Name of the data, for the provenance.
 
     Raises:
-        FitError: The motion was not done, not seen, or does not fix the mounting; the message states what to do.
+        FitError: The motion was not done or seen, or does not fix the mounting; the message states what to
+            do.
         CalibrationError: The rig lacks its laser plane, palm pose or IMU.
     """
     if rig.imu is None:
@@ -210,9 +188,8 @@ def calibrate_extrinsics(
     start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
     if start is None:
         raise FitError(f"hand and IMU were hardly seen at the same time: {MOTION}")
-    distance = np.linalg.norm(
-        transform(setup.T_camera_palm, model.rest_position_m[CHAINS[1:, 0]].mean(axis=0))
-    )
+    knuckles = model.rest_position_m[CHAINS[1:, 0]].mean(axis=0)
+    distance = np.linalg.norm(transform(setup.T_camera_palm, knuckles))
     px_per_m = float(setup.optics.matrix[0, 0] / distance)
     firsts = [replaced(start, camera_late_s=late_s).unknown for late_s in (start.camera_late_s, 0.0)]
     fit = fit_extrinsics(lines_of_sight, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
@@ -223,11 +200,7 @@ def calibrate_extrinsics(
 
 
 def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
-    """The marker at the tip of a finger.
-
-    Raises:
-        FitError: There is none.
-    """
+    """The marker at the tip of a finger."""
     wanted = CHAINS[FINGERS.index(finger), 3]
     for number, name in enumerate(markers):
         if model.mount(name).joint == wanted:
@@ -242,34 +215,26 @@ def _cycles(
     messages: Sequence[WristDetections],
     zero_ns: int,
 ) -> StrobeCycles:
-    """What was seen of index ... little, on the laser plane and in the image."""
+    """Observations of index ... little, on the laser plane and in the image."""
     laser, sigma, tips, tip_sigma = (list[Float]() for _ in range(4))
     for one in messages:
         shown = in_image(setup, one.laser_uv, one.laser_sigma_px)
         found = laser_points(setup, np.where(shown[:, None], one.laser_uv, np.nan), one.laser_sigma_px)
-        laser.append(lines_of_sight.flat(found.point_m))
-        sigma.append(np.sqrt(np.einsum("fii->fi", lines_of_sight.flat_cov(found.cov_m2))))
+        laser.append(lines_of_sight.axes.flat(found.point_m))
+        sigma.append(np.sqrt(np.einsum("fii->fi", lines_of_sight.axes.flat_cov(found.cov_m2))))
         shown = in_image(setup, one.tip_uv, one.tip_sigma_px)
         tips.append(np.where(shown[:, None], one.tip_uv, np.nan))
         tip_sigma.append(one.tip_sigma_px)
-    return StrobeCycles(
-        np.array([1e-9 * (one.t_ns - zero_ns) for one in messages]),
-        np.array(laser)[:, LASER_FINGERS],
-        np.array(sigma)[:, LASER_FINGERS],
-        np.array(tips)[:, LASER_FINGERS],
-        np.array(tip_sigma)[:, LASER_FINGERS],
-        1.0 / camera.frame_rate_hz,  # the frame with the LEDs follows that with the laser
+    t_s = np.array([1e-9 * (one.t_ns - zero_ns) for one in messages])
+    laser_m, sigma_m, uv, uv_sigma = (
+        np.array(part)[:, LASER_FINGERS] for part in (laser, sigma, tips, tip_sigma)
     )
+    late_s = 1.0 / camera.frame_rate_hz  # the frame with the LEDs follows that with the laser
+    return StrobeCycles(t_s, laser_m, sigma_m, uv, uv_sigma, late_s)
 
 
 def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
-    """Select the strobe cycles (T,) whose hand both sensors see.
-
-    At most 200.
-
-    Raises:
-        FitError: There are too few of them, or the IMU was silent.
-    """
+    """The strobe cycles (T,) whose hand both sensors see, at most 200; or refuse."""
     fewest, least_s = 60, 5.0
     if len(hand.t_s) < fewest or len(imu) < fewest:
         raise FitError(
@@ -278,8 +243,7 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
         )
     fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
     near = hand.nearest(seen.t_s)
-    markers = 4
-    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= markers
+    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= 4
     lines_of_sight = 2  # fingers with a laser point or a tip
     both = (fingers >= lines_of_sight) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
     both &= (seen.t_s > imu.t_s[0]) & (seen.t_s < imu.t_s[-1])
@@ -308,7 +272,6 @@ def _documented(
     sigma: dict[str, float],
     source: str,
 ) -> RigCalibration:
-    """The rig with what was measured, and where that comes from."""
     unknown = fit.unknown
     place = replace(
         old,
@@ -329,10 +292,7 @@ def _documented(
 
 
 def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
-    """Return the rotation R_rig_world (3, 3) of the IMU samples' own world.
-
-    Mean of its vertical, and the first heading.
-    """
+    """R_rig_world (3, 3) of the IMU samples' world: mean vertical, first heading."""
     orientations = imu.mended(fit.unknown.gyro).at(imu.t_s)
     rig_world = fit.unknown.R_rig_world @ orientations.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
     known = np.isfinite(rig_world[:, 0, 0])

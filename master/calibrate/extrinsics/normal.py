@@ -1,15 +1,8 @@
 """The normal equations of a mounting eliminate the hand of every epoch.
 
-Hand poses of all epochs: cost and normal equations, batched over epochs.
-
-Given markers and posture priors.
-
-The residuals are the markers' distances, whitened by their covariances; priors add a quadratic of the free angles.
-The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.kinematics` has it.
-
-Normal equations of a mounting.
-
-Unknowns that all epochs share, and the hand of each epoch, which is eliminated.
+The residuals of a hand are the markers' distances, whitened by their covariances; priors add a quadratic of
+the free angles. The Jacobian is closed form: rotation, shift and angles move a marker on the hand as
+`master.estimator.kinematics` has it. All is batched over the epochs T.
 """
 
 from dataclasses import dataclass, replace
@@ -27,19 +20,13 @@ from master.estimator.priors import PosturePrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hands:
-    """Hand poses of all epochs.
-
-    Palms (T, 4, 4), palm frame -> rig frame, and free angles (T, n) [rad].
-    """
+    """Hand poses of all epochs: T_rig_palm (T, 4, 4), free angles x (T, n) [rad]."""
 
     T_rig_palm: Float
     x: Float
 
     def retracted(self, step: Float) -> "Hands":
-        """Return the hands after the given steps.
-
-        Steps (T, 6 + n): rotation [rad] and shift [m], both in rig axes, and angles [rad].
-        """
+        """After steps (T, 6 + n): rotation [rad], shift [m], both rig axes; angles [rad]."""
         T = self.T_rig_palm.copy()
         T[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
         T[:, :3, 3] += step[:, 3:6]
@@ -48,10 +35,7 @@ class Hands:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Linearisation of the cost at a point.
-
-    Gradient (T, L) and Gauss-Newton normal matrix (T, L, L); L = 6 + n.
-    """
+    """The cost at a point: gradient (T, L), Gauss-Newton matrix (T, L, L); L = 6 + n."""
 
     gradient: Float
     normal: Float
@@ -59,21 +43,13 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandProblem:
-    """Constraints on the hands from markers and posture priors.
-
-    Attributes:
-        model: The hand.
-        markers: The M markers on it.
-        posture_prior: Those of one hypothesis.
-        points_m: (T, M, 3) [m] where markers were seen, rig frame.
-        whiten: (T, M, 3, 3) inverse square roots of their covariances [1/m]; 0: not seen.
-    """
+    """Constraints on the hands from markers and posture priors."""
 
     model: HandModel
-    markers: BodyPoints
-    posture_prior: PosturePrior
-    points_m: Float
-    whiten: Float
+    markers: BodyPoints  # the M markers on the hand
+    posture_prior: PosturePrior  # those of one hypothesis
+    points_m: Float  # (T, M, 3) [m] where markers were seen, rig frame
+    whiten: Float  # (T, M, 3, 3) inverse square roots of their covariances [1/m]; 0: not seen
 
     def place(self, hands: Hands) -> Float:
         """Where the markers (T, M, 3) [m] of hands are, rig frame."""
@@ -81,7 +57,7 @@ class HandProblem:
         return arm + hands.T_rig_palm[:, None, :3, 3]
 
     def cost(self, hands: Hands) -> Float:
-        """Return half the sum of squares (T,) of whitened distances and posture priors."""
+        """Half the sum of squares (T,) of whitened distances, and of posture priors."""
         arm = self._arm(hands, self.markers.place(self._chains(hands)))
         residual = self._residual(hands, arm)
         pushed = self._pushed(hands)
@@ -117,27 +93,17 @@ class HandProblem:
         return (self.whiten @ off[..., None]).reshape(len(off), -1)
 
     def _pushed(self, hands: Hands) -> Float:
-        """Return the posture priors' information times the free angles (T, n)."""
+        """The posture priors' information times the free angles (T, n)."""
         return (hands.x[:, None] @ self.posture_prior.normal)[:, 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations of the shared unknowns and of the hand in each epoch.
+    """Normal equations of the U = UNKNOWN shared unknowns and each epoch's L = 6 + n."""
 
-    Shared by all epochs: U = UNKNOWN; each hand: L = 6 + n.
-
-    Attributes:
-        own: (T, L, L) information of the hands.
-        mixed: (T, L, U).
-        own_pull: (T, L).
-        shared: (U, U).
-        shared_pull: (U,).
-    """
-
-    own: Float
+    own: Float  # this, mixed and shared: (T, L, L), (T, L, U) and (U, U) information
     mixed: Float
-    own_pull: Float
+    own_pull: Float  # this and shared_pull: (T, L) and (U,)
     shared: Float
     shared_pull: Float
 
@@ -188,15 +154,10 @@ class Normal:
         return replace(self, own=own, mixed=self.mixed * moves[..., None], own_pull=self.own_pull * moves)
 
     def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
-        """Eliminate the hands and return the reduced normal equations.
-
-        Information (U, U) and gradient (U,) without the hands, and what gives the hands' steps from the step of the
-        rest.
-        """
+        """Information (U, U) and gradient (U,) without the hands; and the hands' part."""
         own = self.own.copy()
         diagonal = np.einsum("tii->ti", own)
-        nothing = 1e-9  # information of what nothing constrains
-        diagonal[...] = (1.0 + damping) * diagonal + nothing
+        diagonal[...] = (1.0 + damping) * diagonal + 1e-9  # information of what nothing constrains
         by_shared = np.asarray(np.linalg.solve(own, self.mixed), np.float64)
         own_step = np.asarray(np.linalg.solve(own, self.own_pull[..., None])[..., 0], np.float64)
         information = self.shared + damping * np.diag(np.diag(self.shared))

@@ -1,15 +1,7 @@
 """The most probable mounting is the solution of one least-squares problem.
 
-Wrist angles: two anatomical ones, and a third that no wrist has.
-
-Also how they change with a rotation.
-
-Most probable mounting as one least-squares problem.
-
-Given what marker rig, wrist camera and IMU saw of one motion.
-
-Unknown in each epoch is the hand, palm and fingers, as markers and the widest priors have it (`hands`); all epochs
-share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
+Unknown in each epoch is the hand, palm and fingers, as markers and the widest priors have it
+(`normal.Hands`); all epochs share the mounting (`unknown.Unknown`). Four kinds of residuals:
 
 - **markers**, where they were at that epoch of the rig's clock;
 - **laser points and tips**, of the palm as it lies before the camera. Camera and IMU are one body, so that is
@@ -17,18 +9,14 @@ share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
       R_camera_palm = R_camera_imu (R_rig_world R_world_imu)' R_rig_palm
 
   however the wrist is bent, and its joint stays where it is;
-- **the wrist**, which bends and does not twist:
-  R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
-  (`common.hand.wrist`);
+- **the wrist**, which bends and does not twist: R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)'
+  R_rig_palm has two angles and no third (`common.hand.wrist`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
-The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
-Marquardt; outliers are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
-all epochs of a second together count as a few.
-
-Maximum a posteriori estimate of the mounting.
-
-First fits a part of the motion from several guesses, then all of it from the best one.
+The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of
+Levenberg and Marquardt; outliers are weighed down (Cauchy). Errors of skin and tips last as long as a bend
+does, so all epochs of a second together count as a few. A part of the motion is fitted from several guesses,
+then all of it from the best.
 """
 
 from collections.abc import Sequence
@@ -79,10 +67,7 @@ def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
 
 
 def bends_by_rotation(R_forearm_palm: Float) -> Float:
-    """Return the derivatives (T, 3, 3) of `wrist_rotation_angles`.
-
-    By a rotation of the palms (T, 3, 3), forearm axes.
-    """
+    """Derivatives (T, 3, 3) of `wrist_rotation_angles` by a rotation, forearm axes."""
     here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
         difference_step = 1e-5
@@ -109,7 +94,7 @@ class _Output:
 class Problem:
     """Residuals and steps of the mounting problem.
 
-    Holds the output of the tracks for the last estimate of the clocks.
+    State: the markers and orientations of the tracks at the last estimate of the clocks.
     """
 
     def __init__(
@@ -123,13 +108,8 @@ class Problem:
         px_per_m: float,
         first: Unknown,
     ) -> None:
-        self._lines_of_sight, self._hand, self._imu, self._cycles, self._first = (
-            lines_of_sight,
-            hand,
-            imu,
-            cycles,
-            first,
-        )
+        self._lines_of_sight, self._hand, self._imu = lines_of_sight, hand, imu
+        self._cycles, self._first = cycles, first
         model = replace(model, tolerance_rad=np.zeros((5, 4)))  # nothing here weighs what is beyond limits
         self._model, self._parameters = model, HandParameters.of(model)
         count = len(cycles.t_s)
@@ -146,13 +126,12 @@ class Problem:
         laser_m = np.hypot(np.nan_to_num(cycles.laser_sigma_m), surface_m)
         self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
         last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
-        per_s = 4.0  # independent epochs
-        self._share = min(per_s * (last_s - first_s) / count, 1.0)
+        self._share = min(4.0 * (last_s - first_s) / count, 1.0)  # independent epochs
         self._wrist_sigma = np.array([_WRIST_RAD, _WRIST_RAD, _TWIST_RAD])
         self._prior_sigma = prior_sigma()
 
     def followed(self, unknown: Unknown, rounds: Sequence[int]) -> tuple[Unknown, Hands, int]:
-        """From a guess downhill, round by round; and the steps taken."""
+        """Minimise from a guess, round by round; also the number of steps."""
         hands, steps = self.guessed(unknown), 0
         for most in rounds:
             self.update_observations(unknown, hands)
@@ -186,10 +165,8 @@ class Problem:
         self._observed = _Output(
             unknown,
             Markers(observed[0], observed[1], observed[2], markers.cov_m2),
-            ImuOrientations(
-                np.where(self._known[:, None, None], orientations.R_world_imu, _EYE),
-                orientations.rate_rad_s,
-                orientations.drift,
+            replace(
+                orientations, R_world_imu=np.where(self._known[:, None, None], orientations.R_world_imu, _EYE)
             ),
             self._tips_with_the_laser(unknown, hands),
         )
@@ -198,16 +175,12 @@ class Problem:
         self._data = np.where(self._known[:, None, None], data, np.nan)
 
     def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
-        """Return the tips (T, 4, 2) [px] at the time when the laser shone.
-
-        Moved back by how the hand moved meanwhile.
-        """
+        """Tips (T, 4, 2) [px] at the laser's time, moved back by the hand's own motion."""
         late_s, t_s = self._cycles.tip_late_s, self._cycles.t_s
         at = t_s + unknown.camera_late_s
         orientations = self._mended.at(at - unknown.imu_late_s)
-        R = self._camera_rig(
-            unknown, replace(orientations, R_world_imu=np.nan_to_num(orientations.R_world_imu))
-        )
+        known = replace(orientations, R_world_imu=np.nan_to_num(orientations.R_world_imu))
+        R = self._camera_rig(unknown, known)
         angles = self._parameters.angles(hands.x)
         seen = self._lines_of_sight(
             R @ hands.T_rig_palm[:, :3, :3], unknown.shift_m, angles, unknown.thick, unknown.reach_m
@@ -218,7 +191,7 @@ class Problem:
         return self._cycles.tip_uv - late_s * np.nan_to_num(speed)
 
     def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
-        """The least cost from a guess, and the steps taken."""
+        """The least cost from a guess, and the number of steps."""
         damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
         for _ in range(rounds):
             normal, gain = self.normal(unknown, hands), 0.0
@@ -238,25 +211,15 @@ class Problem:
         return unknown, hands, taken
 
     def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
-        """Return the fit with what is reported at the end."""
+        """The fit with its covariance and residuals."""
         covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
         shown, wrist_angles = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
-        here = self._here(unknown)
-        far = self._hands.place(hands) - here.points_m
+        far = self._hands.place(hands) - self._here(unknown).points_m
         seen = self._hands.whiten[..., 0, 0] > 0.0
         marker_m = float(np.sqrt((far[seen] ** 2).sum(axis=-1).mean()))
-        return Fit(
-            unknown,
-            covariance,
-            wrist_angles[:, :2],
-            wrist_angles[:, 2],
-            off,
-            self.sigma,
-            shown,
-            marker_m,
-            steps,
-        )
+        bends, twist = wrist_angles[:, :2], wrist_angles[:, 2]
+        return Fit(unknown, covariance, bends, twist, off, self.sigma, shown, marker_m, steps)
 
     def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
         after = hands.retracted(own)
@@ -294,10 +257,7 @@ class Problem:
         return unknown.R_forearm_imu @ palm
 
     def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
-        """Return the predicted observations and the angles of the wrist.
-
-        LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad].
-        """
+        """Predicted observations (T, 4, SEEN), and angles of the wrist (T, 3) [rad]."""
         orientations = self._orientations(unknown)
         R = self._camera_rig(unknown, orientations) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
@@ -305,9 +265,9 @@ class Problem:
         return seen, wrist_rotation_angles(self._wrists(unknown, hands, orientations))
 
     def _off(self, shown: Float) -> Float:
-        """Return fitted minus seen (T, 4, SEEN) in standard deviations.
+        """Fitted minus seen (T, 4, SEEN) in standard deviations; 0: not seen.
 
-        0 where not seen; a finger that the laser misses is far.
+        A finger that the laser misses is far.
         """
         off = (shown - self._data) / self.sigma
         missed = np.isnan(shown) & np.isfinite(self._data)
@@ -315,7 +275,7 @@ class Problem:
         return np.where(missed, farthest, np.nan_to_num(off))
 
     def cost(self, unknown: Unknown, hands: Hands) -> float:
-        """Return the sum of squares with outliers down-weighted."""
+        """Sum of squares with outliers down-weighted."""
         shown, wrist_angles = self._shown(unknown, hands)
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
@@ -328,24 +288,20 @@ class Problem:
         return float(self._share * (data + wrist + held) + (prior_residual**2).sum())
 
     def normal(self, unknown: Unknown, hands: Hands) -> Normal:
-        """Normal equations about a place."""
+        """Normal equations at a point."""
         orientations, here = self._orientations(unknown), self._here(unknown)
         problem = replace(self._hands, points_m=here.points_m)
         linear = problem.linearise(hands)
         out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
-        rows = (
-            self._line_of_sight_rows(unknown, hands, orientations),
-            self._wrist_rows(unknown, hands, orientations),
-        )
-        for residual, own, shared in rows:
-            out = out.and_rows(residual, own, shared)
+        out = out.and_rows(*self._line_of_sight_rows(unknown, hands, orientations))
+        out = out.and_rows(*self._wrist_rows(unknown, hands, orientations))
         out = out.shared_out(self._share, unknown.off(self._first), self._prior_sigma)
         return out.within(hands.x, self._parameters)
 
     def _line_of_sight_rows(
         self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
     ) -> tuple[Float, Float, Float]:
-        """Return the line-of-sight residuals (T, 16) and their derivatives.
+        """Line-of-sight residuals (T, 16) and their derivatives.
 
         By own unknowns (T, 16, 6 + n) and by shared unknowns (T, 16, UNKNOWN).
         """
@@ -397,14 +353,9 @@ class Problem:
     def _world_columns(
         self, shared: Float, by_imu: Float, unknown: Unknown, orientations: ImuOrientations
     ) -> None:
-        """Fill the derivatives by everything that rotates the IMU in the rig.
+        """Fill in derivatives by the IMU's world, its gyroscope's errors, and clocks.
 
-        Its world, the errors of its gyroscope, and clocks.
-
-        Args:
-            shared: (T, R, UNKNOWN) which is changed.
-            by_imu: (T, R, 3) derivatives by a turn of the IMU, rig axes.
-            unknown, orientations: Where.
+        Into `shared` (T, R, UNKNOWN), from `by_imu` (T, R, 3) by a rotation of the IMU, rig axes.
         """
         shared[..., RIG_WORLD] = by_imu
         by_gyro = -by_imu @ (unknown.R_rig_world @ orientations.drift)
@@ -415,7 +366,7 @@ class Problem:
 
 
 def _loosest(posture_prior: PosturePrior) -> PosturePrior:
-    """Those of the free hand, the last hypothesis, with a share of their information."""
+    """Priors of the free hand, the last hypothesis, with a part of the information."""
     prior_share = 1e-2  # of their information: what sensors measure is to count
     normal, pull, constant = (
         prior_share * part[-1:] for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant)
@@ -423,7 +374,7 @@ def _loosest(posture_prior: PosturePrior) -> PosturePrior:
     return PosturePrior(normal, pull, constant, posture_prior.log_density[-1:])
 
 
-_COARSE_ROUNDS = (4, 4, 4)  # epochs and steps of a first look
+_COARSE_ROUNDS = (4, 4, 4)  # steps of a first look
 _ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
 
 
@@ -437,18 +388,11 @@ def fit_extrinsics(
     px_per_m: float,
     firsts: Sequence[Unknown],
 ) -> Fit:
-    """Fit the mounting.
+    """Fit the mounting to tracks of hand and IMU and to strobe cycles.
 
-    Args:
-        sights: Forward function of the device.
-        model: The hand.
-        names: Of the markers, in the order of the track's.
-        hand, imu: What was seen of the hand, and felt.
-        cycles: What was seen from the wrist.
-        px_per_m: What a metre at the tips is in the image.
-        firsts: First guesses, of which one is right to some 15 degrees, 15 mm and 20 ms.
+    `names` are the track's markers, in order; `px_per_m` is what a metre at the tips is in the image. Of the
+    first guesses `firsts` one is right to some 15 degrees, 15 mm and 20 ms.
     """
-    # epochs and steps of a first look
     some = np.unique(np.linspace(0, len(cycles.t_s) - 1, 40).astype(np.int64))
     coarse = cycles.of(some)
     best: tuple[float, Unknown] | None = None

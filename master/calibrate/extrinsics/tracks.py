@@ -1,20 +1,13 @@
 """The measurement model predicts tracks of rig and IMU, and lines of sight.
 
-Tracks of marker rig and IMU, interpolated at any time.
+Cameras, IMU and marker rig have no epochs in common, and the difference of their clocks is unknown. So
+markers and orientations are queried at times that shift while the fit goes on: each answer comes with its
+derivatives.
 
-The hand's markers with how they move, and the IMU's rotation with its rate.
-
-Cameras, IMU and marker rig have no epochs in common, and by how much their clocks differ is to be found. So markers
-and orientations are queried at times that shift while the fit goes on: each answer comes with its derivatives.
-
-Measurement model of a wrist device: laser points and tips of four fingers.
-
-Also their derivatives by the unknowns.
-
-The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_intersection`,
-`common.hand.model`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
-numbers of each finger are unknown, which a mounting must not take for its own: how thick its skin is, and where on the
-pulp its tip is seen.
+Laser points and tips of four fingers are those that the master solves fingers with
+(`master.calibrate.laser_intersection`, `common.hand.model`), so that what is fitted is what will be used.
+Beside palm pose and angles two numbers of each finger are unknown, which a mounting must not absorb: how
+thick its skin is, and where on the pulp its tip is seen.
 """
 
 from collections.abc import Sequence
@@ -42,18 +35,12 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """Markers at times (T).
+    """Markers at times (T)."""
 
-    Attributes:
-        points_m: (T, M, 3) cap centroids, rig frame; NaN: not seen, or a gap nearby.
-        speed_m_s, acceleration_m_s2: (T, M, 3) first and second derivative.
-        cov_m2: (T, M, 3, 3).
-    """
-
-    points_m: Float
-    speed_m_s: Float
+    points_m: Float  # (T, M, 3) cap centroids, rig frame; NaN: not seen, or a gap nearby
+    speed_m_s: Float  # this and acceleration_m_s2: (T, M, 3) first and second derivative
     acceleration_m_s2: Float
-    cov_m2: Float
+    cov_m2: Float  # (T, M, 3, 3)
 
     @property
     def seen(self) -> Bool:
@@ -63,27 +50,17 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandTrack:
-    """Track of the hand as the marker rig alone saw it (N epochs).
+    """Track of the hand as the marker rig alone saw it (N epochs)."""
 
-    Attributes:
-        t_s: (N,) [s], rising.
-        points_m, cov_m2: (N, M, 3), (N, M, 3, 3) markers as measured, rig frame.
-        T_rig_palm: (N, 4, 4).
-        angles_rad: (N, 5, 4).
-    """
-
-    t_s: Float
-    points_m: Float
+    t_s: Float  # (N,) [s], rising
+    points_m: Float  # this and cov_m2: (N, M, 3), (N, M, 3, 3) markers as measured, rig frame
     cov_m2: Float
-    T_rig_palm: Float
-    angles_rad: Float
+    T_rig_palm: Float  # (N, 4, 4)
+    angles_rad: Float  # (N, 5, 4)
 
     @classmethod
     def of(cls, poses: Sequence[HandPose], model: HandModel, zero_ns: int) -> "HandTrack":
-        """Build the track from the valid poses of the markers' pipeline.
-
-        Times count from `zero_ns`.
-        """
+        """The track of the valid poses of the markers' pipeline; times from `zero_ns`."""
         known = [pose for pose in poses if pose.valid[WRIST] and np.isfinite(pose.angles_rad).all()]
         cov = np.array([pose.markers_cov_m2 for pose in known])
         poor_m = 0.03  # a cap of which so little is seen that its place is off by as much as this
@@ -103,17 +80,15 @@ class HandTrack:
         )
 
     def nearest(self, t_s: Float) -> Int:
-        """Return the indices (T,) of the epochs nearest to times (T,) [s]."""
+        """Indices (T,) of the epochs nearest to times (T,) [s]."""
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         return after - (t_s - self.t_s[after - 1] < self.t_s[after] - t_s)
 
     def markers(self, t_s: Float) -> Markers:
-        """Interpolate the markers at times (T,) [s].
+        """The markers at times (T,) [s], by a cubic through what was seen within 80 ms.
 
-        By a cubic through what was seen within 80 ms of each time.
-
-        One through four neighbours would pass on their noise to the speed, and both to the clock's error: cycles are
-        often taken at the same share of the time between two frames.
+        One through four neighbours would pass on their noise to the speed, and both to the clock's error:
+        cycles are often taken at the same share of the time between two frames.
         """
         near = self.nearest(t_s)
         support = 10  # frames to either side
@@ -123,9 +98,8 @@ class HandTrack:
         points, cov = self.points_m[rows], self.cov_m2[rows]  # (T, K, M, 3), (T, K, M, 3, 3)
         within = (np.abs(off) < 1.0) & np.diff(rows, axis=1, prepend=-1).astype(np.bool_)
         seen = within[..., None] & np.isfinite(points[..., 0]) & np.isfinite(cov[..., 0, 0])
-        weight = np.where(
-            seen, 1.0 / np.einsum("tkmii->tkm", np.where(seen[..., None, None], cov, _EYE)), 0.0
-        )
+        variance = np.einsum("tkmii->tkm", np.where(seen[..., None, None], cov, _EYE))
+        weight = np.where(seen, 1.0 / variance, 0.0)
         terms, neighbours = 4, 2  # of a cubic; frames to each side that it needs
         power = off[..., None] ** np.arange(terms)
         normal = np.einsum("tkm,tki,tkj->tmij", weight, power, power)
@@ -141,17 +115,11 @@ class HandTrack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuOrientations:
-    """Orientations of the IMU at times (T), in a world of its own.
+    """Orientations of the IMU at times (T), in a world of its own."""
 
-    Attributes:
-        R_world_imu: (T, 3, 3); NaN: no sample nearby.
-        rate_rad_s: (T, 3) IMU axes.
-        drift: (T, 3, 12) by how much too far it has turned since the middle, world axes, by errors of the gyroscope.
-    """
-
-    R_world_imu: Float
-    rate_rad_s: Float
-    drift: Float
+    R_world_imu: Float  # (T, 3, 3); NaN: no sample nearby
+    rate_rad_s: Float  # (T, 3) IMU axes
+    drift: Float  # (T, 3, 12) error of its rotation since the middle, world axes, by errors of the gyroscope
 
     @property
     def known(self) -> Bool:
@@ -160,23 +128,17 @@ class ImuOrientations:
 
 
 class ImuTrack:
-    """How one IMU turned (S samples): its rates summed up. Fixed by the constructor.
+    """Rotation of one IMU (S samples): its rates integrated. Fixed once constructed.
 
-    The orientation that comes with the samples leans by some degrees whenever the arm is accelerated, since gravity
-    holds it; for ten seconds rates alone are better, once their errors are known. The two worlds agree in the middle.
-    Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row: what it reads is too much by
-    zero + gain @ what it reads.
-
-    Attributes:
-        t_s: (S,) [s], by its stamps.
-        gap_s: The longest time between two samples.
+    The orientation that comes with the samples leans by some degrees whenever the arm is accelerated, since
+    gravity holds it; for ten seconds rates alone are better, once their errors are known. The two worlds
+    agree in the middle. Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row:
+    what it reads is too much by zero + gain @ what it reads. `t_s` (S,) are the stamps [s], `gap_s` the
+    longest time between two samples.
     """
 
     def __init__(self, samples: Sequence[ImuSample], zero_ns: int) -> None:
-        """Keep the samples, given in order, that have rates and an orientation.
-
-        Times count from `zero_ns`.
-        """
+        """Keep the samples with rates and an orientation; times count from `zero_ns`."""
         valid = [one for one in samples if np.isfinite([*one.orientation_wxyz, *one.gyro_rad_s]).all()]
         times = np.array([1e-9 * (one.t_ns - zero_ns) for one in valid])
         rising = np.diff(times, prepend=-np.inf) > 0.0
@@ -199,7 +161,7 @@ class ImuTrack:
         return out
 
     def _sum_up(self) -> None:
-        """Orientations by rates alone, and what errors of the rates make of them.
+        """Orientations by rates alone, and their derivatives by errors of the rates.
 
         A rate is the mean over the time that ends at its stamp.
         """
@@ -217,35 +179,26 @@ class ImuTrack:
         self._drift = drift - drift[middle]
 
     def __len__(self) -> int:
-        """How many samples there are."""
         return len(self.t_s)
 
     def at(self, t_s: Float) -> ImuOrientations:
-        """The IMU at times (T,) [s] by its stamps, by its rates."""
+        """The IMU at times (T,) [s] of its stamps, by its rates."""
         after, share, known = self._between(t_s)
-        R = self._integrated[after - 1] @ _share_of_arc(
-            self._integrated[after - 1], self._integrated[after], share
-        )
-        rate = self._rate[after]
+        before = self._integrated[after - 1]
+        R = before @ _share_of_arc(before, self._integrated[after], share)
         drift = (1.0 - share)[..., None] * self._drift[after - 1] + share[..., None] * self._drift[after]
         R[~known] = np.nan
-        return ImuOrientations(R, rate, drift)
+        return ImuOrientations(R, self._rate[after], drift)
 
     def held_at(self, t_s: Float) -> Float:
-        """Return the orientations that the samples themselves report.
-
-        (T, 3, 3) IMU axes -> a world whose z axis is up; NaN: none nearby.
-        """
+        """The samples' own orientations (T, 3, 3), IMU -> z-up world; NaN: none nearby."""
         after, share, known = self._between(t_s)
         R = self._held[after - 1] @ _share_of_arc(self._held[after - 1], self._held[after], share)
         R[~known] = np.nan
         return R
 
     def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
-        """Find the samples around each time.
-
-        Returns the sample after each time, the share (T, 1) of the way to it, and whether both are near (T,).
-        """
+        """The sample after each time, the share (T, 1) up to it, whether both are near."""
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         start, stop = self.t_s[after - 1], self.t_s[after]
         known = (t_s >= start) & (t_s <= stop) & (stop - start <= GAP_S)
@@ -253,10 +206,7 @@ class ImuTrack:
 
 
 def _share_of_arc(first: Float, second: Float, share: Float) -> Float:
-    """Interpolate rotations (T, 3, 3) by a share (T, 1) of the way.
-
-    From the first towards the second, in axes of the first.
-    """
+    """Part (T, 1) of the rotation from the first to the second, in the first's axes."""
     return rotation_vector_to_matrix(share * matrix_to_rotation_vector(np.swapaxes(first, 1, 2) @ second))
 
 
@@ -267,23 +217,11 @@ _STEPS = np.repeat([_ROTATION_STEP, _SHIFT_M, _ROTATION_STEP, _THICK], (3, 3, 4,
 
 
 class LinesOfSight:
-    """Measurement model for one device and one hand.
-
-    Its state was prepared by the constructor.
-    """
+    """Measurement model for one device and one hand."""
 
     def __init__(self, setup: WristSetup) -> None:
-        self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        rays = 16
-        self._intersection, self._tips = LaserIntersection(setup, rays), Fingertips.of(setup.model)
-
-    def flat(self, point_m: Float) -> Float:
-        """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""
-        return self._axes.flat(point_m)
-
-    def flat_cov(self, cov_m2: Float) -> Float:
-        """Covariances (..., 2, 2) of covariances (..., 3, 3)."""
-        return self._axes.flat_cov(cov_m2)
+        self._setup, self._surface, self.axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
+        self._intersection, self._tips = LaserIntersection(setup, rays=16), Fingertips.of(setup.model)
 
     def __call__(self, R: Float, shift_m: Float, angles: Float, thick: Float, reach_m: Float) -> Float:
         """What is seen (T, 4, SEEN); NaN where the laser misses.
@@ -301,11 +239,10 @@ class LinesOfSight:
     def derivatives(
         self, R: Float, shift_m: Float, angles: Float, thick: Float, reach_m: Float
     ) -> tuple[Float, Float]:
-        """What is seen, and by what it moves.
+        """What is seen (T, 4, SEEN), and its derivatives (T, 4, SEEN, 12); 0: not known.
 
-        Returns:
-            (T, 4, SEEN), and derivatives (T, 4, SEEN, 12): by a turn of the palm (3, camera axes, about the wrist
-            joint), its shift (3), the finger's own four angles, its thickness and reach; 0 where not known.
+        By rotation (3, camera axes, about the wrist joint) and shift (3) of the palm, the finger's own four
+        angles, its thickness and reach.
         """
         surface, radius, _ = local = self._local(angles, thick, reach_m)
         all_of = [self._placed_at(R, shift_m, *local)]
@@ -321,28 +258,21 @@ class LinesOfSight:
         seen = self._seen(all_of)
         out = np.zeros((*seen.shape[1:], len(_STEPS) + 1))
         out[..., :-1] = np.moveaxis(seen[1:] - seen[0], 0, -1) / _STEPS
-        farther = self._placed_at(
-            R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2]
-        )
-        out[..., 2:, -1] = (self._setup.optics.project(farther[2]) - seen[0][..., 2:]) / _SHIFT_M
+        beyond = self._local(angles, thick, reach_m + _SHIFT_M)[2]
+        farther = self._setup.optics.project(self._placed_at(R, shift_m, surface, radius, beyond)[2])
+        out[..., 2:, -1] = (farther - seen[0][..., 2:]) / _SHIFT_M
         return seen[0], np.nan_to_num(out)
 
     def _local(self, angles: Float, thick: Float, reach_m: Float) -> tuple[Float, Float, Float]:
-        """Return the finger surface spheres and the tips in the palm frame.
-
-        Spheres (T, 4, K, 3) [m], their radii (4, K), and tips (T, 4, 3) [m].
-        """
+        """Spheres (T, 4, K, 3), radii (4, K) and tips (T, 4, 3) [m] in the palm frame."""
         chains = self._setup.model.chains(angles)
         factor = np.ones((5, 1))
         factor[FINGERS, 0] = np.exp(thick)
         surface = PalmarSurface(factor * self._surface.palmar_m, factor * self._surface.radius_m)
         beyond = self._tips.beyond_m.copy()
         beyond[FINGERS] += reach_m
-        return (
-            surface.spheres(chains)[:, FINGERS],
-            surface.radius_m[FINGERS],
-            replace(self._tips, beyond_m=beyond).points(chains)[:, FINGERS],
-        )
+        tips = replace(self._tips, beyond_m=beyond).points(chains)[:, FINGERS]
+        return surface.spheres(chains)[:, FINGERS], surface.radius_m[FINGERS], tips
 
     @staticmethod
     def _placed_at(R: Float, shift_m: Float, spheres: Float, radius: Float, tips: Float) -> tuple[Float, ...]:

@@ -1,24 +1,19 @@
 """The unknowns of a mounting have a prior, observations and a first guess.
 
-Unknowns of a mounting: a point on a manifold, steps on it, and its prior.
+The first guess is right to some degrees and ms:
 
-Observations of a motion from the wrist, and the mounting fitted to them.
-
-Initial guess of a mounting: how the IMU lies, and the clock offsets.
-
-To some degrees and ms.
-
-**Turns.** With a wrist that is about straight the palm's turn is R_rig_palm = R_rig_world R_world_imu R_imu_palm with
-two constant turns. In quaternions the sum of the cosines of half of what is left is bilinear in the two,
+**Rotations.** With a wrist that is about straight the palm's rotation is R_rig_palm = R_rig_world R_world_imu
+R_imu_palm with two constant rotations. In quaternions the sum of the cosines of half of the residual is
+bilinear in the two,
 
     sum_t <q_rig_palm, q_rig_world q_world_imu q_imu_palm> = q_rig_world' M q_imu_palm,
 
-so the first singular vectors of M (4, 4) are the turns, and its singular value is how well the two tracks agree: it
-is greatest where the IMU's clock is right.
+so the first singular vectors of M (4, 4) are the rotations, and its singular value is how well the two tracks
+agree: it is greatest where the IMU's clock is right.
 
-**Tips.** Camera and IMU are one body, which is carried by the wrist joint. So where the camera should see a marker on a
-fingertip is given by markers and IMU, however the wrist is bent and fingers are. The camera's clock is right where the
-tips that it sees move as these do.
+**Tips.** Camera and IMU are one body, which is carried by the wrist joint. So where the camera should see a
+marker on a fingertip is given by markers and IMU, however wrist and fingers are bent. The camera's clock is
+right where the tips that it sees move as these do.
 """
 
 from dataclasses import dataclass, replace
@@ -42,34 +37,25 @@ UNKNOWN = 34
 CAMERA_IMU, SHIFT, FOREARM_IMU, RIG_WORLD, ZERO = (slice(3 * k, 3 * k + 3) for k in range(5))
 CAMERA_LATE, IMU_LATE = 15, 16
 THICK, REACH, GAIN = slice(17, 21), slice(21, 25), slice(25, 34)
-_ZERO_RAD_S = np.radians(2.5)  # of the zero of a gyroscope when it is switched on (`common.imu_doubt`)
+_ZERO_RAD_S = np.radians(2.5)  # of the zero of a gyroscope when it is switched on (`common.imu.fusion`)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknown:
     """Unknowns that all epochs share.
 
-    Camera and IMU are one body, so their turn against each other is fixed by every motion; how both are turned against
-    the palm of a straight wrist, by what the wrist does.
-
-    Attributes:
-        R_camera_imu: (3, 3) IMU axes -> camera axes.
-        shift_m: (3,) the wrist joint in the camera's frame.
-        R_forearm_imu: (3, 3) IMU axes -> forearm, which is the palm of a straight wrist.
-        R_rig_world: (3, 3) the world of the IMU's track -> rig.
-        gyro: (12,) errors of its gyroscope, as of `tracks.ImuTrack`.
-        camera_late_s, imu_late_s: How much later frames, samples are than their stamps state.
-        thick, reach_m: (4,) of the fingers, as of `lines_of_sight.LinesOfSight`.
+    Camera and IMU are one body, so their relative rotation is fixed by every motion; how both are rotated
+    against the palm of a straight wrist, by what the wrist does.
     """
 
-    R_camera_imu: Float
-    shift_m: Float
-    R_forearm_imu: Float
-    R_rig_world: Float
-    gyro: Float
-    camera_late_s: float
+    R_camera_imu: Float  # (3, 3) IMU axes -> camera axes
+    shift_m: Float  # (3,) the wrist joint in the camera's frame
+    R_forearm_imu: Float  # (3, 3) IMU axes -> forearm, which is the palm of a straight wrist
+    R_rig_world: Float  # (3, 3) the world of the IMU's track -> rig
+    gyro: Float  # (12,) errors of its gyroscope, as of `tracks.ImuTrack`
+    camera_late_s: float  # this and imu_late_s: how much later frames, samples are than their stamps state
     imu_late_s: float
-    thick: Float
+    thick: Float  # this and reach_m: (4,) of the fingers, as of `tracks.LinesOfSight`
     reach_m: Float
 
     @property
@@ -78,7 +64,7 @@ class Unknown:
         return rigid(self.R_camera_imu @ self.R_forearm_imu.T, self.shift_m)
 
     def retracted(self, step: Float) -> Self:
-        """After a step (UNKNOWN,); turns in front: by axes of camera, forearm and rig."""
+        """After a step (UNKNOWN,); rotations in front: by axes of camera, forearm, rig."""
         return type(self)(
             rotation_vector_to_matrix(step[CAMERA_IMU]) @ self.R_camera_imu,
             self.shift_m + step[SHIFT],
@@ -92,10 +78,7 @@ class Unknown:
         )
 
     def off(self, first: Self) -> Float:
-        """Return the deviation (UNKNOWN,) from the prior.
-
-        Rotations, which have no prior, are 0.
-        """
+        """Deviation (UNKNOWN,) from the prior; 0 for rotations, which have none."""
         out = np.zeros(UNKNOWN)
         out[SHIFT], out[ZERO], out[GAIN] = self.shift_m - first.shift_m, self.gyro[:3], self.gyro[3:]
         out[CAMERA_LATE] = self.camera_late_s - first.camera_late_s
@@ -105,7 +88,7 @@ class Unknown:
 
 
 def prior_sigma() -> Float:
-    """Return the prior standard deviations (UNKNOWN,)."""
+    """Prior standard deviations (UNKNOWN,)."""
     any_rad, any_m, any_s = 1.0, 0.03, 0.1  # standard deviations of what nothing is known of
     sigma = np.full(UNKNOWN, any_rad)
     sigma[SHIFT], sigma[ZERO], sigma[[CAMERA_LATE, IMU_LATE]] = any_m, _ZERO_RAD_S, any_s
@@ -120,71 +103,45 @@ OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is down-we
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrobeCycles:
-    """Observations of the device over T strobe cycles.
+    """Observations of T strobe cycles, fingers index ... little; NaN: not seen."""
 
-    Fingers index ... little; NaN: not seen.
-
-    Attributes:
-        t_s: (T,) stamps [s], rising.
-        laser_m, laser_sigma_m: (T, 4, 2) on the plane, across and along, and standard deviations of the sensing.
-        tip_uv: (T, 4, 2) [px], seen `tip_late_s` later than the laser.
-        tip_sigma_px: (T, 4).
-        tip_late_s: Of the frame that shows the tips.
-    """
-
-    t_s: Float
+    t_s: Float  # (T,) stamps [s], rising
+    # this and laser_sigma_m: (T, 4, 2) on the plane, across and along, and standard deviations of the sensing
     laser_m: Float
     laser_sigma_m: Float
-    tip_uv: Float
-    tip_sigma_px: Float
+    tip_uv: Float  # (T, 4, 2) [px], seen `tip_late_s` later than the laser
+    tip_sigma_px: Float  # (T, 4)
     tip_late_s: float
 
     def of(self, rows: Int | Bool) -> "StrobeCycles":
         """Some of them."""
-        return StrobeCycles(
-            self.t_s[rows],
-            self.laser_m[rows],
-            self.laser_sigma_m[rows],
-            self.tip_uv[rows],
-            self.tip_sigma_px[rows],
-            self.tip_late_s,
-        )
+        seen = self.laser_m, self.laser_sigma_m, self.tip_uv, self.tip_sigma_px
+        laser_m, sigma_m, uv, uv_sigma = (part[rows] for part in seen)
+        return StrobeCycles(self.t_s[rows], laser_m, sigma_m, uv, uv_sigma, self.tip_late_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The most probable mounting.
-
-    Attributes:
-        unknown: It.
-        covariance: (UNKNOWN, UNKNOWN) of steps on it.
-        wrist_angles_rad: (T, 2) flexion and deviation of the wrist in each strobe cycle.
-        twist_rad: (T,) what no wrist does.
-        off: (T, 4, SEEN) seen minus fitted, in standard deviations; NaN: not seen.
-        sigma: (T, 4, SEEN) these [m, px].
-        shown: (T, 4, SEEN) as fitted.
-        marker_m: Rms of what is left at the markers.
-        steps: SensorMessage.
-    """
+    """The most probable mounting."""
 
     unknown: Unknown
-    covariance: Float
-    wrist_angles_rad: Float
-    twist_rad: Float
-    off: Float
-    sigma: Float
-    shown: Float
-    marker_m: float
-    steps: int
+    covariance: Float  # (UNKNOWN, UNKNOWN) of steps on `unknown`
+    wrist_angles_rad: Float  # (T, 2) flexion and deviation of the wrist in each strobe cycle
+    twist_rad: Float  # (T,) what no wrist does
+    off: Float  # (T, 4, SEEN) seen minus fitted, in standard deviations; NaN: not seen
+    sigma: Float  # (T, 4, SEEN) these [m, px]
+    shown: Float  # (T, 4, SEEN) as fitted
+    marker_m: float  # rms residual of the markers
+    steps: int  # steps taken
 
     @property
     def rms(self) -> float:
-        """Return the root mean square of `off`, with outliers clipped at their limit."""
+        """Root mean square of `off`, with outliers clipped at their limit."""
         return float(np.sqrt(np.nanmean(np.minimum(np.abs(self.off), 2.0 * OUTLIER_SIGMAS) ** 2)))
 
     @property
     def outlier_share(self) -> float:
-        """Share of the sights that are farther off than noise explains."""
+        """Share of the observations that are farther off than noise explains."""
         pairs = np.hypot(self.off[..., 0::2], self.off[..., 1::2])
         return float((pairs > 2.0 * OUTLIER_SIGMAS).sum() / max(np.isfinite(pairs).sum(), 1))
 
@@ -195,34 +152,20 @@ _FEWEST = 20  # epochs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """A first guess.
+    """A first guess."""
 
-    Attributes:
-        T_camera_palm: (4, 4) of the rig file.
-        R_palm_imu, R_rig_world: (3, 3).
-        imu_late_s, camera_late_s: How much later the samples, the frames are than their stamps state.
-    """
-
-    T_camera_palm: Float
-    R_palm_imu: Float
+    T_camera_palm: Float  # (4, 4) of the rig file
+    R_palm_imu: Float  # this and R_rig_world: (3, 3)
     R_rig_world: Float
-    imu_late_s: float
+    imu_late_s: float  # this and camera_late_s: how much later samples, frames are than their stamps state
     camera_late_s: float
 
     @property
     def unknown(self) -> Unknown:
-        """As what is to be fitted."""
-        return Unknown(
-            self.T_camera_palm[:3, :3] @ self.R_palm_imu,
-            self.T_camera_palm[:3, 3],
-            self.R_palm_imu,
-            self.R_rig_world,
-            np.zeros(12),
-            self.camera_late_s,
-            self.imu_late_s,
-            np.zeros(4),
-            np.zeros(4),
-        )
+        """As unknowns to be fitted."""
+        T, R, none = self.T_camera_palm, self.R_palm_imu, np.zeros(4)
+        late_s = self.camera_late_s, self.imu_late_s
+        return Unknown(T[:3, :3] @ R, T[:3, 3], R, self.R_rig_world, np.zeros(12), *late_s, none, none)
 
 
 def started(
@@ -235,12 +178,8 @@ def started(
 ) -> Start | None:
     """The first guess; None: hand and IMU were hardly seen at the same time.
 
-    Args:
-        hand, imu: What was seen of the hand, and felt.
-        tips_m: (N, 4, 3) the markers on index ... little of the hand's epochs, rig frame; NaN: not seen.
-        optics: The wrist camera.
-        T_camera_palm: (4, 4) first guess of the rig file.
-        cycles: What was seen from the wrist.
+    `tips_m` (N, 4, 3) are the markers on index ... little of the hand's epochs, rig frame, NaN: not seen;
+    T_camera_palm (4, 4) is the rig file's guess.
     """
     best: tuple[float, float, Float, Float] | None = None
     for late_s in _SEARCH_S.tolist():
@@ -254,10 +193,7 @@ def started(
 
 
 def _aligned(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
-    """Align the hand's and the IMU's orientations for a given latency of the samples.
-
-    Returns how well the tracks agree (1: exactly), R_rig_world and R_imu_palm.
-    """
+    """Agreement of the tracks (1: exact), R_rig_world and R_imu_palm, for a latency."""
     held = imu.held_at(hand.t_s - late_s)
     known = np.isfinite(held[:, 0, 0])
     if known.sum() < _FEWEST:
@@ -275,7 +211,7 @@ def _aligned(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Floa
 def _camera_late_s(
     hand: HandTrack, tips_m: Float, imu: ImuTrack, optics: CameraModel, first: "Start", cycles: StrobeCycles
 ) -> float:
-    """By the correlation of tips that are seen with where markers on them should be."""
+    """Latency at which tips move as the markers on them should."""
     held = imu.held_at(hand.t_s - first.imu_late_s)
     R_camera_imu = first.T_camera_palm[:3, :3] @ first.R_palm_imu
     R = R_camera_imu @ np.swapaxes(first.R_rig_world @ held, 1, 2)  # camera by rig

@@ -1,6 +1,6 @@
 """`phalanx calibrate hand`: makes a hand file.
 
-From its length alone, or from the guided routine.
+From its length alone, from the guided routine, or from a motion capture.
 """
 
 import sys
@@ -25,29 +25,17 @@ from master.calibrate.hand.measure import (
     report_lines,
 )
 from master.calibrate.hand.observed import read_observed
-from master.calibrate.hand.session import observe_live
-from master.calibrate.tree_files import load_marker_rig, write_hand
-from master.commands.summary import write_summary
+from master.calibrate.hand.session import draw_hand, observe_live
+from master.calibrate.tree_files import load_marker_rig, print_lines, write_hand, write_report
 
 
 def hand_command(options: Namespace) -> None:
-    """Make a hand file.
-
-    From the hand's length, measured by a guided routine of 20 s, or from motion capture.
-    """
+    """Make a hand file of a length, a guided routine of 20 s, or a motion capture."""
     if options.steps:
-        for line in step_lines():
-            echo(line)
+        print_lines(step_lines())
         return
     if options.source is not None:
-        _check_alone(
-            poses=options.poses,
-            live=options.live,
-            length_mm=options.length_mm,
-            hand=options.base,
-            dip_per_pip=options.dip_per_pip,
-            picture=options.picture,
-        )
+        _check_alone(options)
         from master.calibrate.hand.motion import hand_from_motion, motion_json, motion_lines
         from master.mocap.read import Reading, read_motion
 
@@ -55,8 +43,7 @@ def hand_command(options: Namespace) -> None:
             read_motion(options.source, Reading(options.joints, options.unit, options.side, options.rate)),
             options.name,
         )
-        for line in motion_lines(made):
-            echo(line)
+        print_lines(motion_lines(made))
         _finish(options.out, made.profile, motion_json(made), options.json_file)
         return
     if options.joints is not None or options.unit is not None or options.rate is not None:
@@ -83,13 +70,10 @@ def hand_command(options: Namespace) -> None:
         ratio = None if options.dip_per_pip is None else (options.dip_per_pip, ratio_sd)
         length_m = None if options.length_mm is None else 1e-3 * options.length_mm
         found = measure_hand(observed, template, length_m, ratio, _progress)
-        for line in report_lines(found):
-            echo(line)
+        print_lines(report_lines(found))
         data = "live" if options.poses is None else options.poses.name
         profile, report = measured_profile(found, options.name, data, options.dip_per_pip), report_json(found)
         if options.picture is not None:
-            from master.calibrate.hand.session import draw_hand
-
             draw_hand(options.picture, found)
     _finish(options.out, profile, report, options.json_file)
 
@@ -99,14 +83,14 @@ def _finish(
 ) -> None:
     written = None if out is None else write_hand(out, profile)
     echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
-    if json_file is not None:
-        write_summary(json_file, report | {"written": None if written is None else str(written)})
+    write_report(json_file, report, written)
 
 
-def _check_alone(**others: object) -> None:
+def _check_alone(options: Namespace) -> None:
     """Refuse options of the other ways to make a hand."""
-    for name, value in others.items():
-        if value is not None and value is not False:
+    given = vars(options) | {"hand": options.base}
+    for name in ("poses", "live", "length_mm", "hand", "dip_per_pip", "picture"):
+        if given[name] is not None and given[name] is not False:
             raise CalibrationError(f"--{name.replace('_', '-')} has no meaning with --from: leave it out")
 
 
@@ -133,7 +117,7 @@ def step_lines() -> list[str]:
 
 
 def template_of(base: Path | None, side: str, name: str) -> HandProfile:
-    """Return the hand profile that a measurement begins with.
+    """The hand profile that a measurement begins with.
 
     A file, mirrored if it is of the other hand, or the generated profile.
 

@@ -1,11 +1,9 @@
 """Least squares over smooth curves and a few constants.
 
-Cubic B-splines in time, normal equations with a border.
-
-All angles and the palm's pose are uniform cubic B-splines (trajectory estimation in continuous time: Furgale, Barfoot
-& Sibley, ICRA 2012), so frames need no common rate and no averaging. The normal matrix is a band of blocks for the
-coefficients with a border for the constants; the band is eliminated block by block (Cholesky), and the Schur
-complement that is left is the information about the constants alone.
+All angles and the palm's pose are uniform cubic B-splines (trajectory estimation in continuous time: Furgale,
+Barfoot & Sibley, ICRA 2012), so frames need no common rate and no averaging. The normal matrix is a band of
+blocks for the coefficients with a border for the constants; the band is eliminated block by block (Cholesky),
+and the Schur complement that is left is the information about the constants alone.
 """
 
 from dataclasses import dataclass
@@ -20,23 +18,16 @@ _WIDTH = 4  # coefficients that one epoch depends on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knots:
-    """Uniform cubic B-splines over T epochs.
+    """Uniform cubic B-splines over T epochs."""
 
-    Attributes:
-        spacing_s: Between coefficients [s].
-        time_s: (K,) middle of each coefficient's bump [s].
-        first: (T,) first of the four coefficients of each epoch.
-        weight: (T, 4) theirs; they add up to one.
-    """
-
-    spacing_s: float
-    time_s: Float
-    first: Int
-    weight: Float
+    spacing_s: float  # between coefficients [s]
+    time_s: Float  # (K,) middle of each coefficient's bump [s]
+    first: Int  # (T,) first of the four coefficients of each epoch
+    weight: Float  # (T, 4) theirs; they add up to one
 
     @classmethod
     def over(cls, t_s: Float, spacing_s: float) -> "Knots":
-        """Return knots that cover rising times (T,) [s]."""
+        """Knots that cover rising times (T,) [s]."""
         x = (t_s - t_s[0]) / spacing_s
         first = np.floor(x).astype(np.int64)
         u = x - first
@@ -52,10 +43,7 @@ class Knots:
         return np.einsum("tw,twn->tn", self.weight, picked)
 
     def gathered(self, distance: int) -> csr_array:
-        """Return the weight products (K, T) of coefficients k and k + distance.
-
-        At each epoch.
-        """
+        """Weight products (K, T) of coefficients k and k + distance at each epoch."""
         rows = self.first[:, None] + np.arange(_WIDTH - distance)
         value = self.weight[:, : _WIDTH - distance] * self.weight[:, distance:]
         return self._sparse(rows, value)
@@ -71,16 +59,12 @@ class Knots:
 
 
 class BorderedNormal:
-    """Normal equations of K * n coefficients and g constants.
-
-    Holds what was added so far.
+    """Normal equations of K * n coefficients and g constants, as added so far.
 
     Attributes:
         band: (K, 4, n, n) blocks: [k, d] couples coefficients k + d (row) and k (column).
-        border: (K, n, g).
-        corner: (g, g).
-        pull: (K, n), minus the gradient.
-        pull_constants: (g,).
+        border, corner: (K, n, g) and (g, g).
+        pull, pull_constants: (K, n) and (g,), minus the gradient.
     """
 
     def __init__(self, count: int, channels: int, constants: int) -> None:
@@ -93,11 +77,8 @@ class BorderedNormal:
     def add_epochs(self, knots: Knots, jacobian: Float, by_constants: Float, off: Float) -> None:
         """Add residuals of every epoch.
 
-        Args:
-            knots: Where the epochs lie.
-            jacobian: (T, r, n) of the whitened residuals by the curves.
-            by_constants: (T, r, g).
-            off: (T, r) whitened: observed less predicted.
+        Jacobians (T, r, n) by the curves and (T, r, g) by the constants, and off = observed less predicted
+        (T, r), whitened.
         """
         flipped = np.swapaxes(jacobian, -1, -2)
         count, n, g = len(self.pull), jacobian.shape[-1], by_constants.shape[-1]
@@ -114,10 +95,7 @@ class BorderedNormal:
     def add_links(self, jacobian: Float, by_constants: Float, off: Float) -> None:
         """Add residuals that each couple two neighbouring coefficients.
 
-        Args:
-            jacobian: (K - 1, r, 2, n) by coefficients k and k + 1.
-            by_constants: (K - 1, r, g).
-            off: (K - 1, r).
+        Jacobians (K - 1, r, 2, n) by coefficients k and k + 1, (K - 1, r, g) by constants; off (K - 1, r).
         """
         now, then = jacobian[:, :, 0], jacobian[:, :, 1]
         now_t, then_t = np.swapaxes(now, -1, -2), np.swapaxes(then, -1, -2)
@@ -133,15 +111,15 @@ class BorderedNormal:
         self.pull_constants += flat.T @ off.ravel()
 
     def solve(self, damping: float) -> tuple[Float, Float, Float]:
-        """Solve for the step of the coefficients (K, n) and of the constants (g,).
-
-        Also returns the information (g, g) about the constants.
+        """Steps (K, n) of coefficients, (g,) of constants; information (g, g) on these.
 
         `damping` is added, as a share, to the diagonal (Marquardt).
         """
         count, n, g = self.border.shape
-        sides = np.concatenate([self.border, self.pull[..., None]], axis=-1)
-        solved = _solve_tridiagonal(*self._blocks(damping), _padded(sides.reshape(count * n, g + 1), 3 * n))
+        sides = np.zeros((-(-count // 3), 3 * n, g + 1))  # of three coefficients, noughts behind
+        given = np.concatenate([self.border, self.pull[..., None]], axis=-1)
+        sides.reshape(-1, g + 1)[: count * n] = given.reshape(count * n, g + 1)
+        solved = _solve_tridiagonal(*self._blocks(damping), sides)
         solved = solved.reshape(-1, g + 1)[: count * n]
         across, own_step = solved[:, :g], solved[:, g]
         border = self.border.reshape(-1, g)
@@ -152,10 +130,7 @@ class BorderedNormal:
         return (own_step - across @ constants).reshape(count, n), constants, information
 
     def _blocks(self, damping: float) -> tuple[Float, Float]:
-        """Return the band as a block-tridiagonal matrix of three coefficients per block.
-
-        (B, 3n, 3n) on and below the diagonal.
-        """
+        """The band as tridiagonal blocks (B, 3n, 3n) of three coefficients, on and below."""
         count, _, n, _ = self.band.shape
         blocks = -(-count // 3)
         band = np.zeros((3 * blocks + 3, *self.band.shape[1:]))
@@ -174,23 +149,11 @@ class BorderedNormal:
         return on.reshape(blocks, size, size), below.reshape(blocks, size, size)
 
 
-def _padded(sides: Float, size: int) -> Float:
-    """(B, size, r) of (N, r), noughts behind."""
-    blocks = -(-len(sides) // size)
-    out = np.zeros((blocks * size, sides.shape[1]))
-    out[: len(sides)] = sides
-    return out.reshape(blocks, size, -1)
-
-
 def _solve_tridiagonal(on: Float, below: Float, sides: Float) -> Float:
-    """Solve a positive definite block-tridiagonal system by block Cholesky.
+    """Solution (B, s, r) of a positive definite block-tridiagonal system (Cholesky).
 
-    Returns the solution (B, s, r).
-
-    Args:
-        on: (B, s, s) diagonal blocks.
-        below: (B, s, s): [i] stands in row i + 1, column i; the last is not used.
-        sides: (B, s, r).
+    On and below the diagonal (B, s, s): below[i] stands in row i + 1, column i, the last is not used; sides
+    (B, s, r).
     """
     inverses: list[Float] = []
     links: list[Float] = []

@@ -1,16 +1,9 @@
 """A measurement finds a hand's lengths, and writes them into its file.
 
-Measurement of a hand from the markers of a routine.
-
-Which lengths are measured, how well, and the profile with nothing made up.
-
+Markers of a routine enter, a profile with every measured length leaves; the others are scaled, and named so.
 A length counts as measured when it is within 1 mm with 99 % certainty, and by the markers, not by the priors.
-With caps on the tips alone the length of a finger is found, and often not its division: then the sum is measured, and
-its parts stay in the proportion of the template.
-
-Writing of measured lengths into the hand file.
-
-Scaled lengths where nothing was measured, and which are which.
+With caps on the tips alone the length of a finger is found, and often not its division: then the sum is
+measured, and its parts stay in the proportion of the template.
 """
 
 from collections.abc import Callable
@@ -21,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Bool, Float
-from common.calibration import HandProfile, Provenance, RestJoint, Vector3
+from common.calibration import HandProfile, Provenance, RestJoint
 from common.errors import FitError
 from common.hand.model import CHAINS, FINGERS, JOINTS, TIPS, WRIST, HandModel, couplings_of
 from common.hand.profiles import mirrored_profile, scaled_profile
@@ -29,7 +22,7 @@ from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.observed import GRID_S, Alignment, Observed, align, flat_scale, missing_steps
 from master.calibrate.hand.problem import HandRoutineProblem, ShapeFit, fit_shape
 from master.calibrate.hand.shape import PER_FINGER, Priors, RoutineTargets, Shape
-from master.calibrate.tree_files import provenance
+from master.calibrate.tree_files import provenance, vector_of
 
 WITHIN_M = 1e-3
 CERTAIN = 2.576  # standard deviations of 99 %
@@ -40,27 +33,18 @@ _GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """One length of the hand: a bone, or neighbouring bones together.
+    """One length of the hand: a bone, or neighbouring bones together."""
 
-    Attributes:
-        finger: Index, 0 thumb ... 4 little.
-        bones: Which of its three links.
-        length_m: Fitted.
-        scaled_m: As the template, scaled to this hand, has it.
-        sigma_m: Posterior standard deviation.
-        before_m: That of the prior.
-    """
-
-    finger: int
-    bones: tuple[int, ...]
+    finger: int  # index, 0 thumb ... 4 little
+    bones: tuple[int, ...]  # which of its three links
     length_m: float
-    scaled_m: float
-    sigma_m: float
+    scaled_m: float  # as the template, scaled to this hand, has it
+    sigma_m: float  # this and before_m: posterior and prior standard deviation
     before_m: float
 
     @property
     def measured(self) -> bool:
-        """Return true if the markers determine the length."""
+        """True if the markers determine the length."""
         prior_share = 0.5  # of the sd before: more comes from the priors
         return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= prior_share * self.before_m
 
@@ -73,21 +57,13 @@ class Length:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandMeasurement:
-    """Measurement of a hand by a routine.
-
-    Attributes:
-        observed: What was seen.
-        alignment: When the user did what.
-        template: The hand it began with, scaled.
-        fit: The least-squares result.
-        lengths: Every bone, and the sums of neighbours.
-    """
+    """Measurement of a hand by a routine."""
 
     observed: Observed
     alignment: Alignment
-    template: HandModel
+    template: HandModel  # the hand it began with, scaled
     fit: ShapeFit
-    lengths: tuple[Length, ...]
+    lengths: tuple[Length, ...]  # every bone, and the sums of neighbours
 
     @property
     def rms_m(self) -> float:
@@ -95,10 +71,7 @@ class HandMeasurement:
         return float(np.sqrt(np.nanmean(self.fit.residual_m**2)))
 
     def parted(self, finger: int) -> tuple[Length, ...]:
-        """Return the measured lengths of a finger without overlap.
-
-        As finely divided as they are measured.
-        """
+        """Measured lengths of a finger without overlap, as finely divided as measured."""
         found: list[Length] = []
         for length in (length for length in self.lengths if length.finger == finger and length.measured):
             if not any(set(length.bones) & set(other.bones) for other in found):
@@ -116,14 +89,13 @@ def measure_hand(
     """Fit a hand to a routine.
 
     Args:
-        observed: Its markers.
         template: Proportions to begin with, and where the markers sit; its size does not matter.
         hand_length_m: Length of the hand, if it was measured; None: from the flat hand's markers.
         dip_per_pip: Mean and standard deviation of the DIP's ratio, if it was measured.
         progress: Called with the share that is done.
 
     Raises:
-        FitError: A step is missing, the palm moved, it is the other hand, or none; the message states what to do.
+        FitError: A step is missing, the palm moved, it is the other hand, or none; with what to do.
     """
     model = _scaled(observed, template, hand_length_m)
     alignment = align(observed, model)
@@ -164,10 +136,7 @@ def problem_of(
 
 
 def whitening(cov_m2: Float, model_m: float) -> Float:
-    """Return inverse square roots (..., 3, 3) of covariances plus the model's error.
-
-    Zero where NaN.
-    """
+    """Inverse square roots (..., 3, 3) of covariances plus the model's error; 0: NaN."""
     known = np.asarray(np.isfinite(cov_m2).all(axis=(-2, -1)), np.bool_)
     filled = np.where(known[..., None, None], cov_m2, np.eye(3)) + model_m**2 * np.eye(3)
     value, vector = np.linalg.eigh(filled)
@@ -176,7 +145,7 @@ def whitening(cov_m2: Float, model_m: float) -> Float:
 
 
 def lengths_of(problem: HandRoutineProblem, fit: ShapeFit) -> tuple[Length, ...]:
-    """Every bone, then sums, with what is known of each."""
+    """Every bone, then sums, with the uncertainty of each."""
     before = problem.shape_sd()
     out: list[Length] = []
     for finger in range(5):
@@ -184,16 +153,9 @@ def lengths_of(problem: HandRoutineProblem, fit: ShapeFit) -> tuple[Length, ...]
         cov, prior = fit.cov[at : at + 3, at : at + 3], before[at : at + 3]
         for bones in _GROUPS:
             pick: Bool = np.isin(np.arange(3), bones)
-            out.append(
-                Length(
-                    finger,
-                    bones,
-                    float(fit.shape.length_m[finger, pick].sum()),
-                    float(problem.prior.length_m[finger, pick].sum()),
-                    float(np.sqrt(pick @ cov @ pick)),
-                    float(np.sqrt((prior[pick] ** 2).sum())),
-                )
-            )
+            fitted, scaled = (float(one.length_m[finger, pick].sum()) for one in (fit.shape, problem.prior))
+            sigma, sd = float(np.sqrt(pick @ cov @ pick)), float(np.sqrt((prior[pick] ** 2).sum()))
+            out.append(Length(finger, bones, fitted, scaled, sigma, sd))
     return tuple(out)
 
 
@@ -214,8 +176,7 @@ def hand_length_of(model: HandModel) -> float:
     """Wrist crease to the end of the middle finger [m]."""
     tip = TIPS[2]
     whole = np.linalg.norm(model.rest_position_m[tip] - model.rest_position_m[WRIST]) + model.radius_m[tip]
-    wrist_to_crease = 1.0246  # the wrist joint of generated profiles lies behind the crease
-    return float(whole) / wrist_to_crease
+    return float(whole) / 1.0246  # the wrist joint of generated profiles lies behind the crease
 
 
 def _check_side(observed: Observed, template: HandProfile, alignment: Alignment) -> None:
@@ -227,8 +188,7 @@ def _check_side(observed: Observed, template: HandProfile, alignment: Alignment)
             f"this is a {mirrored.profile.side} hand: mirrored, the routine fits to {1e3 * other:.0f} mm, as a"
             f" {template.side} one to {1e3 * alignment.cost_m:.0f} mm; give --side {mirrored.profile.side}"
         )
-    unlike_m = 0.025
-    if alignment.cost_m > unlike_m:
+    if alignment.cost_m > 0.025:
         raise FitError(
             f"the markers are {1e3 * alignment.cost_m:.0f} mm off the routine (rms): the palm did not rest, or"
             " the steps were others; lay the hand down and follow the steps"
@@ -236,15 +196,11 @@ def _check_side(observed: Observed, template: HandProfile, alignment: Alignment)
 
 
 def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
-    """Refuse a palm that moved far more than its prior expects.
-
-    Curves that are smoothed by a prior stay within it, unless the palm really moved more than that.
-    """
+    """Refuse a palm that moved far more than its prior expects."""
     priors, step_s = problem.priors, np.sqrt(problem.knots.spacing_s)
     expected_rms = np.repeat([priors.palm_rad_s, priors.palm_m_s], 3) * step_s
     wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / expected_rms
-    restless = 1.2  # times the wandering that is assumed of a palm that rests
-    if wander.max() > restless:
+    if wander.max() > 1.2:  # times the wandering that is assumed of a palm that rests
         rotation, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(
             f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(rotation):.0f} degrees;"
@@ -260,15 +216,10 @@ _QUICK = "rest_joints"  # marks a whole hand that is only scaled
 def measured_profile(
     measurement: HandMeasurement, name: str, data: str, dip_per_pip: float | None = None
 ) -> HandProfile:
-    """Return the template with every measured length inserted.
+    """The template with every measured length inserted, from data of the given name.
 
-    The parts of a measured sum keep the template's proportions.
-
-    Args:
-        measurement: What the routine measured.
-        name: Of the new profile.
-        data: Name of what it was measured from.
-        dip_per_pip: The DIP's ratio that the lengths were measured with, if that was measured; None: the template's.
+    The parts of a measured sum keep the template's proportions. `dip_per_pip` is the DIP's measured ratio;
+    None: the template's.
     """
     model = measurement.template
     factor = bone_factors(measurement)
@@ -296,10 +247,7 @@ def measured_profile(
 
 
 def bone_factors(measurement: HandMeasurement) -> Float:
-    """Return the stretch factors (5, 3) of the template's bones.
-
-    1 where nothing was measured.
-    """
+    """Stretch factors (5, 3) of the template's bones; 1 where nothing was measured."""
     factor = np.ones((5, 3))
     for finger in range(5):
         for length in measurement.parted(finger):
@@ -308,21 +256,18 @@ def bone_factors(measurement: HandMeasurement) -> Float:
 
 
 def stretched(model: HandModel, factor: Float) -> dict[str, RestJoint]:
-    """Stretch the bones of the chains of the rest joints by (5, 3).
-
-    Roots and orientations are kept.
-    """
+    """Rest joints with the chains' bones stretched by (5, 3); roots are kept."""
     rest = dict(model.profile.rest_joints)
     for chain, own in zip(CHAINS, factor, strict=True):
         at = model.rest_position_m[chain[0]]
         for (a, b), share in zip(pairwise(chain), own, strict=True):
             at = at + share * (model.rest_position_m[b] - model.rest_position_m[a])
-            rest[JOINTS[b]] = replace(rest[JOINTS[b]], position_m=_vector(at))
+            rest[JOINTS[b]] = replace(rest[JOINTS[b]], position_m=vector_of(at))
     return rest
 
 
 def quick_profile(profile: HandProfile, name: str, length_m: float) -> HandProfile:
-    """A profile scaled from the length of the hand alone, saying so."""
+    """A profile scaled from the length of the hand alone, with a note of it."""
     note = f"scaled from a hand length of {1e3 * length_m:.0f} mm: no bone is measured, individuals differ by 5 to 8 %"
     return replace(profile, name=name, provenance={_QUICK: provenance(TOOL, ("hand length",), {}, note)})
 
@@ -377,8 +322,3 @@ def report_json(measurement: HandMeasurement) -> dict[str, object]:
 
 def _key(name: str) -> str:
     return name.replace(" + ", "_").replace(" ", "_")
-
-
-def _vector(value: Float) -> Vector3:
-    x, y, z = (round(float(number), 7) + 0.0 for number in value)
-    return x, y, z

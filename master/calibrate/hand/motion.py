@@ -1,32 +1,19 @@
 """A motion capture yields a hand file: palm, bone lengths and couplings.
 
-Joint couplings of a person's fingers, from a motion capture.
+Bones are mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
+(`common/hand/fitting.py`); radii and marker places are those of the generated profile of the same length.
 
-How the joints flex together: the couplings of the hand file.
+**Palm.** Wrist, knuckles and the thumb's root are one rigid body, whose shape is the mean of all frames laid
+on one another (generalised Procrustes analysis; Gower, 1975). The palm frame (origin at the wrist, +z to the
+fingers, +y out of the back) is that in which this shape lies nearest to the scaled generated profile's.
+Knuckles and wrist are nearly a plane, its own mirror image: which hand it is follows from the fingers, which
+bend into the palm, towards -y.
 
-    DIP = ratio . PIP,  MCP = ratio . PIP        index ... little, least squares through zero, with the weights of Huber
-
-Zero is the straight finger in the palm's plane, which is where profiles from joints have it. Noise of the joints, which
-shows in bones that change their length, turns short bones; it is taken out of the spread. A DIP that keeps its ratio
-to half a degree was not measured: trackers make it from the PIP (the Leap does so). An MCP that is off by more than 25
-degrees has no coupling: people bend it alone as well, and what was done in the recording constrains too little.
-
-Palm in a motion capture: its frame at every epoch, and which hand it is.
-
-Wrist, knuckles and the thumb's root are one rigid body, whose shape is the mean of all frames laid on one another
-(generalised Procrustes analysis; Gower, 1975). The palm frame is that in which this shape lies nearest to the generated
-profile's, scaled: so it is the frame of all our hands, origin at the wrist, +z to the fingers, +y out of the back.
-
-Knuckles and wrist are nearly a plane, and a plane is its own mirror image: which side is the back, and so which hand it
-is, follows from the fingers. They bend into the palm, towards -y.
-
-Hand file from a motion capture.
-
-Bones and hinges from its joints, couplings where it is long enough.
-
-Bones are the mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
-(`common/hand/fitting.py`). What no motion capture gives is taken from the generated profile of the same length: radii,
-where the marker sits on the tips, where the marker on the back is.
+**Couplings.** DIP = ratio . PIP and MCP = ratio . PIP of index ... little, least squares through zero (the
+straight finger in the palm's plane) with the weights of Huber. Noise of the joints, which shows in bones that
+change their length, rotates short bones; it is taken out of the spread. A DIP that keeps its ratio to half a
+degree was not measured: trackers make it from the PIP (the Leap does so). An MCP off by more than 25 degrees
+has no coupling: people bend it alone as well.
 """
 
 from dataclasses import dataclass
@@ -59,52 +46,35 @@ _ROUNDS = 20
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """One angle against the PIP.
-
-    Attributes:
-        per_pip: The ratio.
-        spread_rad: Standard deviation about it, that of noise taken out; 0: no more than noise.
-        noise_rad: What noise of the joints makes of it.
-    """
+    """One angle against the PIP."""
 
     per_pip: float
-    spread_rad: float
-    noise_rad: float
+    spread_rad: float  # standard deviation about it, that of noise taken out; 0: no more than noise
+    noise_rad: float  # standard deviation by noise of the joints
 
 
 @dataclass(frozen=True, slots=True)
 class MotionCouplings:
-    """Couplings measured from a motion.
+    """Couplings measured from a motion."""
 
-    Attributes:
-        moved_s: How long any PIP moved.
-        dip, mcp: The ratios; None: fingers bend too little.
-        couplings: Those of the default with what was measured; None: nothing was.
-        remarks: What was not taken, and why.
-    """
-
-    moved_s: float
-    dip: Ratio | None
+    moved_s: float  # how long any PIP moved
+    dip: Ratio | None  # this and mcp: the ratios; None: fingers bend too little
     mcp: Ratio | None
-    couplings: Couplings | None
-    remarks: tuple[str, ...]
+    couplings: Couplings | None  # those of the default with what was measured; None: nothing was
+    remarks: tuple[str, ...]  # what was not taken, and why
 
 
 def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCouplings:
-    """Couplings from a motion.
+    """Couplings from a motion with times (T,) [ns].
 
-    Args:
-        angles_rad: (T, 5, 4) [rad] of `common.hand.fitting.joint_angles`.
-        chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is estimated from bones that change.
-        t_ns: (T,) [ns] times.
+    Angles (T, 5, 4) [rad] are of `common.hand.fitting.joint_angles`, chains (T, 5, 4, 3) [m] the joints that
+    they are of: their noise is estimated from bones that change.
     """
     angles = angles_rad[:, 1:, 1:]
     step_s = 1e-9 * np.diff(t_ns)
     rate = np.abs(np.diff(angles[:, :, 1], axis=0)).max(axis=1) / step_s
-    # longer, two frames are no step
-    moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < 0.1)].sum())
+    moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < 0.1)].sum())  # longer, two frames are no step
     low, high = np.percentile(angles[:, :, 1], [5.0, 95.0])
-    # of movement, at least
     if moved_s < 20.0 or high - low < _RANGE_RAD:
         why = f"fingers move for {moved_s:.0f} s, and {np.degrees(high - low):.0f}° at the PIP"
         return MotionCouplings(
@@ -132,12 +102,10 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
 
 
 def _joint_noise(chains_m: Float) -> tuple[float, float, float]:
-    """Return the standard deviations [rad] of MCP, PIP and DIP by joint noise.
+    """Rms deviations [rad] of MCP, PIP and DIP by joint noise, index ... little.
 
-    Mean square over index ... little.
-
-    A bone from a to b of length L turns by the noise across it; b moves both bones at an angle. The noise is that along
-    the bones, whose length does not change in truth, alike in all directions.
+    A bone from a to b of length L turns by the noise across it; b moves both bones at an angle. The noise is
+    that along the bones, whose length does not change in truth, alike in all directions.
     """
     length = np.linalg.norm(np.diff(chains_m[:, 1:], axis=2), axis=3)
     variance = 0.5 * length.var(axis=0).mean(axis=1, keepdims=True)  # of a joint, per axis; (4, 1)
@@ -149,7 +117,7 @@ def _joint_noise(chains_m: Float) -> tuple[float, float, float]:
 
 
 def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
-    """Of angles (T, 4) [rad] to PIPs, where these are bent, and the noise of both."""
+    """Ratio of angles (T, 4) [rad] to bent PIPs, and the noise of both."""
     bent = pip > _BENT_RAD
     x, y = pip[bent], angle[bent]
     weight, slope = np.ones(len(x)), 0.0
@@ -158,10 +126,8 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
         slope = float((weight * x * y).sum() / (weight * x * x).sum())
         off = np.asarray(np.abs(y - slope * x), np.float64)
         spread = max(1.4826 * float(np.median(off)), 1e-6)
-        huber = 1.345
-        weight = np.minimum(1.0, huber * spread / np.maximum(off, 1e-12))
-    outlier = 4.0
-    typical = off < outlier * spread
+        weight = np.minimum(1.0, 1.345 * spread / np.maximum(off, 1e-12))
+    typical = off < 4.0 * spread
     spread = float(np.sqrt((off[typical] ** 2).mean()))
     noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
     left = spread * spread - noise * noise
@@ -176,37 +142,27 @@ _PALM_ROUNDS = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Palm:
-    """The palm of one hand.
-
-    Attributes:
-        side: right or left.
-        mirrored: Positions were turned over in x first: their axes are left-handed.
-        chains_m: (T, 5, 4, 3) [m] the joints of `CHAINS` in the palm frame.
-        shape_m: (26, 3) [m] the palm's own joints in it; NaN: not in the file, or not of the palm.
-        rms_m: How far the palm's joints are off that shape.
-        outlier: (T,) frames whose palm is none.
-    """
+    """The palm of one hand."""
 
     side: Side
-    mirrored: bool
-    chains_m: Float
-    shape_m: Float
-    rms_m: float
-    outlier: Bool
+    mirrored: bool  # positions were turned over in x first: their axes are left-handed
+    chains_m: Float  # (T, 5, 4, 3) [m] the joints of `CHAINS` in the palm frame
+    shape_m: Float  # (26, 3) [m] the palm's own joints in it; NaN: not in the file, or not of the palm
+    rms_m: float  # residual of the palm's joints from that shape
+    outlier: Bool  # (T,) frames whose palm is none
 
 
 def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
-    """Find the palm frame of joints (T, 26, 3) [m].
+    """The palm frame of joints (T, 26, 3) [m]; NaN: not seen.
 
-    NaN: not seen. Of the given side, or of the side that the joints show.
+    Of the given side, or of the side that the joints show.
 
     Raises:
         FitError: The palm is never seen whole, or the fingers do not determine which side is the back.
     """
     mine = list(PALM_JOINTS)
     there = [joint for joint in mine if known(joints_m[:, joint]).mean() > 0.5]
-    least_joints = 4
-    if WRIST not in there or len(there) < least_joints:
+    if WRIST not in there or len(there) < 4:
         raise FitError(f"{where}: wrist and three knuckles, or more, must be seen in half of the frames")
     body = joints_m[:, there]
     whole = np.asarray(known(body).all(axis=1), np.bool_)
@@ -215,9 +171,8 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     shape, T_file_shape, distance = _mean_shape(body[whole])
     outlier = np.zeros(len(joints_m), np.bool_)
     outlier[~whole] = True
-    # of the median distance of a frame's palm from the shape
-    floor_m = 5e-3  # real palms arch by a millimetre or two
-    outlier[np.flatnonzero(whole)[distance > max(4.0 * float(np.median(distance)), floor_m)]] = True
+    # Four times the median distance of a frame's palm from the shape; real palms arch by a millimetre or two.
+    outlier[np.flatnonzero(whole)[distance > max(4.0 * float(np.median(distance)), 5e-3)]] = True
     in_shape = np.full_like(joints_m, np.nan)
     transposed = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
     moved = joints_m[whole] - T_file_shape[:, None, :3, 3]
@@ -235,10 +190,7 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
 
 
 def _mean_shape(body_m: Float) -> tuple[Float, Float, Float]:
-    """Return the mean shape (K, 3) of a body's points (T, K, 3).
-
-    Also its poses (T, 4, 4) and the points' distances (T,) from it.
-    """
+    """Mean shape (K, 3) of points (T, K, 3), poses (T, 4, 4) and distances (T,)."""
     shape = body_m[len(body_m) // 2]
     T = np.zeros((len(body_m), 4, 4))
     for _ in range(_PALM_ROUNDS):
@@ -258,13 +210,7 @@ def palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
 
 
 def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
-    """Return the side of the hand whose fingers flex towards -y.
-
-    That is about +x, whatever the knuckles do.
-
-    Raises:
-        FitError: They bend too little, or aside.
-    """
+    """The side whose fingers flex towards -y, that is about +x; or refuse."""
     chains = in_shape[:, CHAINS[1:]]
     chains = chains[known(chains).all(axis=(1, 2))]
     bones = np.diff(chains, axis=2)
@@ -289,38 +235,26 @@ _BONES = (("metacarpal", "proximal", "distal"), ("proximal", "intermediate", "di
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionHand:
-    """A hand from a motion capture.
-
-    Attributes:
-        profile: The hand file.
-        motion: What it is from.
-        palm: Its palm.
-        couplings: Its couplings; where it determines any, the profile has a posture prior, too.
-        bone_m, bone_sigma_m: (5, 3) [m] mean and spread over frames.
-        frames: How many were used.
-        length_m: From the wrist to the end of the middle finger.
-    """
+    """A hand from a motion capture."""
 
     profile: HandProfile
     motion: JointMotion
     palm: Palm
-    couplings: MotionCouplings
-    bone_m: Float
+    couplings: MotionCouplings  # its couplings; where it determines any, the profile has a posture prior, too
+    bone_m: Float  # this and bone_sigma_m: (5, 3) [m] mean and spread over frames
     bone_sigma_m: Float
-    frames: int
-    length_m: float
+    frames: int  # how many were used
+    length_m: float  # from the wrist to the end of the middle finger
 
 
 def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     """Make a hand file of a motion.
 
-    Args:
-        motion: Wrist and the four joints of each finger at least; its `side` None: by the geometry.
-        name: Of the hand.
+    Its wrist and the four joints of each finger at least are needed; `side` None: by the geometry.
 
     Raises:
         RecordingError: Joints are missing.
-        FitError: Too few good frames, no hand by its size, or the fingers do not determine which side is the back.
+        FitError: Too few good frames, no hand by its size, or fingers that do not determine the side.
         CalibrationError: A finger never bends.
     """
     require(motion, _NEEDED, "a hand")
@@ -347,23 +281,18 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
         like = generated_profile(name, palm.side, length_m)
     except ValueError as error:
         raise FitError(f"{motion.source}: {error}: is --unit right?") from error
-    hand = MotionHand(
-        profile, motion, palm, couplings, bones.mean(axis=0), bones.std(axis=0), int(good.sum()), length_m
-    )
+    mean, sd, frames = bones.mean(axis=0), bones.std(axis=0), int(good.sum())
+    hand = MotionHand(profile, motion, palm, couplings, mean, sd, frames, length_m)
     origin = _provenance(hand)
     back = profile.markers["back"]
-    profile = replace(
-        profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=origin
-    )
+    markers = like.markers | {"back": back}
+    profile = replace(profile, markers=markers, radius_m=like.radius_m, provenance=origin)
     HandModel.of(profile)  # refuses what cannot be
     return changed(hand, profile=profile)
 
 
 def _good(palm: Palm) -> Bool:
-    """Select the frames (T,) with all joints and a plausible hand.
-
-    The palm is no outlier and the bones are as long as usual.
-    """
+    """The frames (T,) with all joints, no outlier palm, and usual bone lengths."""
     whole = np.asarray(known(palm.chains_m).all(axis=(1, 2)), np.bool_) & ~palm.outlier
     lengths = np.linalg.norm(np.diff(palm.chains_m, axis=2), axis=3)
     if not whole.any():

@@ -1,16 +1,9 @@
 """Observations of a hand are checked, and aligned in time with the routine.
 
-Observations of a hand during the routine, checked.
-
-Places of its markers over time, from a file of poses.
-
-Temporal alignment of the scripted routine with what was seen.
-
-Answers when the user did what.
-
-Users begin late and vary their pace. So the markers are compared with those of a template hand that does the routine,
-and the two are matched monotonously in time (dynamic time warping: Sakoe & Chiba, 1978). The palm of the template is
-put where the flat hand is: the stretch of stillness whose markers fit the flat template best.
+Markers over time enter, from a file of poses; when the user did what leaves. Users begin late and vary their
+pace. So the markers are compared with those of a template hand that does the routine, and the two are matched
+monotonously in time (dynamic time warping: Sakoe & Chiba, 1978). The palm of the template is put where the
+flat hand is: the still stretch whose markers fit the flat template best.
 """
 
 from collections.abc import Sequence
@@ -29,19 +22,12 @@ from common.recording.recorded_files import read_npz
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Markers of one hand over time.
+    """Markers of one hand over time."""
 
-    Attributes:
-        names: Markers: those of the tips, thumb ... little, then those of the back.
-        t_s: (T,) rising [s], from nought.
-        points_m: (T, 5 + B, 3) centroids of the caps, rig frame; NaN: not seen.
-        cov_m2: (T, 5 + B, 3, 3); NaN: not seen.
-    """
-
-    names: tuple[str, ...]
-    t_s: Float
-    points_m: Float
-    cov_m2: Float
+    names: tuple[str, ...]  # markers: those of the tips, thumb ... little, then those of the back
+    t_s: Float  # (T,) rising [s], from 0
+    points_m: Float  # (T, 5 + B, 3) centroids of the caps, rig frame; NaN: not seen
+    cov_m2: Float  # (T, 5 + B, 3, 3); NaN: not seen
 
     @classmethod
     def of(
@@ -120,8 +106,7 @@ def read_observed(path: Path, names: Sequence[str], model: HandModel) -> Observe
 
 def _check_length(t_s: Float) -> None:
     span = float(t_s[-1] - t_s[0]) if len(t_s) else 0.0
-    shortest = 0.6  # of the routine
-    if span < shortest * ROUTINE_S:
+    if span < 0.6 * ROUTINE_S:  # shortest of the routine
         raise FitError(
             f"markers are seen over {span:.1f} s, the routine takes {ROUTINE_S:.0f} s: do all of it, and record from"
             " its beginning to its end"
@@ -139,19 +124,12 @@ GRID_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The routine laid over the observations.
+    """The routine laid over the observations."""
 
-    Attributes:
-        T_rig_palm: (4, 4) of the flat hand.
-        time_s: (N,) grid of observed times [s].
-        script_s: (N,) where in the routine the user was.
-        cost_m: Root mean square distance between the markers and the template's.
-    """
-
-    T_rig_palm: Float
-    time_s: Float
-    script_s: Float
-    cost_m: float
+    T_rig_palm: Float  # (4, 4) of the flat hand
+    time_s: Float  # (N,) grid of observed times [s]
+    script_s: Float  # (N,) where in the routine the user was
+    cost_m: float  # rms distance between the markers and the template's
 
     def at(self, t_s: Float) -> Float:
         """Routine times of observed times (N,) [s]."""
@@ -176,8 +154,7 @@ def align(observed: Observed, model: HandModel) -> Alignment:
 def posture_angles(script_s: float) -> Float:
     """Angles (5, 4) [rad] that the routine asks for."""
     posture = np.radians(posture_at(script_s))
-    dip_per_pip = 0.75
-    return np.column_stack([posture, dip_per_pip * posture[:, 2]])
+    return np.column_stack([posture, 0.75 * posture[:, 2]])
 
 
 def flat_scale(observed: Observed, model: HandModel) -> float:
@@ -208,7 +185,8 @@ def missing_steps(observed: Observed, alignment: Alignment, model: HandModel) ->
     home = np.array([_median(flat[:, f]) for f in range(5)])
     asked = _reach(model)
     for number, step in enumerate(STEPS):
-        inside = (script > _start(number)) & (script <= _stop(number))
+        moves = [move for move in MOVES if move.step == number]
+        inside = (script > moves[0].start_s) & (script <= max(move.stop_s for move in moves))
         for f, finger in enumerate(observed.names[:5]):
             if asked[number, f] < 0.02:
                 continue
@@ -226,14 +204,6 @@ def missing_steps(observed: Observed, alignment: Alignment, model: HandModel) ->
                     f" {1e3 * asked[number, f]:.0f} mm are asked for"
                 )
     return lines
-
-
-def _start(step: int) -> float:
-    return next(move.start_s for move in MOVES if move.step == step)
-
-
-def _stop(step: int) -> float:
-    return max(move.stop_s for move in MOVES if move.step == step)
 
 
 def _reach(model: HandModel) -> Float:
@@ -270,10 +240,7 @@ def _gridded(observed: Observed) -> tuple[Float, Float]:
 
 
 def _still(points: Float) -> list[Float]:
-    """Return the mean places (M, 3) of every still stretch.
-
-    All that is seen rests there; four tips at least.
-    """
+    """Mean places (M, 3) of every stretch in which all that is seen, 4 tips, rests."""
     still_s, still_m = 0.4, 4e-3
     length = round(still_s / GRID_S)
     out: list[Float] = []
@@ -298,15 +265,11 @@ def _flat_poses(points: Float, flat: Float) -> list[Float]:
         pose = fit_rigid(window[seen], flat[seen])
         off = window[seen] - transform(pose, flat[seen])
         poses.append((float((off**2).mean()), number, pose))
-    tried = 4  # stretches of stillness
-    return [pose for _, _, pose in sorted(poses, key=lambda entry: entry[:2])[:tried]]
+    return [pose for _, _, pose in sorted(poses, key=lambda entry: entry[:2])[:4]]  # stretches of stillness
 
 
 def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: Float) -> Alignment:
-    """Find the cheapest path through the table of observed and scripted distances.
-
-    N observed and S scripted epochs.
-    """
+    """The cheapest path through the (N, S) distances of observed and scripted epochs."""
     asked = transform(pose, template)
     square = ((points[:, None] - asked[None]) ** 2).sum(axis=-1)  # (N, S, M)
     seen = np.isfinite(square)
@@ -320,8 +283,7 @@ def _warped(pose: Float, time_s: Float, points: Float, script: Float, template: 
         tempo = 3  # the user's fastest, times the routine's
         ways = np.full((tempo + 1, count), np.inf)
         for k in range(tempo + 1):
-            step_cost = 1e-5  # [m^2] of leaving the routine's tempo
-            ways[k, k:] = total[: count - k] + step_cost * abs(k - 1)
+            ways[k, k:] = total[: count - k] + 1e-5 * abs(k - 1)  # [m^2] of leaving the routine's tempo
         came[i] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[i]
     way = np.empty(len(time_s), np.int64)

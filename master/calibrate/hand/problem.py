@@ -1,16 +1,9 @@
 """The hand routine is one least-squares problem, fitted with uncertainties.
 
-Hand routine as one least-squares problem.
-
-One shape, and curves of 26 numbers (palm pose and angles).
-
-Channels of the curves: palm turn (3, rotation vector about the palm's middle, against the first pose), palm shift (3),
-then the angles (20). Deviations from what the routine asks for are Ornstein-Uhlenbeck processes: they live for about a
-second, so that many frames of one bend count as one trial and not as many.
-
-Hand that best explains a routine, with the uncertainty of each number.
-
-Damped Gauss-Newton over the whole routine.
+One shape, and curves of 26 channels: palm rotation (3, rotation vector about the palm's middle, against the
+first pose), palm shift (3), then the angles (20). Deviations from what the routine asks for are
+Ornstein-Uhlenbeck processes: they live for about a second, so that many frames of one bend count as one trial
+and not as many. Solved by damped Gauss-Newton over the whole routine.
 """
 
 from collections.abc import Callable
@@ -52,34 +45,22 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRoutineProblem:
-    """Observations and priors of the routine.
+    """Observations and priors of the routine."""
 
-    Attributes:
-        model: Template.
-        cap_m: (5, 3) offsets of the caps in the frames of the tip joints.
-        prior: Prior shape.
-        points_m: (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen.
-        whiten: (T, 5 + B, 3, 3): whiten @ off has unit covariance.
-        knots: Of the curves.
-        targets: What the routine asks for at each of them.
-        start: (4, 4) palm pose about which the curves are.
-        palm_free: The palm may move, since it is measured.
-        priors: Widths.
-    """
-
-    model: HandModel
-    cap_m: Float
+    model: HandModel  # template
+    cap_m: Float  # (5, 3) offsets of the caps in the frames of the tip joints
     prior: Shape
+    # (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen
     points_m: Float
-    whiten: Float
+    whiten: Float  # (T, 5 + B, 3, 3): whiten @ off has unit covariance
     knots: Knots
-    targets: RoutineTargets
-    start: Float
-    palm_free: bool
-    priors: Priors
+    targets: RoutineTargets  # what the routine asks for at each of the knots
+    start: Float  # (4, 4) palm pose about which the curves are
+    palm_free: bool  # the palm may move, since it is measured
+    priors: Priors  # widths
 
     def guess(self) -> State:
-        """Return the scripted routine with the prior shape as the initial state."""
+        """The scripted routine with the prior shape."""
         coefficients = np.zeros((len(self.knots.time_s), CHANNELS))
         angles = coefficients[:, _PALM:].reshape(-1, 5, 4)
         angles[..., :3] = self.targets.posture_rad
@@ -87,7 +68,7 @@ class HandRoutineProblem:
         return State(self.prior, coefficients)
 
     def stepped(self, state: State, coefficients: Float, constants: Float) -> State:
-        """With a step, kept where hands can be."""
+        """After a step, kept where hands can be."""
         moved = state.coefficients + coefficients
         low, high = (self.model.limits_rad[..., i].ravel() for i in (0, 1))
         np.clip(moved[:, _PALM:], low - _SLACK_RAD, high + _SLACK_RAD, out=moved[:, _PALM:])
@@ -121,18 +102,15 @@ class HandRoutineProblem:
         return self.points_m - self._predicted(state)[0]
 
     def angles(self, state: State) -> Float:
-        """Return the joint angles (T, 5, 4) [rad] at the epochs."""
+        """Joint angles (T, 5, 4) [rad] at the epochs."""
         return self.knots.at(state.coefficients)[:, _PALM:].reshape(-1, 5, 4)
 
     def shape_sd(self) -> Float:
-        """Return the standard deviations (size,) of the prior shape."""
+        """Standard deviations (size,) of the prior shape."""
         return 1.0 / self._shape_prior(self.prior)[0]
 
     def _predicted(self, state: State) -> tuple[Float, Float, Float]:
-        """Predict the markers (T, M, 3) and their Jacobians.
-
-        By the curves (T, M, 3, 26) and by the shape (T, M, 3, size).
-        """
+        """Markers (T, M, 3), by the curves (T, M, 3, 26), by the shape (T, M, 3, size)."""
         curves = self.knots.at(state.coefficients)
         count, markers = self.points_m.shape[:2]
         caps = caps_of(self.model, self.cap_m, state.shape, curves[:, _PALM:].reshape(-1, 5, 4))
@@ -158,13 +136,13 @@ class HandRoutineProblem:
         return predicted, by_curve, by_shape
 
     def _markers(self, state: State) -> tuple[Float, Float, Float]:
-        """Whitened Jacobians and differences; nought where nothing was seen."""
+        """Whitened Jacobians and differences; 0 where nothing was seen."""
         predicted, by_curve, by_shape = self._predicted(state)
         off = np.nan_to_num(self.points_m - predicted)
         return self.whiten @ by_curve, self.whiten @ by_shape, (self.whiten @ off[..., None])[..., 0]
 
     def _links(self, state: State) -> tuple[Float, Float, Float]:
-        """Return the residual rows between neighbouring coefficients.
+        """Residual rows between neighbouring coefficients.
 
         Palm, angles about the routine, DIPs about their PIPs.
         """
@@ -197,10 +175,7 @@ class HandRoutineProblem:
         return jacobian, by_shape, off
 
     def _widths(self) -> tuple[Float, Float, Float]:
-        """Return the prior widths and means of the coefficients.
-
-        Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26).
-        """
+        """Inverse sd of changes, means, inverse sd of levels, each (K - 1, 26)."""
         b, h = self.priors, self.knots.spacing_s
         count = len(self.knots.time_s) - 1
         moving = (self.targets.moving[1:] | self.targets.moving[:-1]).reshape(count, 5, 3)
@@ -221,10 +196,7 @@ class HandRoutineProblem:
         return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
 
     def _shape_prior(self, shape: Shape) -> tuple[Float, Float]:
-        """Return the inverse sd (size,) and the deviation from the prior shape.
-
-        Deviation of a shape (size,).
-        """
+        """Inverse sd (size,) and deviation (size,) from the prior shape."""
         b, prior = self.priors, self.prior
         sd, away = np.empty(shape.size), np.empty(shape.size)
         own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
@@ -248,22 +220,12 @@ def weigh(whitened: Float) -> Float:
 
 def _rotation_between(rotation: Float, other: Float) -> Float:
     """(5, 3) small turns about the palm's axes from `other` to `rotation` (5, 3, 3)."""
-    relative = rotation @ np.swapaxes(other, -1, -2)
-    return 0.5 * np.stack(
-        [
-            relative[:, 2, 1] - relative[:, 1, 2],
-            relative[:, 0, 2] - relative[:, 2, 0],
-            relative[:, 1, 0] - relative[:, 0, 1],
-        ],
-        axis=1,
-    )
+    r = rotation @ np.swapaxes(other, -1, -2)
+    return 0.5 * np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
 
 
 def _left_jacobian(vector: Float) -> Float:
-    """Return the left Jacobian (T, 3, 3) of rotation vectors.
-
-    Rotations of rotation_vector_to_matrix(vector) by changes of the vector (Barfoot, 2017, eq. 7.77).
-    """
+    """Left Jacobian (T, 3, 3) of rotation vectors (Barfoot, 2017, eq. 7.77)."""
     angle = np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[:, None, None]
     k = skew(vector)
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
@@ -274,27 +236,16 @@ _REFUSED = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeFit:
-    """A fitted shape.
-
-    Attributes:
-        shape: The numbers.
-        cov: (size, size) their posterior covariance, residuals' spread included.
-        residual_m: (T, 5 + B, 3) observed less predicted; NaN: not seen.
-        angles_rad: (T, 5, 4).
-        palm: (K, 6) turn [rad] and shift [m] of the palm against its first pose.
-        spread: Root of the mean squared whitened residual: 1 where the stated covariances are true.
-        alike: By what the standard deviations were raised because errors last longer than a frame.
-        steps: SensorMessage.
-    """
+    """A fitted shape."""
 
     shape: Shape
-    cov: Float
-    residual_m: Float
-    angles_rad: Float
-    palm: Float
-    spread: float
-    alike: float
-    steps: int
+    cov: Float  # (size, size) posterior covariance, residuals' spread included
+    residual_m: Float  # (T, 5 + B, 3) observed less predicted; NaN: not seen
+    angles_rad: Float  # (T, 5, 4)
+    palm: Float  # (K, 6) rotation [rad] and shift [m] of the palm against its first pose
+    spread: float  # root of the mean squared whitened residual: 1 where the stated covariances are true
+    alike: float  # factor of the standard deviations because errors last longer than a frame
+    steps: int  # steps taken
 
 
 def fit_shape(
@@ -317,8 +268,7 @@ def fit_shape(
             gain, state, normal, cost = cost - next_cost, tried, next_normal, next_cost
             damping, taken, refused = max(damping / 5.0, 1e-9), taken + 1, 0
             progress(min(taken / 15.0, 0.99))
-            tolerance = 0.05  # of half chi square, against thousands
-            settled = gain < tolerance
+            settled = gain < 0.05  # tolerance of half chi square, against thousands
             if settled:
                 break
         else:
@@ -336,12 +286,10 @@ def fit_shape(
 
 
 def _spread(problem: HandRoutineProblem, residual_m: Float) -> tuple[float, float]:
-    """Return the root mean squared whitened residual and its correlation factor.
+    """Root mean squared whitened residual, and the factor by its correlation in time.
 
-    The factor is how much more the residual counts because neighbours in time err alike.
-
-    Errors that last, such as a cap's hidden part, do not average out: with a correlation r from frame to frame, n
-    frames carry as much information as n (1 - r) / (1 + r) independent ones.
+    Errors that last, such as a cap's hidden part, do not average out: with a correlation r from frame to
+    frame, n frames carry as much information as n (1 - r) / (1 + r) independent ones.
     """
     whitened = (problem.whiten @ np.nan_to_num(residual_m)[..., None])[..., 0]
     seen = np.isfinite(residual_m[..., 0])

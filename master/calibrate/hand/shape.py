@@ -1,18 +1,10 @@
 """The shape of a hand is a vector of unknowns with priors.
 
-Shape of a hand as numbers to be estimated.
-
-Also where it puts the caps for given angles, with derivatives.
-
-Of each finger: three bone lengths, the place and the rest orientation of its root (knuckle; thumb: CMC), and how its
-DIP follows its PIP. Directions of bones in their joints, rest turns and the caps' offsets from the tip joints stay
-those of the template. With them the places of the markers on the back.
-
-Priors before a marker is seen.
-
-Of hands in general, and of a user who follows the routine roughly.
-
-None of it is exact, and all of it is wide: where the markers do not overrule it, a bone is reported as undetermined.
+Of each finger: three bone lengths, position and rest orientation of its root (knuckle; thumb: CMC), and how
+its DIP follows its PIP; with them the places of the markers on the back. Directions of bones in their joints,
+rest rotations and the caps' offsets from the tip joints stay those of the template. Priors are of hands in
+general, and of a user who follows the routine roughly: all wide, so where the markers do not overrule them a
+bone is reported as undetermined.
 """
 
 from dataclasses import dataclass
@@ -30,22 +22,14 @@ LENGTH, ROOT, ROTATION, RATIO, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """One hand's shape.
+    """One hand's shape."""
 
-    Attributes:
-        length_m: (5, 3) bones of the chains, proximal to distal.
-        root_m: (5, 3) roots of the chains, palm frame.
-        root_rotation: (5, 3, 3) rest orientation of the root joints, joint -> palm frame.
-        dip_ratio, dip_bias_rad: (5,) DIP = ratio PIP + bias (thumb: IP and MCP).
-        back_m: (B, 3) markers of the back, palm frame.
-    """
-
-    length_m: Float
-    root_m: Float
-    root_rotation: Float
-    dip_ratio: Float
+    length_m: Float  # (5, 3) bones of the chains, proximal to distal
+    root_m: Float  # (5, 3) roots of the chains, palm frame
+    root_rotation: Float  # (5, 3, 3) rest orientation of the root joints, joint -> palm frame
+    dip_ratio: Float  # this and dip_bias_rad: (5,) DIP = ratio PIP + bias (thumb: IP and MCP)
     dip_bias_rad: Float
-    back_m: Float
+    back_m: Float  # (B, 3) markers of the back, palm frame
 
     @classmethod
     def of(cls, model: HandModel, back: tuple[str, ...], dip_ratio: float, thumb_ratio: float) -> "Shape":
@@ -61,7 +45,7 @@ class Shape:
 
     @property
     def size(self) -> int:
-        """How many numbers it has: 11 of each finger, then 3 of each marker of the back."""
+        """Number of unknowns: 11 of each finger, then 3 of each marker of the back."""
         return 5 * PER_FINGER + self.back_m.size
 
     def stepped(self, step: Float) -> "Shape":
@@ -80,27 +64,18 @@ class Shape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Caps:
-    """Positions of the fingertip caps in the palm frame, for T epochs.
+    """Fingertip caps in the palm frame, and their derivatives, for T epochs."""
 
-    Attributes:
-        place_m: (T, 5, 3).
-        by_angle: (T, 5, 3, 4) [m/rad] change with abduction, flexion, PIP, DIP.
-        by_shape: (T, 5, 3, 11) change with the numbers of the own finger.
-    """
-
-    place_m: Float
-    by_angle: Float
-    by_shape: Float
+    place_m: Float  # (T, 5, 3)
+    by_angle: Float  # (T, 5, 3, 4) [m/rad] by abduction, flexion, PIP, DIP
+    by_shape: Float  # (T, 5, 3, 11) by the numbers of the own finger
 
 
 def caps_of(model: HandModel, cap_m: Float, shape: Shape, angles_rad: Float) -> Caps:
-    """Caps of a shape.
+    """Caps of a shape for angles (T, 5, 4): abduction, flexion, PIP, DIP [rad].
 
-    Args:
-        model: Template: rest turns, directions of bones, side.
-        cap_m: (5, 3) offsets of the caps in the frames of the tip joints [m].
-        shape: The shape.
-        angles_rad: (T, 5, 4) abduction, flexion, PIP, DIP.
+    `model` gives rest rotations, directions of bones and side, `cap_m` (5, 3) the caps' offsets in the tip
+    joints [m].
     """
     count = len(angles_rad)
     abduct = _about(1, model.side_sign * angles_rad[..., 0])
@@ -149,68 +124,53 @@ def _about(axis: int, angle: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Priors:
-    """Standard deviations.
+    """Standard deviations."""
 
-    Attributes:
-        bone: Of one bone about its share of the hand length, as a share of its length. Individuals spread by 5 to 8 %
-            (Buchholz, Armstrong & Goldstein, 1992; Greiner, 1991).
-        root_m: Of a knuckle's place, and of the thumb's CMC.
-        root_rad, thumb_rad: Of a finger's and the thumb's rest orientation, about each axis.
-        dip_ratio, thumb_ratio: Mean and sd of DIP per PIP, between Kalbfleisch's 2/3 and Kamper's 0.84, and of the
-            thumb's IP per MCP.
-        dip_bias_rad: Of the DIP of a finger whose PIP is straight.
-        dip_rad, thumb_dip_rad: By how much the DIP drifts from that, slowly.
-        straight_rad: Mean and sd of the PIP of a finger that is held straight.
-        level_rad, moving_level_rad: Of an angle about what the routine asks for, while held and while it moves.
-        held_rad_s: Wandering of a joint that is to be held [rad/sqrt(s)].
-        moving_rad_s: Of one that is to move.
-        palm_rad_s, palm_m_s: Of a palm that rests [rad/sqrt(s)], [m/sqrt(s)].
-        free_palm_rad_s, free_palm_m_s: Of one that need not, because three markers on it are seen.
-        back_m: Of the place of a marker on the back.
-        slow_s: Time over which deviations live [s].
-        model_m: Of a cap's place, by what the model leaves out: skin that moves, caps not quite round.
-    """
-
+    # of one bone about its share of the hand length, as a share of its length. Individuals spread by 5 to 8 %
+    # (Buchholz, Armstrong & Goldstein, 1992; Greiner, 1991)
     bone: float = 0.07
-    root_m: float = 6e-3
+    root_m: float = 6e-3  # of a knuckle's place, and of the thumb's CMC
+    # this and thumb_rad: of a finger's and the thumb's rest orientation, about each axis
     root_rad: float = float(np.radians(5.0))
     thumb_rad: float = float(np.radians(12.0))
+    # this and thumb_ratio: mean and sd of DIP per PIP, between Kalbfleisch's 2/3 and Kamper's 0.84, and of
+    # the thumb's IP per MCP
     dip_ratio: tuple[float, float] = (0.75, 0.08)
     thumb_ratio: tuple[float, float] = (0.9, 0.3)
-    dip_bias_rad: float = float(np.radians(3.0))
+    dip_bias_rad: float = float(np.radians(3.0))  # of the DIP of a finger whose PIP is straight
+    # this and thumb_dip_rad: by how much the DIP drifts from that, slowly
     dip_rad: float = float(np.radians(5.0))
     thumb_dip_rad: float = float(np.radians(12.0))
+    # mean and sd of the PIP of a finger that is held straight
     straight_rad: tuple[float, float] = (float(np.radians(1.5)), float(np.radians(1.5)))
+    # this and moving_level_rad: of an angle about what the routine asks for, while held and while it moves
     level_rad: float = float(np.radians(12.0))
     moving_level_rad: float = float(np.radians(30.0))
-    held_rad_s: float = float(np.radians(2.5))
-    moving_rad_s: float = float(np.radians(400.0))
+    held_rad_s: float = float(np.radians(2.5))  # wandering of a joint that is to be held [rad/sqrt(s)]
+    moving_rad_s: float = float(np.radians(400.0))  # of one that is to move
+    # this and palm_m_s: of a palm that rests [rad/sqrt(s)], [m/sqrt(s)]
     palm_rad_s: float = float(np.radians(0.3))
     palm_m_s: float = 3e-4
+    # this and free_palm_m_s: of one that need not, because three markers on it are seen
     free_palm_rad_s: float = float(np.radians(100.0))
     free_palm_m_s: float = 0.3
-    back_m: float = 8e-3
-    slow_s: float = 1.0
+    back_m: float = 8e-3  # of the place of a marker on the back
+    slow_s: float = 1.0  # time over which deviations live [s]
+    # of a cap's place, by what the model leaves out: skin that moves, caps not quite round
     model_m: float = 2e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoutineTargets:
-    """What the routine asks for at each knot.
+    """What the routine asks for at each knot."""
 
-    Attributes:
-        posture_rad: (K, 5, 3).
-        moving: (K, 5, 3) the angle is to change.
-        straight: (K, 5) the finger is to be straight.
-    """
-
-    posture_rad: Float
-    moving: Bool
-    straight: Bool
+    posture_rad: Float  # (K, 5, 3)
+    moving: Bool  # (K, 5, 3) the angle is to change
+    straight: Bool  # (K, 5) the finger is to be straight
 
     @classmethod
     def of(cls, script_s: Float) -> "RoutineTargets":
-        """Return the targets at routine times (K,) [s].
+        """The targets at routine times (K,) [s].
 
         What may be moving by then counts as moving, since times are known roughly.
         """

@@ -1,21 +1,14 @@
 """A bundle adjustment fits beads on a rigid body to their observations.
 
-Positions of an object's beads over time, with covariances.
-
-From what cameras found or a master published.
-
-Bundle adjustment of bead positions on a rigid body and its pose per epoch.
-
-One least-squares problem, from where the beads were.
-
-Minimised over beads q_b and poses R_t, p_t, with the covariances C of the points, which hold what the cameras' pixels
-measured (a bundle adjustment, linear in the points: Triggs et al. 2000):
+Bead positions over time with covariances enter, from cameras or a running master. Minimised over beads q_b
+and poses R_t, p_t, with the covariances C of the points, which hold what the cameras' pixels measured (a
+bundle adjustment, linear in the points: Triggs et al. 2000):
 
     sum_tb  rho( e' C^-1 e ),   e = R_t q_b + p_t - x_tb
 
-Poses are eliminated (Schur complement), so that what is solved has 3 B unknowns however long the motion was. The frame
-of q is free: steps that only move the whole body are excluded (inner constraints, ibid. 9.2.2). rho is Geman and
-McClure's, so that a bead that was taken for something else, or was half hidden, costs itself.
+Poses are eliminated (Schur complement), so that what is solved has 3 B unknowns however long the motion was.
+The frame of q is free: steps that only move the whole body are excluded (inner constraints, ibid. 9.2.2). rho
+is Geman and McClure's, so that a bead that was mistaken, or was half hidden, costs itself.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,19 +32,12 @@ from master.fabrik.sync import FrameSet, FrameSync
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """Beads of one object over time.
+    """Beads of one object over time."""
 
-    Attributes:
-        names: (B,) of the beads.
-        t_s: (T,) rising [s], from the first.
-        points_m: (T, B, 3) rig frame; NaN: not seen by two cameras.
-        cov_m2: (T, B, 3, 3); NaN as the points.
-    """
-
-    names: tuple[str, ...]
-    t_s: Float
-    points_m: Float
-    cov_m2: Float
+    names: tuple[str, ...]  # (B,) of the beads
+    t_s: Float  # (T,) rising [s], from the first
+    points_m: Float  # (T, B, 3) rig frame; NaN: not seen by two cameras
+    cov_m2: Float  # (T, B, 3, 3); NaN as the points
 
     @property
     def known(self) -> Bool:
@@ -63,7 +49,7 @@ def rows_of(rig: RigCalibration, names: Sequence[str]) -> list[int]:
     """Rows of the beads among the rig's markers.
 
     Raises:
-        CalibrationError: The rig has no such marker, or it sits on the hand; the message states what to write.
+        CalibrationError: The rig has no such marker, or it sits on the hand; the message names the remedy.
     """
     listed = ", ".join(f'"{name}"' for name in names)
     for name in names:
@@ -85,14 +71,9 @@ def seen_by(
 ) -> Seen:
     """Bring the cameras to common epochs and triangulate the beads there.
 
-    What has a second place in a camera is rejected at that epoch: there is no pose yet that determines which is right.
-
-    Args:
-        rig: Whose markers these are.
-        models: Camera -> model, in the rig's order.
-        frame_rate_hz: Camera -> nominal rate.
-        messages: Of all cameras, by their stamps.
-        names: Of the beads.
+    What has a second place in a camera is rejected at that epoch: there is no pose yet that determines which
+    is right. Models and nominal rates are by camera, in the rig's order; messages are of all cameras, by
+    their stamps.
 
     Raises:
         CalibrationError: As `rows_of`.
@@ -138,7 +119,7 @@ def seen_in(poses: Sequence[HandPose], rig: RigCalibration, names: Sequence[str]
 
 
 def _clear(frames: FrameSet, uv: Float) -> Float:
-    """Return the pixels (C, M, 2) without those that have an alternative."""
+    """The pixels (C, M, 2) without those that have an alternative."""
     if frames.alt_uv is None:
         return uv
     return np.where(np.isfinite(frames.alt_uv[..., :1]), np.nan, uv)
@@ -158,47 +139,30 @@ _ROUNDS = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """A rigid body that explains what was seen.
+    """A rigid body that explains what was seen."""
 
-    Attributes:
-        seen: The epochs that were used.
-        beads_m: (B, 3) in a frame of its own.
-        cov_m2: (3 B, 3 B) of the beads among each other, from the covariances of the points alone.
-        T: (T, 4, 4) body -> rig.
-        off_m: (T, B, 3) where the body has a bead, less where it was seen; NaN: not seen.
-        weight: (T, B) 0..1; 0: not seen.
-        spread: How large what is left is by what the covariances expect.
-    """
-
-    seen: Seen
-    beads_m: Float
-    cov_m2: Float
-    T: Float
-    off_m: Float
-    weight: Float
-    spread: float
+    seen: Seen  # the epochs that were used
+    beads_m: Float  # (B, 3) in a frame of its own
+    cov_m2: Float  # (3 B, 3 B) of the beads among each other, from the covariances of the points alone
+    T: Float  # (T, 4, 4) body -> rig
+    off_m: Float  # (T, B, 3) fitted minus seen; NaN: not seen
+    weight: Float  # (T, B) 0..1; 0: not seen
+    spread: float  # residuals as a factor of what the covariances expect
 
     @property
     def outlier(self) -> Bool:
-        """Return the observations (T, B) that the body does not explain."""
+        """The observations (T, B) that the body does not explain."""
         # weight below which a bead at an epoch counts as an outlier
         return self.seen.known & (self.weight < 0.1)
 
 
 def usable(seen: Seen) -> Bool:
-    """Select the epochs (T,) that constrain the body.
-
-    Three beads or more are known.
-    """
+    """The epochs (T,) that constrain the body: three beads or more are known."""
     return seen.known.sum(axis=1) >= 3
 
 
 def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
-    """Fit a body.
-
-    Args:
-        seen: The beads over time.
-        rows: Which epochs; None: all that are usable, at most so many, spread.
+    """Fit a body to epochs `rows`; None: all that are usable, thinned to a maximum.
 
     Raises:
         FitError: A bead is never seen together with two others whose places are known.
@@ -209,7 +173,8 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, most).astype(np.int64))]
     own = Seen(seen.names, seen.t_s[chosen], seen.points_m[chosen], seen.cov_m2[chosen])
     beads, T = first_body(own)
-    info = np.where(own.known[..., None, None], _inverse(own.cov_m2), 0.0)
+    known_cov = np.where(np.isfinite(own.cov_m2), own.cov_m2, np.eye(3))
+    info = np.where(own.known[..., None, None], np.linalg.inv(known_cov), 0.0)
     points = np.nan_to_num(own.points_m)
     scale_2, cov = 1.0, np.empty(0)
     weight = own.known.astype(np.float64)
@@ -224,8 +189,7 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         rotation = rotation_vector_to_matrix(poses[:, :3])
         T = T.copy()
         T[:, :3, :3], T[:, :3, 3] = rotation @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
-        settled_m = 1e-7
-        if float(np.abs(step).max()) < settled_m:
+        if float(np.abs(step).max()) < 1e-7:
             break
     off = _off(beads, T, points)
     left = np.where(own.known[..., None], off, np.nan)
@@ -233,9 +197,7 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
 
 
 def first_body(seen: Seen) -> tuple[Float, Float]:
-    """Return initial beads (B, 3) and poses (T, 4, 4).
-
-    From the epoch that is known best, bead by bead by medians.
+    """Beads (B, 3), by medians from the best known epoch, and poses (T, 4, 4).
 
     Raises:
         FitError: A bead is never seen together with two others whose places are known.
@@ -265,10 +227,7 @@ def _medians(placed: Float, beads: Float) -> Float:
 
 
 def _pose(points: Float, beads: Float) -> Float:
-    """Return the pose (4, 4) of a body (B, 3) from points (B, 3).
-
-    NaN where fewer than three are known of both.
-    """
+    """Pose (4, 4) of a body (B, 3) from points (B, 3); NaN: fewer than three known."""
     both = np.isfinite(points[:, 0] + beads[:, 0])
     return fit_rigid(points[both], beads[both]) if both.sum() >= 3 else np.full((4, 4), np.nan)
 
@@ -277,17 +236,11 @@ def _off(beads: Float, T: Float, points: Float) -> Float:
     return np.array([transform(pose, beads) for pose in T]) - points
 
 
-def _inverse(cov: Float) -> Float:
-    return np.linalg.inv(np.where(np.isfinite(cov), cov, np.eye(3)))
-
-
 def _scale_2(chi: Float, known: Bool) -> float:
-    """Return the factor by which the covariances are multiplied.
+    """Factor of the covariances, at least 1, by the median of chi-squares (T, B).
 
-    1 at least, from chi-squares (T, B) by their median.
-
-    Of the 3 n numbers of an epoch 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n numbers, whose
-    median follows by Wilson and Hilferty (1931).
+    Of the 3 n numbers of an epoch 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n
+    numbers, whose median follows by Wilson and Hilferty (1931).
     """
     own = chi[known]
     free = 3.0 - 6.0 / float(known.sum(axis=1).mean())
@@ -296,10 +249,7 @@ def _scale_2(chi: Float, known: Bool) -> float:
 
 
 def _solved(beads: Float, T: Float, off: Float, info: Float) -> tuple[Float, Float, Float]:
-    """Perform one Gauss-Newton step.
-
-    Of the beads (B, 3), of the poses (T, 6: rotation, position); also returns the beads' covariance.
-    """
+    """Gauss-Newton step of beads (B, 3) and poses (T, 6), and the beads' covariance."""
     count = len(beads)
     R = T[:, :3, :3]
     by_pose = np.empty((len(T), count, 3, 6))
@@ -325,7 +275,7 @@ def _solved(beads: Float, T: Float, off: Float, info: Float) -> tuple[Float, Flo
 
 
 def _free(beads: Float) -> Float:
-    """Basis (3 B, 3 B - 6) of the steps that change the body and not only its frame."""
+    """Basis (3 B, 3 B - 6) of steps that change the body and not only its frame."""
     middle = beads - beads.mean(axis=0)
     moves = np.concatenate([np.tile(np.eye(3), (len(beads), 1)), skew(middle).reshape(-1, 3)], axis=1)
     return np.linalg.svd(moves)[0][:, 6:]

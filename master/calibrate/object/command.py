@@ -1,22 +1,8 @@
 """Measure an object: guide its user, fit and save.
 
-A session guides a person through the object motion on a running master.
-
-Guided object motion with a person.
-
-Every second reports what is seen and what is still missing, until it is enough.
-
-The guided motion with the master that runs: opens its bus.
-
-The command `calibrate object` measures beads and writes the object file.
-
-Writing of the measured beads into the object's file, and the report.
-
-In the frame asked for, the rest of an old file kept.
-
-`phalanx calibrate object`: where the beads of a new object sit.
-
-Measured by moving it before the cameras.
+The object is moved before the cameras, live on a running master or in a recording; every second the guide
+reports what is seen and what is still missing. Bead positions go into the object's file, the rest of an old
+file is kept.
 """
 
 from argparse import Namespace
@@ -27,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import RigCalibration, load, save
+from common.calibration import RigCalibration, load
 from common.calibration.object_profile import Bead, ObjectProfile, check_object
 from common.clock import Clock, SystemClock
 from common.command_line import echo
@@ -47,10 +33,18 @@ from master.calibrate.object.measure import (
     looks_of,
     measure_object,
 )
-from master.calibrate.time_offsets import geometry_of
-from master.calibrate.tree_files import load_marker_rig, provenance, rig_in_tree, write_rig
+from master.calibrate.time_offsets import detections_of, geometry_of
+from master.calibrate.tree_files import (
+    load_marker_rig,
+    print_lines,
+    provenance,
+    refusals_named,
+    rig_in_tree,
+    vector_of,
+    write_object,
+    write_rig,
+)
 from master.commands.summary import write_summary
-from master.replay.recorded import recorded_detections
 from master.run.process import join_bus
 
 Receive = Callable[[float], HandPose | None]
@@ -66,29 +60,22 @@ def guide(
 ) -> Seen:
     """Lead a person through the motion until it is enough, or the time is over.
 
-    Args:
-        receive: The next pose of the running master, waiting at most so long [s].
-        rig: Of that master.
-        names: Of the beads.
-        clock: Of this machine.
-        notify: Called with one line at a time.
-        longest_s: How long the motion may take [s].
+    `receive` gives the next pose of the running master, waiting at most so long [s]; `notify` is called with
+    one line at a time.
 
     Raises:
-        CalibrationError: As `master.calibrate.object.bundle.seen_in`.
+        CalibrationError: As `seen_in`.
         FitError: No pose came.
     """
     poses = list[HandPose]()
     notify(MOTION)
     begin_ns = printed_ns = clock.now_ns()
     while clock.now_ns() - begin_ns < longest_s * 1e9:
-        wait_s = 0.05
-        pose = receive(wait_s)
+        pose = receive(0.05)
         if pose is not None:
             poses.append(pose)
         now_ns = clock.now_ns()
-        print_ns = 1_000_000_000
-        if now_ns - printed_ns < print_ns:
+        if now_ns - printed_ns < 1_000_000_000:
             continue
         printed_ns = now_ns
         if not poses:
@@ -104,7 +91,7 @@ def guide(
 
 
 def progress(seen: Seen) -> tuple[str, bool]:
-    """What there is and what is wanting, for a person; whether it is enough."""
+    """Progress and what is still missing, for a person; and whether it is enough."""
     rows = np.flatnonzero(usable(seen))
     whole = int(seen.known.all(axis=1).sum())
     looks = 0
@@ -133,14 +120,7 @@ def progress(seen: Seen) -> tuple[str, bool]:
 def observe_live(
     bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
 ) -> Seen:
-    """Lead the user through the motion.
-
-    Args:
-        bus: Endpoint of the running master's bus.
-        rig: That it runs.
-        names: Of the beads.
-        longest_s: How long the motion may take [s].
-        notify: Called with one line at a time.
+    """Lead the user through the motion, on the bus of a running master.
 
     Raises:
         BusError: Nobody listens there.
@@ -149,8 +129,7 @@ def observe_live(
     """
     link = join_bus(bus)
     try:
-        depth = 512  # poses that may wait while a line is printed
-        poses = link.subscribe("hand", depth=depth)
+        poses = link.subscribe("hand", depth=512)  # poses that may wait while a line is printed
 
         def receive(timeout_s: float) -> HandPose | None:
             message = poses.get(timeout_s)
@@ -173,15 +152,10 @@ def measured_profile(
     like: ObjectProfile | None,
     like_where: str,
 ) -> tuple[ObjectProfile, dict[str, float]]:
-    """Return the object and the displacement of each bead from an old file [m].
+    """The object, and the displacement of each bead from an old file [m].
 
-    Args:
-        found: What was measured.
-        name: Of the object.
-        radius_m: Of each bead.
-        data: Name of what it was measured from.
-        like: Whose frame and whose other parts are kept; None: a frame of its own, and nothing else.
-        like_where: Name of its file, for errors.
+    `data` names what it was measured from. Frame and other parts are those of `like`, which file `like_where`
+    holds; None: a frame of its own, and nothing else.
 
     Raises:
         FitError: The frame of `like` cannot be kept.
@@ -194,7 +168,7 @@ def measured_profile(
         frame = f"frame of {like_where}"
     places = transform(T, found.bundle.beads_m)
     beads = {
-        bead: Bead(position_m=_vector(place), radius_m=radius_m[bead])
+        bead: Bead(position_m=vector_of(place), radius_m=radius_m[bead])
         for bead, place in zip(found.names, places, strict=True)
     }
     residual = {f"{bead}_rms_mm": _mm(rms) for bead, rms in zip(found.names, found.rms_m, strict=True)}
@@ -204,21 +178,6 @@ def measured_profile(
     profile = replace(base, markers=beads, provenance=base.provenance | {"markers": how})
     check_object(profile, name)
     return profile, misses
-
-
-def write_object(out: Path, profile: ObjectProfile) -> Path:
-    """Write objects/<name>.json of the tree `out`; return its path.
-
-    Raises:
-        CalibrationError: It cannot be written; an old file is untouched.
-    """
-    path = out / "objects" / f"{profile.name}.json"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
-    save(path, profile)
-    return path
 
 
 def add_to_rig(out: Path, rig_name: str, rig: RigCalibration, name: str) -> Path:
@@ -278,27 +237,17 @@ def _mm(value: float | Float) -> float:
     return round(1e3 * float(value), 3)
 
 
-def _vector(value: Float) -> tuple[float, float, float]:
-    x, y, z = (round(float(number), 7) + 0.0 for number in np.asarray(value))
-    return x, y, z
-
-
 def object_command(options: Namespace) -> None:
     """Measure where the beads of a rigid object sit."""
-    _check_together(
-        options.live, options.recording, options.detections, options.rig, options.add_to_rig, options.out
-    )
+    _check_together(options)
     base, where = base_of(options.calibration, options.name, options.like)
-    given = (
-        None
-        if options.markers is None
-        else tuple(part.strip() for part in options.markers.split(",") if part.strip())
-    )
+    given = None
+    if options.markers is not None:
+        given = tuple(part.strip() for part in options.markers.split(",") if part.strip())
     if options.live:
         assert options.rig is not None
         used = load_marker_rig(options.calibration, options.rig)
         names = names_of(given, base, used)
-
         seen, data = observe_live(options.bus, used, names, options.seconds, echo), "live"
     else:
         assert options.recording is not None
@@ -307,15 +256,11 @@ def object_command(options: Namespace) -> None:
             options.recording, options.detections, options.rig, options.calibration, given, base
         )
         data = options.recording.resolve().name
-    try:
+    with refusals_named(data):
         found = measure_object(seen)
-        profile, misses = measured_profile(
-            found, options.name, radii(names, options.radius_mm, base), data, base, where
-        )
-    except FitError as error:
-        raise FitError(f"{data}: {error}") from error
-    for line in report_lines(found, profile, misses):
-        echo(line)
+        radius_m = radii(names, options.radius_mm, base)
+        profile, misses = measured_profile(found, options.name, radius_m, data, base, where)
+    print_lines(report_lines(found, profile, misses))
     if options.picture is not None:
         from master.calibrate.picture import draw_object
 
@@ -327,9 +272,7 @@ def object_command(options: Namespace) -> None:
 
 
 def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProfile | None, str]:
-    """Return the object file whose frame and other parts are kept, and its name.
-
-    None: there is none.
+    """The object file whose frame and other parts are kept, and its name; or None.
 
     Raises:
         CalibrationError: It is missing or broken.
@@ -343,9 +286,7 @@ def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProf
 def names_of(
     given: tuple[str, ...] | None, base: ObjectProfile | None, rig: RigCalibration
 ) -> tuple[str, ...]:
-    """Return the names of the beads.
-
-    As given, of the file, or all that sit on no hand.
+    """Names of the beads: as given, of the file, or all that sit on no hand.
 
     Raises:
         CalibrationError: Fewer than three, one stands twice, or the rig does not have them.
@@ -361,10 +302,7 @@ def names_of(
 
 
 def radii(names: tuple[str, ...], radius_mm: float | None, base: ObjectProfile | None) -> dict[str, float]:
-    """Return the radius of each bead [m].
-
-    As given, as the file has it, or the usual.
-    """
+    """Radius of each bead [m]: as given, as the file has it, or the usual."""
     there = {} if base is None else {name: bead.radius_m for name, bead in base.markers.items()}
     return {
         name: there.get(name, 0.008) if radius_mm is None else round(1e-3 * radius_mm, 7) for name in names
@@ -395,29 +333,17 @@ def recorded(
         raise CalibrationError(f"rig {used.name!r}: cameras: two or more are needed")
     names = names_of(given, base, used)
     models = {camera: CameraModel.of(cameras[camera], used.camera_pose(camera)) for camera in used.cameras}
-    messages = [
-        message
-        for camera in used.cameras
-        for message in recorded_detections(detections, camera, len(used.markers))
-    ]
-    messages.sort(key=lambda message: message.t_ns)
     rates = {camera: cameras[camera].frame_rate_hz for camera in used.cameras}
-    return used, names, seen_by(used, models, rates, messages, names)
+    return used, names, seen_by(used, models, rates, detections_of(used, detections), names)
 
 
-def _check_together(
-    live: bool,
-    recording: Path | None,
-    detections: Path | None,
-    rig: str | None,
-    adds: bool,
-    out: Path | None,
-) -> None:
-    if live == (recording is not None) or live == (detections is not None):
+def _check_together(options: Namespace) -> None:
+    live: bool = options.live
+    if live == (options.recording is not None) or live == (options.detections is not None):
         raise CalibrationError("give --live, or --recording FOLDER and --detections DIR of the motion")
-    if live and rig is None:
+    if live and options.rig is None:
         raise CalibrationError("--live needs --rig: that of the running master")
-    if adds and out is None:
+    if options.add_to_rig and options.out is None:
         raise CalibrationError("--add-to-rig writes into the tree --out: give --out DIR")
 
 

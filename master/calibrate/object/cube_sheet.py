@@ -1,13 +1,8 @@
 """The command `phalanx calibrate cube` draws a box of tags to cut and fold.
 
-Printable box of tags to cut out and fold.
-
-Its five faces as one net at true scale, and the file of the object.
-
-The top is in the middle of the net and the four sides stand about it, each with its upper edge at the top. The frame
-of the object is in the middle of the box: x to the right and y up on the top as it is printed, z out of it.
-
-`phalanx calibrate cube`: a box of tags to print and fold, and its object file.
+Its five faces are one net at true scale; the object's file is written too. The top is in the middle of the
+net and the four sides stand about it, each with its upper edge at the top. The frame of the object is in the
+middle of the box: x to the right and y up on the top as it is printed, z out of it.
 """
 
 from argparse import Namespace
@@ -35,20 +30,12 @@ _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))  # outward, object frame: the first 
 
 @dataclass(frozen=True, slots=True)
 class TagBox:
-    """A box that wears a tag on each of five faces, the sixth for what carries it.
-
-    Attributes:
-        name: Of the object.
-        family: Of its tags.
-        first: Number of the first; the others follow.
-        side_m: Of the box [m].
-        edge_m: Of the black squares [m].
-    """
+    """A box with a tag on each of five faces, the sixth for what carries it."""
 
     name: str
     family: TagFamily
-    first: int
-    side_m: float
+    first: int  # number of the first tag; the others follow
+    side_m: float  # this and edge_m: of the box, and of the tags' black squares [m]
     edge_m: float
 
     def __post_init__(self) -> None:
@@ -63,8 +50,7 @@ class TagBox:
             raise CalibrationError(
                 f"--first {self.first}: {self.family} has tags 0 to {grid.tags - 1}, five are needed"
             )
-        edge_mm = 8.0
-        if not self._across_mm() <= _A4_MM[0] - 2.0 * edge_mm:
+        if not 3e3 * self.side_m <= _A4_MM[0] - 16.0:  # the net is three sides wide, with 8 mm beside it
             raise CalibrationError(f"--side-mm {1e3 * self.side_m:g}: the net does not fit on A4: 64 does")
 
     def profile(self) -> ObjectProfile:
@@ -79,21 +65,14 @@ class TagBox:
             Tag(id=self.first + k, edge_m=self.edge_m, T_object_tag=_rows(T)) for k, T in enumerate(poses)
         )
         size = (self.side_m, self.side_m, self.side_m)
-        return ObjectProfile(
-            version=1,
-            name=self.name,
-            tags=Tags(family=self.family, tags=tags),
-            shape=(BoxShape(size_m=size),),
-        )
-
-    def _across_mm(self) -> float:
-        return 3e3 * self.side_m
+        tagged = Tags(family=self.family, tags=tags)
+        return ObjectProfile(version=1, name=self.name, tags=tagged, shape=(BoxShape(size_m=size),))
 
 
 def dark_squares(box: TagBox) -> list[tuple[float, float, float]]:
-    """Return left edge, lower edge and size [mm] of all black cells.
+    """Left edge, lower edge and size [mm] of all black cells, from the net's middle.
 
-    From the middle of the net, x to the right, y up.
+    x to the right, y up.
     """
     cells = GRIDS[box.family].cells + 2
     cell = 1e3 * box.edge_m / cells
@@ -110,9 +89,7 @@ def dark_squares(box: TagBox) -> list[tuple[float, float, float]]:
 
 
 def print_box(path: Path, box: TagBox) -> None:
-    """Write the net on an A4 page as PDF or SVG.
-
-    The extension of the file decides which.
+    """Write the net on an A4 page as PDF or SVG, by the file's ending.
 
     Raises:
         CalibrationError: Another ending, or the file cannot be written.
@@ -162,7 +139,6 @@ def _rows(T: Float) -> Matrix4:
 
 def cube(options: Namespace) -> None:
     """Draw the net of a box of tags at true scale and write objects/<name>.json."""
-
     box = TagBox(options.name, options.family, options.first, 1e-3 * options.side_mm, 1e-3 * options.edge_mm)
     path = options.calibration / "objects" / f"{options.name}.json"
     if path.exists():

@@ -1,12 +1,7 @@
 """A measurement finds an object's beads, and the frame they are written in.
 
-Frame in which the positions of beads are written.
-
-The object's own, by the beads, or that of an existing file.
-
-Positions of the beads on an object, measured from its motion.
-
-The observations are checked, fitted, and refused with the cause.
+Observations are checked, fitted, and refused with the cause. The frame is the object's own, by the beads, or
+that of an existing file.
 """
 
 from collections.abc import Mapping
@@ -29,9 +24,7 @@ OWN = (
 
 
 def own_frame(beads_m: Float, names: tuple[str, ...]) -> Float:
-    """Return `T_own_body` (4, 4) for beads (B, 3) [m].
-
-    Axes as `OWN` defines; z is x times y.
+    """`T_own_body` (4, 4) for beads (B, 3) [m], with axes by `OWN`; z is x times y.
 
     Raises:
         FitError: The beads lie in one line.
@@ -54,9 +47,7 @@ def own_frame(beads_m: Float, names: tuple[str, ...]) -> Float:
 def frame_of(
     beads_m: Float, names: tuple[str, ...], like: ObjectProfile, where: str
 ) -> tuple[Float, dict[str, float]]:
-    """Return `T_file_body` (4, 4), the best fit of beads (B, 3) to those of a file.
-
-    Also by how much each bead misses [m].
+    """`T_file_body` (4, 4) that fits beads (B, 3) to a file's; misses by bead [m].
 
     Raises:
         FitError: The file has fewer than three of them, in one line, or they lie elsewhere.
@@ -87,28 +78,19 @@ MOTION = (
 )
 ENOUGH = 240  # epochs at which all beads are known
 ENOUGH_LOOKS = 15
-_LOOK_RAD = np.radians(
-    10.0
-)  # turned by so much, a bead shows cameras another side: what misleads them is another
+_LOOK_RAD = np.radians(10.0)  # turned by so much, a bead shows another side: what misleads is another
 # By which a distance between beads may change, from the tenth to the ninetieth percentile of quarters of a second.
 _RIGID_M = 2e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """Beads of an object.
-
-    Attributes:
-        bundle: What was fitted.
-        T_own_body: (4, 4) of the frame that is reported (`master.calibrate.object.measure`).
-        looks: How many ways of turning and places cameras saw it in.
-        sigma_m: (B,) how sure each place is among the others, largest axis.
-    """
+    """Beads of an object."""
 
     bundle: Bundle
-    T_own_body: Float
-    looks: int
-    sigma_m: Float
+    T_own_body: Float  # (4, 4) of the frame that is reported, see `own_frame`
+    looks: int  # in how many distinct poses cameras saw it
+    sigma_m: Float  # (B,) standard deviation of each place among the others, largest axis
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,16 +99,13 @@ class Measurement:
 
     @property
     def rms_m(self) -> Float:
-        """Return the root mean square residual (B,) of each bead to the body.
-
-        Outliers are rejected.
-        """
+        """Rms residual (B,) of each bead from the body, without outliers."""
         kept = np.where((self.bundle.weight > 0) & ~self.bundle.outlier, 1.0, np.nan)
         return np.sqrt(np.nanmean(kept * (self.bundle.off_m**2).sum(axis=-1), axis=0))
 
     @property
     def outlier_share(self) -> Float:
-        """Return the share (B,) of each bead's observations that the body does not fit."""
+        """Share (B,) of each bead's observations that the body does not fit."""
         return self.bundle.outlier.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
 
 
@@ -134,7 +113,8 @@ def measure_object(seen: Seen) -> Measurement:
     """Measure.
 
     Raises:
-        FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not determine them.
+        FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not
+            determine them.
     """
     refuse_insufficient(seen)
     refuse_loose(seen)
@@ -149,15 +129,13 @@ def measure_object(seen: Seen) -> Measurement:
     found = Measurement(bundle, own, looks, sigma)
     outlier_share = found.outlier_share
     worst = int(np.argmax(outlier_share))
-    most_outliers = 0.3
-    if outlier_share[worst] > most_outliers:
+    if outlier_share[worst] > 0.3:
         raise FitError(
             f"{seen.names[worst]}: {100 * outlier_share[worst]:.0f} % of its views are elsewhere than the other"
             " beads show: is its colour calibrated, is nothing else of that colour seen, are the cameras calibrated?"
         )
     fewest_looks = 4
-    sigma_m = 1e-3  # standard deviation of a bead, at most
-    if looks < fewest_looks or float(sigma.max()) > sigma_m:
+    if looks < fewest_looks or float(sigma.max()) > 1e-3:  # standard deviation of a bead, at most
         raise FitError(
             f"it was seen in {looks} ways of turning and places, the beads are known to"
             f" {1e3 * float(sigma.max()):.1f} mm: {MOTION}"
@@ -188,9 +166,7 @@ def refuse_insufficient(seen: Seen) -> None:
 
 
 def refuse_loose(seen: Seen) -> None:
-    """Refuse beads that do not keep their distances.
-
-    For the most part of the time, not for a moment.
+    """Refuse beads that do not keep their distances, most of the time.
 
     Raises:
         FitError: Which bead moved, where the others determine it.
@@ -215,10 +191,7 @@ def refuse_loose(seen: Seen) -> None:
 
 
 def guilty_of(change: Mapping[tuple[int, int], tuple[float, float]], count: int) -> int | None:
-    """Return the bead without which the others keep their distances.
-
-    If it is one; `change` as of `changes`.
-    """
+    """The one bead without which the others keep their distances; None: unknown."""
     rest = [
         max((by / most for pair, (by, most) in change.items() if bead not in pair), default=0.0)
         for bead in range(count)
@@ -228,12 +201,11 @@ def guilty_of(change: Mapping[tuple[int, int], tuple[float, float]], count: int)
 
 
 def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
-    """Return the change of distance of each pair of beads and its limit [m].
+    """Change of distance of each pair of beads and its limit [m].
 
     Without pairs that were hardly seen.
     """
-    window_s = 0.25
-    window: Int = (seen.t_s / window_s).astype(np.int64)
+    window: Int = (seen.t_s / 0.25).astype(np.int64)
     out = dict[tuple[int, int], tuple[float, float]]()
     for a, b in combinations(range(len(seen.names)), 2):
         way = seen.points_m[:, a] - seen.points_m[:, b]
@@ -256,23 +228,17 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
             continue
         low, high = np.percentile(medians, (10.0, 90.0))
         # most of a sigma changes from frame to frame, or is a suspicion that does not come true
-        rigid_sigmas = 0.5
-        out[a, b] = float(high - low), _RIGID_M + rigid_sigmas * float(np.sqrt(typical))
+        out[a, b] = float(high - low), _RIGID_M + 0.5 * float(np.sqrt(typical))
     return out
 
 
 def looks_of(T: Float) -> int:
-    """Count the poses (T, 4, 4) that give cameras distinctly different views.
-
-    Greedily, the first ones are kept.
-    """
+    """Count the poses (T, 4, 4) that give cameras distinct views, greedily."""
     kept = np.empty((0, 4, 4))
     for pose in T:
-        rotation = np.linalg.norm(
-            matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3]), axis=-1
-        )
+        turn = matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3])
+        rotation = np.linalg.norm(turn, axis=-1)
         way = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
-        look_m = 0.04  # and so does one that is elsewhere
-        if not ((rotation < _LOOK_RAD) & (way < look_m)).any():
+        if not ((rotation < _LOOK_RAD) & (way < 0.04)).any():  # and so does one that is elsewhere
             kept = np.concatenate([kept, pose[None]])
     return len(kept)

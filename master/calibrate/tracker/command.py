@@ -1,22 +1,8 @@
 """Register a tracker: guide its user, fit and save.
 
-A session guides a person through the tracker motion on a running master.
-
-Guided tracker motion with a person.
-
-Every second reports what was seen so far and what is still missing.
-
-The machine that counts is `Session`; `guide` gives it what comes and talks.
-
-The guided motion with the master that runs: opens its bus.
-
-The command `calibrate tracker` reads a motion and writes a registration.
-
-What a registration is made from, and what comes of it, as files.
-
-`phalanx calibrate tracker`: registration of a tracking system to the rig.
-
-Also of its device on an object.
+A motion that cameras and tracking system both see enters, live on a running master or as a file;
+T_rig_tracking goes into the rig's file, T_object_tracker and stamp_offset_us into the object's. `Session`
+counts, `guide` talks: every second it reports what was seen so far and what is still missing.
 """
 
 from argparse import Namespace
@@ -27,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import RigCalibration, load, save
+from common.calibration import RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
 from common.clock import Clock, SystemClock
 from common.command_line import echo
@@ -37,7 +23,14 @@ from common.recording.recorded_files import read_npz, write_npz
 from master.calibrate.tracker.fit import first_lag
 from master.calibrate.tracker.registration import MOTION, Registration, documented, register
 from master.calibrate.tracker.tracks import Coverage, coverage_of, object_track, tracker_track
-from master.calibrate.tree_files import load_marker_rig, rig_in_tree, write_rig
+from master.calibrate.tree_files import (
+    load_marker_rig,
+    print_lines,
+    refusals_named,
+    rig_in_tree,
+    write_object,
+    write_rig,
+)
 from master.commands.summary import write_summary
 from master.run.process import join_bus
 
@@ -49,11 +42,10 @@ Receive = Callable[[float], ObjectPose | TrackerPose | None]
 class Session:
     """Push machine of the guided motion.
 
-    Holds all poses of the motion, and when each side was last received.
+    State: all poses of the motion, and the lag once known.
     """
 
     def __init__(self) -> None:
-        """Begin."""
         self.objects: list[ObjectPose] = []
         self.tracked: list[TrackerPose] = []
         self._lag_s: float | None = None
@@ -66,10 +58,7 @@ class Session:
             self.objects.append(message)
 
     def coverage(self) -> Coverage | None:
-        """Return the coverage so far.
-
-        None: one side has sent nothing yet.
-        """
+        """The coverage so far; None: one side has sent nothing yet."""
         if not (self.objects and self.tracked):
             return None
         zero_ns = min(self.objects[0].t_ns, self.tracked[0].t_ns)
@@ -77,16 +66,12 @@ class Session:
         if len(seen) < 2 or len(device) < 2:
             return None
         found = coverage_of(seen, device, self._lag_s or 0.0)
-        lag_after_s = 5.0
-        if self._lag_s is None and found.shared_s > lag_after_s:
+        if self._lag_s is None and found.shared_s > 5.0:
             self._lag_s = first_lag(seen, device)
         return found
 
     def silent(self, now_ns: int) -> str:
-        """Name the side that sends nothing just now, and what to look at.
-
-        Empty: both send.
-        """
+        """The side that sends nothing just now, and what to look at; empty: both send."""
         if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
             return "no tracker data received: is `phalanx-slave run --tracker` running, and does the master know it?"
         if not np.isfinite([one.position_m for one in self.tracked[-20:]]).any():
@@ -99,11 +84,8 @@ class Session:
 def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest_s: float) -> Session:
     """Lead a person through the motion until it is enough, or the time is over.
 
-    Args:
-        receive: The next pose of object or device, waiting at most so long [s].
-        clock: The master's clock.
-        notify: Called with one line at a time.
-        longest_s: How long the motion may take [s].
+    `receive` gives the next pose of object or device, waiting at most so long [s]; `notify` is called with
+    one line at a time.
 
     Raises:
         FitError: Nothing was received from the cameras or the tracker all the time.
@@ -113,13 +95,11 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
     begin_ns = printed_ns = clock.now_ns()
     enough = False
     while not enough and clock.now_ns() - begin_ns < longest_s * 1e9:
-        wait_s = 0.02
-        message = receive(wait_s)
+        message = receive(0.02)
         if message is not None:
             session.push(message)
         now_ns = clock.now_ns()
-        print_ns = 1_000_000_000
-        if now_ns - printed_ns < print_ns:
+        if now_ns - printed_ns < 1_000_000_000:
             continue
         printed_ns = now_ns
         coverage, silent = session.coverage(), ""
@@ -146,13 +126,7 @@ def _recent(t_ns: list[int], now_ns: int) -> bool:
 def observe_live(
     bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
 ) -> Session:
-    """Lead the user through the motion.
-
-    Args:
-        bus: Endpoint of the running master's bus.
-        profile: The object; it has a tracker.
-        longest_s: How long the motion may take [s].
-        notify: Called with one line at a time.
+    """Lead the user through the motion, on the bus of a running master.
 
     Raises:
         BusError: Nobody listens there.
@@ -178,9 +152,7 @@ _FIX = "it needs t_ns, position_m and orientation_wxyz, each with object_ and tr
 
 
 def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> None:
-    """Save the cameras' and the tracker's poses of a motion as an .npz file.
-
-    `read_motion` reads it.
+    """Save the poses of a motion as an .npz file that `read_motion` reads.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -203,9 +175,7 @@ def write_motion(path: Path, objects: Sequence[ObjectPose], tracked: Sequence[Tr
 
 
 def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], list[TrackerPose]]:
-    """Read the poses of one object from cameras and tracker, both on one clock.
-
-    NaN: not seen, lost.
+    """Read poses of one object from cameras and tracker, on one clock; NaN: lost.
 
     Raises:
         RecordingError: The file is missing or broken, or lacks a key; the text states which.
@@ -235,11 +205,7 @@ def read_motion(path: Path, profile: ObjectProfile) -> tuple[list[ObjectPose], l
 
 
 def _checked(path: Path, arrays: dict[str, Float], who: str) -> int:
-    """How many poses; all keys have as many.
-
-    Raises:
-        RecordingError: They have not, or are no numbers.
-    """
+    """The number of poses; refuse keys that have another, or no numbers."""
     count = len(arrays[f"{who}_t_ns"]) if arrays[f"{who}_t_ns"].ndim == 1 else -1
     for key, shape in _KEYS.items():
         array = arrays[f"{who}_{key}"]
@@ -251,9 +217,7 @@ def _checked(path: Path, arrays: dict[str, Float], who: str) -> int:
 def write_registration(
     out: Path, rig_name: str, rig: RigCalibration, profile: ObjectProfile, found: Registration, source: str
 ) -> tuple[Path, Path]:
-    """Write rigs/<rig_name>.json and objects/<object>.json of the tree `out`.
-
-    Returns their paths.
+    """Write rigs/<rig_name>.json and objects/<object>.json of `out`; return paths.
 
     The files there are kept but for the new keys: T_rig_tracking; T_object_tracker, stamp_offset_us.
 
@@ -264,13 +228,7 @@ def write_registration(
     base = load(path, ObjectProfile) if path.exists() else profile
     base = replace(base, tracker=profile.tracker)
     new_rig, new_object = documented(rig_in_tree(out, rig_name, rig), base, found, source)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
-    written = write_rig(out, rig_name, new_rig)
-    save(path, new_object)
-    return written, path
+    return write_rig(out, rig_name, new_rig), write_object(out, new_object)
 
 
 def tracker(options: Namespace) -> None:
@@ -280,8 +238,6 @@ def tracker(options: Namespace) -> None:
     used = load_marker_rig(options.calibration, options.rig)
     profile = profile_of(options.calibration, options.name, options.device)
     if options.motion is None:
-        pass
-
         session = observe_live(options.bus, profile, options.seconds, echo)
         objects, tracked, source = session.objects, session.tracked, "live"
         if options.keep is not None:
@@ -290,12 +246,9 @@ def tracker(options: Namespace) -> None:
     else:
         objects, tracked = read_motion(options.motion, profile)
         source = options.motion.name
-    try:
+    with refusals_named(source):
         found = register(objects, tracked)
-    except FitError as error:
-        raise FitError(f"{source}: {error}") from error
-    for line in found.report:
-        echo(line)
+    print_lines(found.report)
     if options.picture is not None:
         from master.calibrate.picture import draw_registration
 

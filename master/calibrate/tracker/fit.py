@@ -1,29 +1,22 @@
 """A weighted least-squares fit refines an initial registration.
 
-Initial registration without a prior.
+**Initial.** Cameras and tracker sit in unknown frames, but the rotation of the object within a fifth of a
+second is the same angle in all frames: the lag is where the two courses of that angle differ least. The
+closed form is that of robot-world/hand-eye calibration, A Y = X B for all epochs (Shah, "Solving the
+robot-world/hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5, 2013): the
+rotations of X and Y are the first singular vectors of the sum of R_B (x) R_A, their shifts then a linear
+least squares; outliers are outvoted.
 
-The lag by how fast both rotate, the positions in closed form, outliers outvoted.
+**Fit.** Thirteen unknowns, as small changes: rotation a and shift d of the tracking system about the middle c
+of what was seen, rotation b and shift e of the device in the object's frame, and the lag. With P, R the
+predicted pose:
 
-Cameras and tracker sit in frames that nobody knows yet, but by how much the object turned within a fifth of a second
-is the same number in all frames. So the lag is where the two courses of that number differ least.
+    P' = P + a x (P - c) + d + R e - v dt        rotation' = a + R b - w dt
 
-The closed form is that of robot-world/hand-eye calibration, A Y = X B for all epochs (Shah, "Solving the
-robot-world/hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5, 2013): the turns of X
-and Y are the first singular vectors of the sum of R_B (x) R_A, their shifts then a linear least squares.
-
-Most probable registration, by weighted least squares.
-
-Over all shared epochs, outliers down-weighted.
-
-Thirteen unknowns, as small changes of what is there: a turn a and shift d of the tracking system about the middle c of
-what was seen, a turn b and shift e of the device in the object's frame, and the lag. With P, R the predicted pose:
-
-    P' = P + a x (P - c) + d + R e - v dt        turn' = a + R b - w dt
-
-Each epoch counts by the covariance that the object's pose has, with what a tracker's jitter is; all of these are
-scaled by one factor, so that half of the epochs lie within what is predicted. How sure the result is comes from the
-leaving out of blocks of time, since neighbours in time share their errors (jackknife), and where the motion determines
-nothing of an unknown, from the normal equations; the larger counts.
+Each epoch counts by the covariance that the object's pose has, with the tracker's jitter; all are scaled by
+one factor, so that half of the epochs lie within what is predicted. Uncertainty comes from leaving out blocks
+of time, since neighbours in time share their errors (jackknife), and where the motion determines nothing of
+an unknown, from the normal equations; the larger counts.
 """
 
 from dataclasses import dataclass
@@ -46,23 +39,17 @@ _NEAR_RAD = np.radians(6.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A registration: A(t) = X B(t - late) inv(Y).
+    """A registration: A(t) = X B(t - late) inv(Y)."""
 
-    Attributes:
-        T_rig_tracking: X (4, 4).
-        T_object_tracker: Y (4, 4).
-        late_s: How much later the tracker's poses hold than their time stamps [s].
-    """
-
-    T_rig_tracking: Float
+    T_rig_tracking: Float  # this and T_object_tracker: X and Y (4, 4)
     T_object_tracker: Float
-    late_s: float
+    late_s: float  # how much later the tracker's poses hold than their time stamps [s]
 
 
 def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
-    """Return how much later the tracker's poses hold than their stamps [s].
+    """How much later the tracker's poses hold than stamped [s]; None: no overlap.
 
-    To some milliseconds; None: they hardly overlap.
+    To some milliseconds.
     """
     most_lag_s = 0.5
     begin = min(seen.t_s[0], tracker.t_s[0]) - most_lag_s
@@ -93,10 +80,7 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
 
 
 def _rotated(track: PoseTrack, t_s: Float) -> Float:
-    """Return the angle of rotation around each time [rad].
-
-    NaN where that is not known.
-    """
+    """Angle of rotation around each time [rad]; NaN where not known."""
     chord_s = 0.2
     first, _, known = track.at(t_s - 0.5 * chord_s)
     last, _, also = track.at(t_s + 0.5 * chord_s)
@@ -105,15 +89,9 @@ def _rotated(track: PoseTrack, t_s: Float) -> Float:
 
 
 def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int = 0) -> Placed | None:
-    """Return a registration that most epochs agree with.
+    """A registration that most epochs agree with; None: too few epochs are shared.
 
-    None: too few epochs are shared.
-
-    Args:
-        seen: The object, by the cameras.
-        tracker: The device, by its system.
-        late_s: How much later its poses hold than their time stamps [s].
-        seed: Of the draws.
+    `late_s` is how much later the tracker's poses hold than their stamps [s]; `seed` is of the draws.
     """
     epochs, draws = 240, 120
     rows = shared_epochs(seen, tracker, late_s, epochs)
@@ -143,15 +121,11 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
 def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
     rotation, place = predicted(X, Y, RB, pB)
     off = np.linalg.norm(matrix_to_rotation_vector(RA @ rotation.swapaxes(1, 2)), axis=1)
-    near_m = 0.03
-    return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < near_m)
+    return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < 0.03)
 
 
 def predicted(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
-    """Predict the object's rotations (N, 3, 3) and positions (N, 3) in the rig.
-
-    Where the device is at (RB, pB): X B inv(Y).
-    """
+    """The object (N, 3, 3), (N, 3) in the rig by the device (RB, pB): X B inv(Y)."""
     rotation = X[:3, :3] @ RB @ Y[:3, :3].T
     device = pB @ X[:3, :3].T + X[:3, 3]
     return rotation, device - rotation @ Y[:3, 3]
@@ -160,16 +134,13 @@ def predicted(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
 def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
     """X and Y (4, 4) of A Y = X B, least squares, no weights (Shah, 2013).
 
-    Args:
-        RA, pA: The object in the rig (N, 3, 3), (N, 3).
-        RB, pB: The device in its system's frame.
+    A = RA, pA: the object in the rig (N, 3, 3), (N, 3); B = RB, pB: the device in its system's frame.
     """
     total = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
     left, _, right = np.linalg.svd(total)
     RX, RY = _rotation(left[:, 0]), _rotation(right[0])
-    if _rotation_residual(RX, RY, RA, RB) > _rotation_residual(
-        -RX, RY, RA, RB
-    ):  # the sign of singular vectors means nothing
+    # The sign of singular vectors means nothing.
+    if _rotation_residual(RX, RY, RA, RB) > _rotation_residual(-RX, RY, RA, RB):
         RX = -RX
     RX, RY = (RX, RY) if np.linalg.det(RX) > 0.0 else (-RX, -RY)
     RX, RY = _nearest(RX), _nearest(RY)
@@ -179,10 +150,7 @@ def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Floa
 
 
 def _rotation(stacked: Float) -> Float:
-    """Return the matrix (3, 3) whose columns were stacked.
-
-    Scaled to a determinant of 1 or -1.
-    """
+    """Matrix (3, 3) of stacked columns, scaled to a determinant of 1 or -1."""
     matrix = stacked.reshape(3, 3).T
     size = float(np.cbrt(np.linalg.det(matrix)))
     return matrix / (abs(size) if abs(size) > 1e-9 else 1.0)
@@ -200,50 +168,31 @@ def _nearest(matrix: Float) -> Float:
 
 TRACKER_RAD = np.radians(0.15)
 DEFAULT_SIGMA_RAD = np.radians(1.5)  # of an object's pose without covariance
-OUTLIER = (
-    4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
-)
+OUTLIER = 4.1  # sigmas: 0.999 of chi with six degrees of freedom is within 4.7, at the good half's scale
 _ROUNDS = 4
 _UNKNOWNS = 13
-_PRIOR = (
-    np.array([1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [0.5]) ** -2
-)  # rad, m, rad, m, s: hardly any
+_PRIOR = np.array([1.0] * 12 + [0.5]) ** -2  # rad, m, rad, m, s: hardly any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Registration and its residuals (N epochs).
-
-    Attributes:
-        placed: The registration.
-        middle_m: (3,) middle of the object's places, rig frame.
-        t_s: (N,) epochs [s].
-        R, p_m: The object as the tracker foretells it, rig frame.
-        off: (N, 6) what cameras saw against that: place [m], turn [rad], rig axes.
-        outlier: (N,) which epochs no registration explains.
-        scale: By how much more than predicted the good half is off.
-        cov: (13, 13) of the unknowns, by the normal equations.
-        rejected: (B, 13) how the unknowns change when a block of time is omitted.
-    """
+    """Registration and its residuals (N epochs)."""
 
     placed: Placed
-    middle_m: Float
-    t_s: Float
-    R: Float
+    middle_m: Float  # (3,) middle of the object's places, rig frame
+    t_s: Float  # (N,) epochs [s]
+    R: Float  # this and p_m: the object as the tracker predicts it, rig frame
     p_m: Float
-    off: Float
-    outlier: Bool
-    scale: float
-    cov: Float
-    rejected: Float
+    off: Float  # (N, 6) cameras minus that: place [m], rotation [rad], rig axes
+    outlier: Bool  # (N,) which epochs no registration explains
+    scale: float  # factor of the good half's residuals over what was predicted
+    cov: Float  # (13, 13) of the unknowns, by the normal equations
+    rejected: Float  # (B, 13) how the unknowns change when a block of time is omitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Linearised equations at a registration.
-
-    Residuals (N, 6), and their derivatives by the unknowns (N, 6, 13).
-    """
+    """Linearised equations: residuals (N, 6), and derivatives (N, 6, 13)."""
 
     R: Float
     p_m: Float
@@ -258,11 +207,9 @@ class _Problem:
         self._tracker = tracker
         self.t_s, self.R, self.p_m = seen.t_s[rows], seen.R[rows], seen.p_m[rows]
         self.middle_m = self.p_m.mean(axis=0)
-        default_sigma_m = 3e-3  # of an object's pose without covariance
-        default_cov = np.diag(np.repeat([default_sigma_m, DEFAULT_SIGMA_RAD], 3) ** 2)
+        default_cov = np.diag(np.repeat([3e-3, DEFAULT_SIGMA_RAD], 3) ** 2)  # of a pose without covariance
         with_cov = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
-        tracker_m = 1e-3
-        jitter = np.diag(np.repeat([tracker_m, TRACKER_RAD], 3) ** 2)
+        jitter = np.diag(np.repeat([1e-3, TRACKER_RAD], 3) ** 2)
         cov = np.where(with_cov, seen.cov[rows], default_cov) + jitter
         self.weight: Float = np.asarray(np.linalg.inv(cov), np.float64)
 
@@ -295,10 +242,7 @@ class _Problem:
 def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     """Fit the registration to all epochs known to both cameras and tracker.
 
-    Args:
-        seen: The object, by the cameras.
-        tracker: The device, by its system.
-        first: Right to some centimetres, degrees and ten milliseconds.
+    `first` is right to some centimetres, degrees and ten milliseconds.
     """
     most = 900  # epochs
     coarse = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, most))
@@ -311,26 +255,15 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     counts = _counts(sizes)
     normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
     rejected = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
-    return Fit(
-        placed,
-        problem.middle_m,
-        problem.t_s,
-        lines.R,
-        lines.p_m,
-        lines.off,
-        sizes > OUTLIER,
-        scale,
-        np.asarray(np.linalg.inv(normal), np.float64),
-        np.array(rejected).reshape(-1, _UNKNOWNS),
-    )
+    cov, left_out = np.asarray(np.linalg.inv(normal), np.float64), np.array(rejected).reshape(-1, _UNKNOWNS)
+    body = problem.middle_m, problem.t_s, lines.R, lines.p_m, lines.off
+    return Fit(placed, *body, sizes > OUTLIER, scale, cov, left_out)
 
 
 def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
-    """Return the uncertainty of an object's pose by the tracker.
+    """Uncertainty of an object's pose by the tracker: position [m], rotation [rad].
 
-    At poses (T, 3, 3), (T, 3) of the rig: position [m], rotation [rad].
-
-    Root of the mean square over the poses, all axes together.
+    At poses (T, 3, 3), (T, 3) of the rig; root mean square over the poses, all axes together.
     """
     jacobian = np.zeros((len(R), 6, _UNKNOWNS))
     jacobian[:, :3, 0:3] = -skew(p_m - fit.middle_m)
@@ -359,8 +292,7 @@ def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
         sizes = _sizes(problem.weight, problem.lines(placed).off)
         half = 5.348  # median of chi square with six degrees of freedom
         scale = max(float(np.sqrt(np.median(sizes**2) / half)), 1e-3)
-        steps = 6
-        for _ in range(steps):
+        for _ in range(6):
             lines = problem.lines(placed)
             counts = _counts(_sizes(problem.weight, lines.off) / scale)
             normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
@@ -373,15 +305,12 @@ def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
 
 
 def _sizes(weight: Float, off: Float) -> Float:
-    """(N,) how far off, in sigmas of six dimensions."""
+    """Residuals (N,) in sigmas of six dimensions."""
     return np.sqrt(np.einsum("ni,nij,nj->n", off, weight, off))
 
 
 def _counts(sizes: Float) -> Float:
-    """Return the weights (N,) of the epochs by Tukey's biweight.
-
-    Zero for a residual of twice the outlier limit or more.
-    """
+    """Weights (N,) by Tukey's biweight; zero at twice the outlier limit or more."""
     return np.clip(1.0 - (sizes / (2.0 * OUTLIER)) ** 2, 0.0, 1.0) ** 2
 
 
@@ -394,7 +323,7 @@ def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
 
 
 def _blocks(t_s: Float) -> list[Bool]:
-    """Return one mask (N,) for each block of time: the epochs in it."""
+    """One mask (N,) for each block of time: the epochs in it."""
     share = (t_s - t_s[0]) / (t_s[-1] - t_s[0] + 1e-9)
     blocks = 12
     number = (blocks * share).astype(np.int64)
@@ -402,10 +331,7 @@ def _blocks(t_s: Float) -> list[Bool]:
 
 
 def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:
-    """Return the change of the unknowns (13,) when a block is omitted.
-
-    One step from the whole.
-    """
+    """Change of the unknowns (13,) when a block is omitted, by one step."""
     kept = np.where(block, 0.0, counts)
     normal = _normal(problem.weight, lines, kept) + np.diag(_PRIOR)
     return np.asarray(np.linalg.solve(normal, _pull(problem.weight, lines, kept)), np.float64)

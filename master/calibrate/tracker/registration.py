@@ -1,10 +1,9 @@
 """Registration of a tracking system to the rig and of its device to an object.
 
-From one motion that both saw.
-
-The system's own frame is whatever it is: SteamVR's is y up, libsurvive's z up, both with a heading and an origin of
-their own. The registration takes that up, so none is turned beforehand; but a registration for one is none for the
-other, and none after the base stations were moved or the system was calibrated anew.
+From one motion that both saw. The system's own frame is whatever it is: SteamVR's is y up, libsurvive's z up,
+both with a heading and an origin of their own. The registration takes that up, so none is turned beforehand;
+but a registration for one is none for the other, and none after the base stations were moved or the system
+was calibrated again.
 """
 
 from collections.abc import Sequence
@@ -45,30 +44,22 @@ _ROTATION_RAD = np.radians(50.0)  # of the poses at which the result must be kno
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """A registration that explains what was seen.
-
-    Attributes:
-        fit: What was fitted.
-        coverage: What the motion was.
-        figures: Quantity with its unit -> value: what is left, and standard deviations.
-        report: Lines for a person.
-    """
+    """A registration that explains what was seen."""
 
     fit: Fit
-    coverage: Coverage
-    figures: dict[str, float]
-    report: tuple[str, ...]
+    coverage: Coverage  # what the motion was
+    figures: dict[str, float]  # quantity with its unit -> value: residuals, and standard deviations
+    report: tuple[str, ...]  # lines for a person
 
 
 def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> Registration:
     """Find the registration.
 
-    Args:
-        objects: Object poses by the cameras, in any order; those held or reported by a tracker are rejected.
-        tracked: Poses reported by the device on it, on the same clock.
+    Object poses are the cameras', in any order (those held or reported by a tracker are rejected), the
+    device's on the same clock.
 
     Raises:
-        FitError: The motion was not done, was not seen, does not constrain the registration, or none explains it.
+        FitError: The motion was not done or seen, does not constrain the registration, or none explains it.
     """
     if not (objects and tracked):
         raise FitError(f"{'the cameras' if not objects else 'the tracker'} reported nothing: {MOTION}")
@@ -92,21 +83,18 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
 
 
 def figures_of(fit: Fit) -> dict[str, float]:
-    """Return the residuals of the inliers and the uncertainty of the result.
+    """Residuals of the inliers and uncertainty of the result, with their units.
 
-    By quantity with its unit.
-
-    `position_mm` and `rotation_deg` are roots of the mean square of the whole offset; sigmas are of an object's pose by
-    the tracker, wherever it may be within the motion's reach, turned by up to 50 degrees, from the registration alone.
+    `position_mm` and `rotation_deg` are roots of the mean square of the whole offset; sigmas are of an
+    object's pose by the tracker, wherever it may be within the motion's reach, turned by up to 50 degrees,
+    from the registration alone.
     """
     left = fit.off[~fit.outlier]
     place, rotation = (np.sqrt((part**2).sum(axis=1).mean()) for part in (left[:, :3], left[:, 3:]))
     R, p = _reach(fit)
     place_sigma, rotation_sigma = sigma_at(fit, R, p)
-    place_sigma, rotation_sigma = (
-        np.hypot(place_sigma, place / _LOOKS**0.5),
-        np.hypot(rotation_sigma, rotation / _LOOKS**0.5),
-    )
+    place_sigma = np.hypot(place_sigma, place / _LOOKS**0.5)
+    rotation_sigma = np.hypot(rotation_sigma, rotation / _LOOKS**0.5)
     return {
         "position_mm": 1e3 * float(place),
         "rotation_deg": float(np.degrees(rotation)),
@@ -118,10 +106,7 @@ def figures_of(fit: Fit) -> dict[str, float]:
 
 
 def _reach(fit: Fit) -> tuple[Float, Float]:
-    """Return the poses (T, 3, 3), (T, 3) at which the result must be known.
-
-    To all sides of the middle, rotated about all axes.
-    """
+    """Poses (T, 3, 3), (T, 3) about the middle at which the result must be known."""
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     mean = fit.R[len(fit.R) // 2]
     rotated = np.concatenate([mean[None], rotation_vector_to_matrix(_ROTATION_RAD * ways) @ mean])
@@ -137,9 +122,7 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         FitError: With what to do.
     """
     left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["rotation_deg"])
-    # left m
-    most_outliers = 0.4
-    if figures["outlier_share"] > most_outliers or left_m > 0.012 or left_rad > _LEFT_RAD:
+    if figures["outlier_share"] > 0.4 or left_m > 0.012 or left_rad > _LEFT_RAD:
         raise FitError(
             f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
             f" and {figures['rotation_deg']:.1f} deg"
@@ -148,10 +131,8 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
         )
     wanting: list[str] = []
     sigma_m, late_s = 3e-3, 5e-3  # standard deviations, at most
-    if (
-        1e-3 * figures["position_sigma_mm"] > sigma_m
-        or np.radians(figures["rotation_sigma_deg"]) > _SIGMA_RAD
-    ):
+    turned = np.radians(figures["rotation_sigma_deg"]) > _SIGMA_RAD
+    if 1e-3 * figures["position_sigma_mm"] > sigma_m or turned:
         wanting.append(
             f"poses would be known to {figures['position_sigma_mm']:.1f} mm,"
             f" {figures['rotation_sigma_deg']:.1f} deg only"

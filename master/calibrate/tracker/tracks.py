@@ -1,12 +1,7 @@
 """Two pose tracks of one object constrain a registration if they cover enough.
 
-Pose tracks of one object from cameras and tracking system.
-
-They can be interpolated at any time.
-
-Check of whether a motion constrains a registration.
-
-Rotations about which of the object's axes, path, pace; and what is missing.
+Tracks of cameras and tracking system can be interpolated at any time. Coverage: rotations about which of the
+object's axes, path, pace; and what is missing.
 """
 
 from collections.abc import Iterable
@@ -27,29 +22,18 @@ _NOT_ITS_OWN = (ObjectSource.TRACKER, ObjectSource.HELD, ObjectSource.NONE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
-    """Poses (N) of one thing in one frame, as received.
+    """Poses (N) of one thing in one frame, as received."""
 
-    Attributes:
-        t_s: (N,) [s], rising.
-        R: (N, 3, 3) thing -> frame.
-        p_m: (N, 3) its origin [m], in the frame.
-        cov: (N, 6, 6) of place and of a small turn about the frame's axes; NaN: not reported.
-    """
-
-    t_s: Float
-    R: Float
-    p_m: Float
-    cov: Float
+    t_s: Float  # (N,) [s], rising
+    R: Float  # (N, 3, 3) thing -> frame
+    p_m: Float  # (N, 3) its origin [m], in the frame
+    cov: Float  # (N, 6, 6) of place and of a small rotation about the frame's axes; NaN: not reported
 
     def __len__(self) -> int:
-        """How many poses."""
         return len(self.t_s)
 
     def at(self, t_s: Float) -> tuple[Float, Float, Bool]:
-        """Interpolate rotations (T, 3, 3) and positions (T, 3) at times (T,) [s].
-
-        From pose to pose; also returns (T,) which are known.
-        """
+        """Rotations (T, 3, 3), positions (T, 3) at times (T,) [s], and which are known."""
         after, share, known = self._between(t_s)
         before = after - 1
         step = matrix_to_rotation_vector(self.R[before].swapaxes(1, 2) @ self.R[after])
@@ -66,10 +50,7 @@ class PoseTrack:
 
 
 def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
-    """Return the track of an object as measured by cameras, rig frame.
-
-    Poses that were held, or reported by the tracker itself, are rejected.
-    """
+    """Track of an object by cameras, rig frame; not of held or tracker-made poses."""
     own = [one for one in poses if one.tracked and one.source not in _NOT_ITS_OWN]
     return _track(
         [one.t_ns - zero_ns for one in own],
@@ -80,10 +61,7 @@ def object_track(poses: Iterable[ObjectPose], zero_ns: int) -> PoseTrack:
 
 
 def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
-    """Return the track of the device as reported, in its system's frame.
-
-    Where it was lost is a gap.
-    """
+    """Track of the device in its system's frame; where it was lost is a gap."""
     every = list(poses)
     return _track(
         [one.t_ns - zero_ns for one in every],
@@ -94,7 +72,7 @@ def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
 
 
 def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: list[Float]) -> PoseTrack:
-    """Build a track that rises in time, each time once, without NaN."""
+    """A track that rises in time, each time once, without NaN."""
     times = np.array(t_ns, np.int64)
     order = np.argsort(times, kind="stable")
     places = np.array(place, dtype=np.float64).reshape(-1, 3)
@@ -108,15 +86,9 @@ def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: li
 
 
 def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
-    """Select the seen poses at whose epochs the tracker knows where it is.
+    """Seen poses at whose epochs the tracker's is known, at most so many, spread.
 
-    At most so many, spread.
-
-    Args:
-        seen: By the cameras.
-        tracker: By the tracking system.
-        late_s: How much later its poses hold than their time stamps [s].
-        most: More of the same motion adds time, not knowledge.
+    `late_s` is how much later the tracker's poses hold than their stamps [s].
     """
     if len(seen) == 0 or len(tracker) < 2:
         return np.zeros(0, np.int64)
@@ -139,42 +111,30 @@ _ADVICE = {
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """What was seen of a motion by cameras and tracker together.
+    """What was seen of a motion by cameras and tracker together."""
 
-    Attributes:
-        seen_s, tracked_s: How long cameras saw the object, and the tracker knew where it was [s].
-        shared_s: How long both [s].
-        rotation_rad: By how much it was turned about its own x, y, z, from one end to the other.
-        way_m: How far it was carried along the rig's x, y, z, from one end to the other.
-        pace_rad_s, pace_m_s: Its speeds, root of the mean square.
-    """
-
+    # this and tracked_s: how long cameras saw the object, and the tracker knew where it was [s]
     seen_s: float
     tracked_s: float
-    shared_s: float
-    rotation_rad: tuple[float, float, float]
-    way_m: tuple[float, float, float]
-    pace_rad_s: float
+    shared_s: float  # how long both [s]
+    rotation_rad: tuple[float, float, float]  # range of rotation about its own x, y, z
+    way_m: tuple[float, float, float]  # range of motion along the rig's x, y, z
+    pace_rad_s: float  # this and pace_m_s: its speeds, root mean square
     pace_m_s: float
 
     @property
     def missing(self) -> tuple[str, ...]:
         """What to do besides, for a person; nothing: it is enough."""
-        begun_s = 1.0  # before that there is no motion to speak of
-        if self.shared_s < begun_s:
+        if self.shared_s < 1.0:  # before that there is no motion to speak of
             return (_ADVICE["seconds"],)
         wanting: list[str] = []
-        poor = [
-            axis
-            for axis, rotation in zip("xyz", self.rotation_rad, strict=True)
-            if rotation < LEAST_ROTATION_RAD
-        ]
+        turned = zip("xyz", self.rotation_rad, strict=True)
+        poor = [axis for axis, rotation in turned if rotation < LEAST_ROTATION_RAD]
         if poor:
             wanting.append(_ADVICE["rotation"].format(axes=" and its ".join(poor)))
         if max(self.way_m) < LEAST_WAY_M:
             wanting.append(_ADVICE["way"])
-        least_pace_m_s = 0.05
-        if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < least_pace_m_s:
+        if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < 0.05:
             wanting.append(_ADVICE["pace"])
         if self.shared_s < LEAST_S:
             wanting.append(_ADVICE["seconds"])
@@ -182,7 +142,7 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """How much of all that is wanted is there, 0 .. 1."""
+        """Share of all that is wanted, 0 .. 1."""
         parts = [self.shared_s / LEAST_S, max(self.way_m) / LEAST_WAY_M]
         parts += [rotation / LEAST_ROTATION_RAD for rotation in self.rotation_rad]
         return float(np.mean(np.minimum(parts, 1.0)))
@@ -197,10 +157,7 @@ class Coverage:
 
 
 def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Coverage:
-    """Return what cameras and tracker saw together.
-
-    At a lag that is right to a tenth of a second.
-    """
+    """What cameras and tracker saw together, at a lag right to a tenth of a second."""
     rows = shared_epochs(seen, tracker, late_s, len(seen))
     times = (_known_s(seen.t_s), _known_s(tracker.t_s), _known_s(seen.t_s[rows]))
     if len(rows) < 3:
@@ -215,10 +172,7 @@ def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Cov
 
 
 def _known_s(t_s: Float) -> float:
-    """Return the total time between consecutive poses [s].
-
-    Gaps of a tenth of a second and more do not count.
-    """
+    """Total time between poses [s] without gaps of a tenth of a second and more."""
     steps: Float = np.diff(t_s)
     return float(steps[steps < 0.1].sum())
 

@@ -1,16 +1,7 @@
 """The command `wrist curl` fits the line of each finger's laser point.
 
-Line of each finger's laser point, from a guided curl.
-
-Outliers are rejected, then the principal axis is taken.
-
-Observations of a curling hand by a slave.
-
-Laser points on their plane and fingertips, strobe cycle by strobe cycle.
-
-`phalanx calibrate wrist curl`: the line of each finger's laser point.
-
-Along which line the point moves, and how far.
+A guided curl enters: laser points and fingertips of every strobe cycle. Outliers are rejected, then the
+principal axis is taken: along which line the point moves, and how far.
 """
 
 from argparse import Namespace
@@ -28,9 +19,8 @@ from common.errors import FitError
 from common.geometry.transforms import intersect_plane
 from common.hand.model import FINGERS
 from common.hand.wrist import laser_plane_of
-from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.device import Device, device_of, print_line, write_device
-from master.commands.summary import write_summary
+from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
+from master.calibrate.wrist.device import Device, device_of, write_device
 from master.estimator.priors import principal_line
 from master.replay.recorded import recorded_cycles
 
@@ -39,28 +29,17 @@ MIN_POINTS = 20  # two thirds of a second of strobe cycles
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FingerCurl:
-    """One finger's curl.
-
-    Attributes:
-        finger: Its name.
-        points_m: (N, 3) the points that count [m], camera frame.
-        seen: Points seen in all.
-        line: Its line; None: not determined.
-        reason: Why not.
-    """
+    """One finger's curl."""
 
     finger: str
-    points_m: Float
-    seen: int
-    line: FingerLine | None
-    reason: str = ""
+    points_m: Float  # (N, 3) the points that count [m], camera frame
+    seen: int  # points seen in all
+    line: FingerLine | None  # its line; None: not determined
+    reason: str = ""  # why not
 
 
 def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
-    """The lines of the five fingers.
-
-    Args:
-        laser_m: (T, 5, 3) laser points [m], camera frame; NaN: not seen.
+    """Lines of the five fingers by laser points (T, 5, 3) [m] as of `read_curled`.
 
     Raises:
         FitError: No finger determines a line; the text states for each finger why.
@@ -75,22 +54,18 @@ def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
 def _curl(finger: str, laser_m: Float) -> FingerCurl:
     seen = laser_m[np.isfinite(laser_m).all(axis=1)]
     if len(seen) < MIN_POINTS:
-        return FingerCurl(
-            finger, seen, len(seen), None, f"{len(seen)} points, at least {MIN_POINTS} are needed"
-        )
+        reason = f"{len(seen)} points, at least {MIN_POINTS} are needed"
+        return FingerCurl(finger, seen, len(seen), None, reason)
     points = seen[_together(seen)]
     axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
     moved = float(np.ptp(points @ axis))
     # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
     min_motion_m = 0.015
     if len(points) < MIN_POINTS or moved < min_motion_m:
-        return FingerCurl(
-            finger,
-            points,
-            len(seen),
-            None,
-            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * min_motion_m:.0f} are needed: bend it to a fist",
+        reason = (
+            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * min_motion_m:.0f} are needed: bend it to a fist"
         )
+        return FingerCurl(finger, points, len(seen), None, reason)
     try:
         return FingerCurl(finger, points, len(seen), principal_line(points))
     except FitError as error:
@@ -98,10 +73,7 @@ def _curl(finger: str, laser_m: Float) -> FingerCurl:
 
 
 def _together(points: Float) -> Bool:
-    """Select the points (N,) that lie along the line that most of them share.
-
-    The points of another finger do not.
-    """
+    """The points (N,) on the line that most of them share; another finger's are not."""
     rng = np.random.default_rng(0)
     pairs = 300
     a, b = points[rng.integers(0, len(points), (2, pairs))]
@@ -123,50 +95,28 @@ def _together(points: Float) -> Bool:
     return near[:, best] & (along > low - alone_m) & (along < high + alone_m)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curled:
-    """Observations of T strobe cycles, fingers thumb ... little.
+def read_curled(detections: Path, device: Device) -> Float:
+    """Laser points (T, 5, 3) [m] of detections_<camera>.npz on the device's plane.
 
-    NaN: not seen.
-
-    Attributes:
-        laser_m: (T, 5, 3) [m] on the laser plane, camera frame.
-        tip_uv: (T, 5, 2) [px].
-    """
-
-    laser_m: Float
-    tip_uv: Float
-
-
-def read_curled(detections: Path, device: Device) -> Curled:
-    """Read the strobe cycles of detections_<camera>.npz.
-
-    The laser points are put on the plane of the device.
+    Camera frame, fingers thumb ... little; NaN: not seen.
 
     Raises:
         RecordingError: The file is missing or broken.
         CalibrationError: The rig has no laser plane yet, or one that crosses no finger.
     """
     normal, offset_m = laser_plane_of(device.rig, f"rig {device.file_name!r}")
-    cycles = list(recorded_cycles(detections, device.camera.name))
+    cycles = recorded_cycles(detections, device.camera.name)
     uv = np.array([cycle.laser_uv for cycle in cycles]).reshape(-1, 5, 2)
-    tips = np.array([cycle.tip_uv for cycle in cycles]).reshape(-1, 5, 2)
-    points = intersect_plane(np.zeros(3), device.optics.ray(uv), normal, offset_m)
-    return Curled(points, tips)
+    return intersect_plane(np.zeros(3), device.optics.ray(uv), normal, offset_m)
 
 
 def curl(options: Namespace) -> None:
-    """Measure along which line the laser point of each finger moves.
-
-    From a guided curl of ten seconds.
-    """
+    """Measure the line of each finger's laser point, from a guided curl."""
     device = device_of(options.recording, options.rig, options.calibration, options.out)
-    seen = read_curled(options.detections, device)
-    try:
-        curls = fit_curls(seen.laser_m)
-    except FitError as error:
-        raise FitError(f"{options.recording}: {error}") from error
-    print_line(report_lines(curls))
+    laser_m = read_curled(options.detections, device)
+    with refusals_named(options.recording):
+        curls = fit_curls(laser_m)
+    print_lines(report_lines(curls))
     if options.picture is not None:
         from master.calibrate.picture import draw_curls
 
@@ -174,14 +124,8 @@ def curl(options: Namespace) -> None:
         echo(f"drew {options.picture}")
     summary = ", ".join(found.finger for found in curls if found.line is not None)
     written = write_device(options.out, device, rig_with_lines(device, curls), f"finger_lines of {summary}")
-    if options.json_file is not None:
-        write_summary(
-            options.json_file,
-            {
-                "fingers": {found.finger: _json_of(found) for found in curls},
-                "written": None if written is None else str(written),
-            },
-        )
+    fingers = {found.finger: _json_of(found) for found in curls}
+    write_report(options.json_file, {"fingers": fingers}, written)
 
 
 def report_lines(curls: tuple[FingerCurl, ...]) -> list[str]:

@@ -1,20 +1,11 @@
 """A wrist device sees lit boards, whose poses are found in its pictures.
 
-Wrist device that is calibrated: its rig and camera.
-
-From the recording or from a calib_json tree.
-
-Strobed views of a thing held still.
-
-The frames of one moment by what lit them, from a recording or from images.
-
-Pose of a board before one camera, and its uncertainty.
-
-The start of all that boards measure of a wrist device.
+Rig and camera come from the recording or a calib_json tree; the frames of one moment, by what lit them, from
+a recording or images. A board's pose and its uncertainty is the start of all that boards measure of a device.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,43 +15,32 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.command_line import echo
-from common.errors import CalibrationError, FitError, PictureError, RecordingError
+from common.errors import CalibrationError, FitError, RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import cross, transform
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.recording.pictures import decode_file, read_picture
 from master.calibrate.cameras.boards import Board, board_corners, find_board
 from master.calibrate.cameras.bundle import place_board
+from master.calibrate.cameras.views import ENDINGS, load_image
 from master.calibrate.tree_files import rig_in_tree, write_rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Device:
-    """A wrist device.
+    """A wrist device."""
 
-    Attributes:
-        rig: Its rig file; the one in the tree of the results where there is one.
-        file_name: Of the rig file, without .json.
-        camera: Its camera file.
-        optics: The same as geometry; its frame is that of the rig.
-        source: Name of the folder that is measured, as provenance names it.
-    """
-
-    rig: RigCalibration
-    file_name: str
+    rig: RigCalibration  # its rig file; the one in the tree of the results where there is one
+    file_name: str  # of the rig file, without .json
     camera: CameraCalibration
-    optics: CameraModel
-    source: str
+    optics: CameraModel  # its camera as geometry, whose frame is that of the rig
+    source: str  # name of the folder that is measured, as provenance names it
 
 
 def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path | None) -> Device:
-    """The device, and the rig file that is to be written.
+    """The device of a recording or folder, and the rig file that is to be written.
 
-    Args:
-        source: Recording, or folder of images or detections.
-        rig_name: A rig of the tree `calibration`; None: the recording's own, with the recording's own camera.
-        calibration: calib_json tree.
-        out: Tree of the results.
+    `rig_name` is a rig of the tree `calibration`; None: the recording's own, with its own camera. `out` is
+    the tree of the results.
 
     Raises:
         RecordingError: The recording cannot be read, or has no wrist rig.
@@ -93,16 +73,8 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
     return Device(rig_in_tree(out, name, rig), name, camera, optics, source.resolve().name)
 
 
-def print_line(lines: Iterable[str]) -> None:
-    """Lines for a person."""
-    for line in lines:
-        echo(line)
-
-
 def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: str) -> Path | None:
-    """Write the rig file with what was measured, and print that.
-
-    None where no tree was given.
+    """Write the rig file with what was measured, and print that; None: no tree given.
 
     Raises:
         CalibrationError: It cannot be written; the old file is untouched.
@@ -115,21 +87,16 @@ def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: st
     return written
 
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
 class LitView:
-    """The frames of one moment.
+    """The frames of one moment."""
 
-    Attributes:
-        name: How the view is called in reports: the number of its first frame, or what its files have in common.
-        frames: What lit it -> how to load the frame (H, W), 8 bits.
-    """
-
+    # how the view is called in reports: the number of its first frame, or what its files have in common
     name: str
-    frames: Mapping[Illumination, Callable[[], Image]]
+    frames: Mapping[Illumination, Callable[[], Image]]  # what lit it -> how to load the frame (H, W), 8 bits
 
     def load(self, lit: Illumination) -> Image | None:
         """One of its frames; None where there is none of this kind.
@@ -141,15 +108,10 @@ class LitView:
 
 
 def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView, ...]:
-    """Return views with an ambient frame and one lit by `needed`.
+    """Views with an ambient frame and one lit by `needed`, spread evenly, at most 60.
 
-    Evenly over the source, at most 60.
-
-    Args:
-        folder: A recording whose frames.csv names the light of each frame, or images VIEW_ambient.png, VIEW_laser.png,
-            VIEW_led.png.
-        camera: Camera of the recording.
-        needed: Laser or LED.
+    From a recording whose frames.csv names the light of each frame, or images VIEW_ambient.png,
+    VIEW_laser.png, VIEW_led.png.
 
     Raises:
         RecordingError: No such folder, or no such frames; the text states what is expected.
@@ -169,10 +131,7 @@ def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView,
 
 
 def _recorded(folder: Path, camera: str) -> list[LitView]:
-    """Return one view for each ambient frame.
-
-    With the frames lit otherwise that follow within a strobe cycle.
-    """
+    """A view for each ambient frame, with frames lit otherwise in its strobe cycle."""
     rows = open_recording(folder).frames_of(camera)
     if not rows:
         raise RecordingError(f"{folder}: camera {camera!r} has no frame")
@@ -186,26 +145,24 @@ def _recorded(folder: Path, camera: str) -> list[LitView]:
             if near.illumination is Illumination.AMBIENT or near.seq - row.seq > apart:
                 break
             cycle.setdefault(near.illumination, near)
-        views.append(
-            LitView(str(row.seq), {lit: partial(load_grey, folder / one.file) for lit, one in cycle.items()})
-        )
+        frames = {lit: partial(load_grey, folder / one.file) for lit, one in cycle.items()}
+        views.append(LitView(str(row.seq), frames))
     return views
 
 
 def _named(folder: Path) -> list[LitView]:
-    """Images by their names."""
     found: dict[str, dict[Illumination, Callable[[], Image]]] = {}
     for file in sorted(folder.iterdir()):
         match = _NAMED.fullmatch(file.stem)
-        if match is not None and file.suffix.lower() in _ENDINGS:
+        if match is not None and file.suffix.lower() in ENDINGS:
             found.setdefault(match[1], {})[Illumination(match[2].lower())] = partial(load_grey, file)
     return [LitView(name or "0", frames) for name, frames in found.items()]
 
 
 def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
-    """Format the refused views (name -> reason) as lines grouped by reason.
+    """Refused views (name -> reason) as lines: each reason after its views.
 
-    Lines for a person: each reason once, after the views it is of; of many views the first.
+    Of many views the first are named.
     """
     views: dict[str, list[str]] = {}
     for name, reason in refused.items():
@@ -218,35 +175,17 @@ def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
     return lines
 
 
-def load_grey(file: Path) -> Image:
-    """An image (H, W), 8 bits.
-
-    Raises:
-        RecordingError: The file cannot be read, or is no image.
-    """
-    try:
-        return decode_file(read_picture(file), grey=True)
-    except OSError as error:
-        raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
-    except PictureError as error:
-        raise RecordingError(f"{file}: is no image: it {error}") from error
+load_grey = partial(load_image, grey=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
-    """A board in the camera's frame.
+    """A board in the camera's frame."""
 
-    Attributes:
-        T_camera_board: (4, 4) [m].
-        centre_m: (3,) middle of the corners, about which `covariance` turns.
-        covariance: (6, 6) of small turns [rad] about the camera's axes and shifts [m], in this order.
-        rms_px: What is left at the corners.
-    """
-
-    T_camera_board: Float
-    centre_m: Float
-    covariance: Float
-    rms_px: float
+    T_camera_board: Float  # (4, 4) [m]
+    centre_m: Float  # (3,) middle of the corners, about which `covariance` rotates
+    covariance: Float  # (6, 6) of small rotations [rad] about the camera's axes and shifts [m], in this order
+    rms_px: float  # residual of the corners
 
 
 def lens_of_model(optics: CameraModel) -> Float:
@@ -256,9 +195,7 @@ def lens_of_model(optics: CameraModel) -> Float:
 
 
 def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
-    """Estimate the board pose of one view.
-
-    At the middle of its strobe cycle where both of its ends show the board.
+    """Board pose of one view, at the middle of its strobe cycle if both ends show it.
 
     Raises:
         RecordingError: An image cannot be read.
@@ -279,10 +216,9 @@ def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
     if not seen:
         raise FitError("no board found: show all of it with its white margin, sharp and not too bright")
     # The ambient frame comes before the laser's and the LED's after it: their mean is where the board was between.
+    # Half of its motion between the frames is what a constant speed leaves unexplained.
     moved = float(np.nanmedian(np.linalg.norm(seen[0] - seen[-1], axis=1)))
-    # between the frames of a strobe cycle; half of it is what a constant speed leaves unexplained
-    moved_px = 1.0
-    if not moved <= moved_px:
+    if not moved <= 1.0:
         raise FitError(f"the board moved by {moved:.1f} px between the frames: hold it still")
     return place_corners(np.mean(seen, axis=0), board, optics)
 
@@ -296,25 +232,21 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
     known = np.isfinite(corners_px[:, 0])
     drawn = board_corners(board)[known]
     T, rms = place_board(drawn, corners_px[known], lens_of_model(optics))
-    most_rms_px = 1.0  # beyond it, it is another board or another lens
-    if not rms <= most_rms_px:
+    if not rms <= 1.0:  # beyond it, it is another board or another lens
         raise FitError(
             f"corners are off by {rms:.2f} px: the size of the board, its flatness or the intrinsics are wrong"
         )
     points = transform(T, drawn)
     centre = points.mean(axis=0)
-    jacobian = np.stack([_pixel_derivative(points, centre, k, optics) for k in range(6)], axis=-1).reshape(
-        -1, 6
-    )
+    jacobian = np.stack([_pixel_derivative(points, centre, k, optics) for k in range(6)], -1).reshape(-1, 6)
     dof = 2.0 * len(drawn) - 6.0
-    # of the detector on rendered boards: what few corners that happen to agree do not get below
-    corner_sigma_px = 0.05
-    sigma = max(rms * np.sqrt(len(drawn) / dof), corner_sigma_px)
+    # At least that of the detector on rendered boards: few corners may happen to agree.
+    sigma = max(rms * np.sqrt(len(drawn) / dof), 0.05)
     return BoardPose(T, centre, sigma**2 * np.linalg.inv(jacobian.T @ jacobian), rms)
 
 
 def _pixel_derivative(points: Float, centre: Float, k: int, optics: CameraModel) -> Float:
-    """Derivative (n, 2) of the pixels by the k-th turn or shift."""
+    """Derivative (n, 2) of the pixels by the k-th rotation or shift."""
     step = np.zeros(3)
     step[k % 3] = 1e-5
     shift = cross(np.broadcast_to(step, points.shape), points - centre) if k < 3 else step

@@ -1,22 +1,16 @@
 """The command `wrist flat-field` fits the illumination of LEDs and lens.
 
-Flat field of a wrist device's LEDs and lens.
-
-From the white squares of a board whose pose is known.
-
-White paper at X with normal n gets E = sum over LEDs of cos / r^2; what a pixel has beyond that is the flat field F:
+White squares of a board whose pose is known enter. White paper at X with normal n gets E = sum over LEDs of
+cos / r^2; what a pixel has beyond that is the flat field F:
 
     led - ambient = k F(x, y) E
 
-with k the paper and the gain, which nobody needs. The logarithm of k F is fitted: a power of the cosine off the axis,
-as LEDs and lenses have it, times a smooth correction of third degree that is assumed to be small; so F stays sane
-where there was no paper. Outliers (shine, shadow, dirt) count little. The file holds a polynomial of sixth
-degree in the normalised image point, laid through this over the whole image. In the corners of a wide lens, where F
-is a fifth, a polynomial follows a power of the cosine to ten per cent only; in the middle half to two.
-
-`phalanx calibrate wrist flat-field`: the illumination of a wrist device.
-
-How the LEDs and the lens light its image.
+with k the paper and the gain, which nobody needs. The logarithm of k F is fitted: a power of the cosine off
+the axis, as LEDs and lenses have it, times a smooth correction of third degree that is assumed to be small;
+so F stays sane where there was no paper. Outliers (shine, shadow, dirt) count little. The file holds a
+polynomial of sixth degree in the normalised image point, laid through this over the whole image. In the
+corners of a wide lens, where F is a fifth, a polynomial follows a power of the cosine to ten per cent only;
+in the middle half to two.
 """
 
 from argparse import Namespace
@@ -36,8 +30,8 @@ from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.recording.frame_recording import Illumination
-from master.calibrate.cameras.boards import Board, board_of, grid_shape
-from master.calibrate.tree_files import provenance
+from master.calibrate.cameras.boards import Board, board_in, grid_shape
+from master.calibrate.tree_files import print_lines, provenance, write_report
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -46,10 +40,8 @@ from master.calibrate.wrist.device import (
     device_of,
     grouped_by_reason,
     lit_views,
-    print_line,
     write_device,
 )
-from master.commands.summary import write_summary
 
 _STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
 _WITHIN = np.array([-0.22, 0.0, 0.22])  # of a square from its middle: clear of blurred borders
@@ -65,51 +57,30 @@ _PLACES = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteSamples:
-    """Light of white paper, over all views. S samples.
+    """Light of white paper, over all views. S samples."""
 
-    Attributes:
-        xy: (S, 2) normalised image points.
-        uv: (S, 2) [px].
-        light: (S,) levels above ambient, divided by what inverse square and cosine make of the LEDs [levels m^2].
-        view: (S,) number of the view.
-    """
-
-    xy: Float
-    uv: Float
-    light: Float
-    view: Int
+    xy: Float  # (S, 2) normalised image points
+    uv: Float  # (S, 2) [px]
+    light: Float  # (S,) levels above ambient, divided by inverse square and cosine of the LEDs [levels m^2]
+    view: Int  # (S,) number of the view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlatFit:
-    """A fitted flat field.
+    """A fitted flat field."""
 
-    Attributes:
-        field: 1 on the axis.
-        rms: Relative residual of the samples, robust.
-        cross_validated_rms: The same of views that were held out of the fit.
-        residual: (S,) relative residual of each sample.
-    """
-
-    field: FlatField
-    rms: float
-    cross_validated_rms: float
-    residual: Float
+    field: FlatField  # 1 on the axis
+    rms: float  # relative residual of the samples, robust
+    cross_validated_rms: float  # the same of views that were held out of the fit
+    residual: Float  # (S,) relative residual of each sample
 
 
 def white_samples(
     led: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel, led_m: Float
 ) -> tuple[Float, Float, Float]:
-    """Return samples of the white squares of one view.
+    """Samples of one view: xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
 
-    xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
-
-    Args:
-        led, ambient: Frames (H, W).
-        placed: Where the board is.
-        board: Its squares.
-        optics: The camera.
-        led_m: (L, 3) where the LEDs are [m].
+    From frames (H, W) and LEDs at led_m (L, 3) [m].
 
     Raises:
         FitError: No white square is bright enough, or all are too bright; the text is the reason.
@@ -121,8 +92,7 @@ def white_samples(
     inside = ((uv >= 2) & (uv <= np.array([width, height]) - 3.0)).all(axis=1)
     points, uv = points[inside], uv[inside]
     level = _at(_smooth(led) - _smooth(ambient), uv)
-    saturated = 250
-    too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= saturated
+    too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= 250
     way = points[:, None] - led_m
     square = (way**2).sum(axis=2)
     cosine = (way @ placed.T_camera_board[:3, 2]) / np.sqrt(square)
@@ -139,10 +109,7 @@ def white_samples(
 
 
 def _squares(board: Board, placed: BoardPose, optics: CameraModel, led: Image) -> tuple[Float, Int]:
-    """Return positions (n, 3) within the whole squares of the board.
-
-    On the board; also the numbers of those that are white.
-    """
+    """Positions (n, 3) on the board's whole squares, and numbers of the white ones."""
     rows, columns = grid_shape(board)
     j, i = np.mgrid[0 : rows - 1, 0 : columns - 1] + 0.5
     middles = np.stack([i.ravel(), j.ravel()], axis=1)
@@ -178,14 +145,11 @@ def gathered(views: Sequence[tuple[Float, Float, Float]]) -> WhiteSamples:
 
 
 def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
-    """Fit the flat-field polynomial to the samples.
-
-    Args:
-        samples: Of five views or more.
-        optics: The camera.
+    """Fit the flat-field polynomial to the samples of five views or more.
 
     Raises:
-        FitError: A part of the image without white paper (named), too few views, or light that follows no such law.
+        FitError: A part of the image without white paper (named), too few views, or light that follows no
+            such law.
     """
     views = int(samples.view.max(initial=-1)) + 1
     folds = 5
@@ -202,12 +166,8 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
         held_out[out] = samples.light[out] / (terms_of(samples.xy[out], _DEGREE) @ fitted) - 1.0
     coefficients = _polynomial(_law(samples.xy, samples.light), grid)
     residual = samples.light / (terms_of(samples.xy, _DEGREE) @ coefficients) - 1.0
-    fit = FlatFit(
-        FlatField(coefficients=tuple(round(float(c / coefficients[0]), 7) for c in coefficients)),
-        _spread(residual),
-        _spread(held_out),
-        residual,
-    )
+    relative = tuple(round(float(c / coefficients[0]), 7) for c in coefficients)
+    fit = FlatFit(FlatField(coefficients=relative), _spread(residual), _spread(held_out), residual)
     worst_rms = 0.05
     if fit.cross_validated_rms > worst_rms:
         raise FitError(
@@ -218,25 +178,19 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
 
 
 def _law(xy: Float, light: Float) -> Float:
-    """Fit the coefficients of the logarithm of k F by least squares.
-
-    Outlying samples are down-weighted (Huber).
-    """
+    """Coefficients of the logarithm of k F, least squares with Huber's weights."""
     terms, wanted = _law_terms(xy), np.log(light)
-    correction_sigma = 0.15  # of a coefficient of the correction, where the tangent is 1
-    # of paper; errors of one view's samples are not independent, so more than of one alone
-    sample_sigma = 0.02
-    prior_information = np.diag(
-        np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (sample_sigma / correction_sigma) ** 2)]
-    )
+    # Of paper (a view's samples err alike, so more than of one alone), and of a coefficient where the tangent is 1.
+    sample_sigma, correction_sigma = 0.02, 0.15
+    prior = np.full(terms.shape[1] - 2, (sample_sigma / correction_sigma) ** 2)
+    prior_information = np.diag(np.r_[0.0, 0.0, prior])
     weight = np.ones(len(light))
     found = np.zeros(terms.shape[1])
     for _ in range(8):
         normal = terms.T @ (weight[:, None] * terms) + prior_information
         found = np.asarray(np.linalg.solve(normal, terms.T @ (weight * wanted)), np.float64)
         off = np.abs(terms @ found - wanted)
-        huber = 2.5
-        weight = 1.0 / np.maximum(off / (huber * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
+        weight = 1.0 / np.maximum(off / (2.5 * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
     return found
 
 
@@ -247,10 +201,7 @@ def _law_terms(xy: Float) -> Float:
 
 
 def _polynomial(law: Float, grid: Float) -> Float:
-    """Return the coefficients (T,) of k F as a polynomial.
-
-    From the law at `grid` (G, 2); dark corners weigh less.
-    """
+    """Coefficients (T,) of k F, from the law at `grid` (G, 2); dark corners less."""
     wanted = np.exp(_law_terms(grid) @ law)
     root = 1.0 / np.sqrt(wanted)
     terms = terms_of(grid, _DEGREE) * root[:, None]
@@ -269,8 +220,7 @@ def _refuse_uncovered(samples: WhiteSamples, size_px: tuple[int, int]) -> None:
     j = np.clip((samples.uv[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
     count = np.zeros(_CELLS, dtype=np.int64)
     np.add.at(count, (j, i), 1)
-    enough_cell = 6  # samples
-    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < enough_cell]
+    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < 6]  # samples
     if missing:
         raise FitError(
             f"no white squares at the {', '.join(missing)} of the image: a flat field is needed there too;"
@@ -288,46 +238,36 @@ class WhiteSeen:
 
 
 def flat_field(options: Namespace) -> None:
-    """Measure the flat field of a wrist device's LEDs.
-
-    From twenty views of a board on matt paper.
-    """
+    """Measure the flat field of a device's LEDs, from twenty views of a board."""
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LED)
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
-    seen = white_of(
-        views,
-        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
-        device.optics,
-        leds,
-    )
+    seen = white_of(views, board_in(options), device.optics, leds)
     try:
         fit = fit_flat_field(seen.samples, device.optics)
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
         raise FitError(f"{options.source}: {error}{reasons}") from error
-    print_line(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
+    print_lines(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
     if options.picture is not None:
         from master.calibrate.picture import draw_flat_field
 
         draw_flat_field(options.picture, fit, seen.samples, device.optics)
         echo(f"drew {options.picture}")
     written = write_device(options.out, device, rig_with_field(device, fit, seen), "flat_field")
-    if options.json_file is not None:
-        report: dict[str, object] = {
-            "coefficients": list(fit.field.coefficients),
-            "rms_percent": round(100 * fit.rms, 4),
-            "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
-            "samples": len(seen.samples.light),
-            "views": seen.views,
-            "refused": dict(seen.refused),
-            "written": None if written is None else str(written),
-        }
-        write_summary(options.json_file, report)
+    report: dict[str, object] = {
+        "coefficients": list(fit.field.coefficients),
+        "rms_percent": round(100 * fit.rms, 4),
+        "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
+        "samples": len(seen.samples.light),
+        "views": seen.views,
+        "refused": dict(seen.refused),
+    }
+    write_report(options.json_file, report, written)
 
 
 def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:
-    """The white squares of every view.
+    """White squares of every view.
 
     Raises:
         RecordingError: An image cannot be read.

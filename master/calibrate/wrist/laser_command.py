@@ -1,6 +1,6 @@
 """`phalanx calibrate wrist laser-plane`: the laser plane in the camera frame.
 
-The frame is that of the wrist camera; from views of a board.
+Views of a board that the laser crosses enter.
 """
 
 from argparse import Namespace
@@ -15,8 +15,8 @@ from common.command_line import echo
 from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.recording.frame_recording import Illumination
-from master.calibrate.cameras.boards import Board, board_of
-from master.calibrate.tree_files import provenance
+from master.calibrate.cameras.boards import Board, board_in
+from master.calibrate.tree_files import print_lines, provenance, write_report
 from master.calibrate.wrist.device import (
     Device,
     LitView,
@@ -24,11 +24,9 @@ from master.calibrate.wrist.device import (
     device_of,
     grouped_by_reason,
     lit_views,
-    print_line,
     write_device,
 )
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane, line_on_board
-from master.commands.summary import write_summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +38,23 @@ class LinesSeen:
 
 
 def laser_plane(options: Namespace) -> None:
-    """Measure the plane of a wrist device's laser.
-
-    From ten views of a board that the laser crosses.
-    """
+    """Measure the plane of a wrist device's laser, from ten views of a board."""
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
-    seen = lines_of(
-        views,
-        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
-        device.optics,
-    )
+    seen = lines_of(views, board_in(options), device.optics)
     try:
         fit = fit_plane(seen.lines)
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
         raise FitError(f"{options.source}: {error}{reasons}") from error
-    print_line(report_lines(fit, seen, len(views)))
+    print_lines(report_lines(fit, seen, len(views)))
     if options.picture is not None:
         from master.calibrate.picture import draw_plane
 
         draw_plane(options.picture, fit, seen.lines, device.optics)
         echo(f"drew {options.picture}")
     written = write_device(options.out, device, rig_with_plane(device, fit), "laser_plane")
-    if options.json_file is not None:
-        report = report_json(fit, seen) | {"written": None if written is None else str(written)}
-        write_summary(options.json_file, report)
+    write_report(options.json_file, report_json(fit, seen), written)
 
 
 def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:

@@ -1,21 +1,15 @@
 """The command `wrist palm` finds the palm's pose from a board that lies on it.
 
-The palm's pose before a wrist camera, from a board that lies on the palm.
+**How the board lies.** Flat on the palm and the straight fingers, print towards the camera; its rows across
+the hand, its columns along the middle finger. Which end is up does not matter: that whose corners lie farther
+from the camera is towards the fingers. Three lengths define where it is, all measured with a ruler:
 
-**How the board lies.** Flat on the palm and the straight fingers, print towards the camera; its rows across the hand,
-its columns along the middle finger. Which end is up does not matter: that whose corners lie farther from the camera is
-towards the fingers. Three lengths define where it is, all measured with a ruler:
-
-- `wrist_m`: along the hand from the crease of the wrist (the wrist joint, the palm frame's origin) to the row of
-  inner corners nearest to it;
+- `wrist_m`: along the hand from the crease of the wrist (the wrist joint, the palm frame's origin) to the row
+  of inner corners nearest to it;
 - `aside_m`: from the middle finger's line to the middle of the board, positive towards the thumb;
 - `depth_m`: from the axis of the wrist joint, half of the wrist's thickness below the skin, up to the print.
 
 In palm axes (z to the fingers, y out of the back): board x = +x, board y = -z, board z (into the board) = +y.
-
-`phalanx calibrate wrist palm`: the palm pose before the wrist camera.
-
-From a board that lies on the palm.
 """
 
 from argparse import Namespace
@@ -32,8 +26,8 @@ from common.errors import FitError
 from common.geometry.transforms import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.recording.frame_recording import Illumination
-from master.calibrate.cameras.boards import Board, board_of, grid_shape
-from master.calibrate.tree_files import matrix_of, provenance
+from master.calibrate.cameras.boards import Board, board_in, grid_shape
+from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named, write_report
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -41,10 +35,8 @@ from master.calibrate.wrist.device import (
     device_of,
     grouped_by_reason,
     lit_views,
-    print_line,
     write_device,
 )
-from master.commands.summary import write_summary
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
 _MOVED_RAD = np.radians(2.0)
@@ -73,21 +65,15 @@ class BoardOffset:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PalmFit:
-    """The palm in the camera's frame.
+    """The palm in the camera's frame."""
 
-    Attributes:
-        T_camera_palm: (4, 4) [m].
-        rotation_sigma_rad, shift_sigma_m: Standard deviation in the least certain direction, of the measurement itself;
-            what the ruler or the hand's shape adds is not in it.
-        residual: Quantity with its unit -> value.
-        note: What it is from.
-    """
-
-    T_camera_palm: Float
+    T_camera_palm: Float  # (4, 4) [m]
+    # this and shift_sigma_m: standard deviation in the least certain direction, of the measurement itself;
+    # errors of the ruler or the hand's shape are not in it
     rotation_sigma_rad: float
     shift_sigma_m: float
-    residual: dict[str, float]
-    note: str
+    residual: dict[str, float]  # quantity with its unit -> value
+    note: str  # what it is from
 
 
 def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffset) -> PalmFit:
@@ -107,8 +93,7 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
     at = np.array([(pose @ middle)[:3] for pose in poses])
     spread = float(np.linalg.norm(rotation_vectors - np.median(rotation_vectors, axis=0), axis=1).max())
     shifted = float(np.linalg.norm(at - np.median(at, axis=0), axis=1).max())
-    moved_m = 0.003  # between views: the hand shifted in the device
-    if spread > _MOVED_RAD or shifted > moved_m:
+    if spread > _MOVED_RAD or shifted > 0.003:  # between views: the hand shifted in the device
         raise FitError(
             f"the board moved by {1e3 * shifted:.1f} mm and {np.degrees(spread):.1f} deg between the views: hold the"
             " hand still in the device, and fix the board to it"
@@ -142,10 +127,7 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
 
 
 def _upright(T_camera_board: Float, board: Board) -> Float:
-    """Return the same board with its first row towards the fingers.
-
-    That is, away from the camera.
-    """
+    """The board with its first row towards the fingers, that is, off the camera."""
     if T_camera_board[2, 1] <= 0.0:  # board y points from the fingers to the wrist
         return T_camera_board
     rows, columns = grid_shape(board)
@@ -163,26 +145,17 @@ def palm(options: Namespace) -> None:
     offset = BoardOffset(
         1e-3 * options.wrist_mm, 1e-3 * options.aside_mm, 1e-3 * options.depth_mm, model.side_sign
     )
-    try:
-        fit = _by_board(
-            options.source,
-            board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
-            offset,
-            device,
-        )
-    except FitError as error:
-        raise FitError(f"{options.source}: {error}") from error
-    print_line(report_lines(fit))
+    with refusals_named(options.source):
+        fit = _by_board(options.source, board_in(options), offset, device)
+    print_lines(report_lines(fit))
     written = write_device(options.out, device, rig_with_palm(device, fit), "T_camera_palm")
-    if options.json_file is not None:
-        report: dict[str, object] = {
-            "T_camera_palm": fit.T_camera_palm.tolist(),
-            "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
-            "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
-            "residual": fit.residual,
-            "written": None if written is None else str(written),
-        }
-        write_summary(options.json_file, report)
+    report: dict[str, object] = {
+        "T_camera_palm": fit.T_camera_palm.tolist(),
+        "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
+        "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
+        "residual": fit.residual,
+    }
+    write_report(options.json_file, report, written)
 
 
 def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
@@ -193,7 +166,7 @@ def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -
             placed.append(board_pose(view, board, device.optics))
         except FitError as error:
             refused[view.name] = str(error)
-    print_line(f"left out: {reason}" for reason in grouped_by_reason(refused))
+    print_lines(f"left out: {reason}" for reason in grouped_by_reason(refused))
     return palm_from_board(placed, board, offset)
 
 
@@ -204,13 +177,12 @@ def report_lines(fit: PalmFit) -> list[str]:
     look: Float = T_palm_camera[:3, 2]
     down = float(np.degrees(np.arctan2(look[1], look[2])))
     where = f"{-up:.1f} mm above the wrist joint, {along:+.1f} mm along the hand, {side:+.1f} mm aside"
-    lines = [
+    return [
         f"palm from {fit.note}",
         f"  the camera is {where}; it looks {down:.1f} deg down to the palm",
         f"  ± {np.degrees(fit.rotation_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
+        "  " + ", ".join(f"{name} {value:g}" for name, value in fit.residual.items()),
     ]
-    lines.append("  " + ", ".join(f"{name} {value:g}" for name, value in fit.residual.items()))
-    return lines
 
 
 def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
@@ -222,7 +194,5 @@ def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
     how = provenance("calibrate wrist palm", (device.source,), residual, fit.note)
     rig = device.rig
     return replace(
-        rig,
-        T_camera_palm=matrix_of(fit.T_camera_palm),
-        provenance=rig.provenance | {"T_camera_palm": how},
+        rig, T_camera_palm=matrix_of(fit.T_camera_palm), provenance=rig.provenance | {"T_camera_palm": how}
     )

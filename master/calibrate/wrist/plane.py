@@ -1,22 +1,15 @@
 """A laser plane is fitted through the laser's lines on boards.
 
-Laser line across a board, to a fraction of a pixel.
-
-Sought in the board's own plane, where it is straight.
-
-The difference (laser - ambient) is laid out flat by the pose of the board. Only what lies within the board's squares
-counts, so that a line on the table beside it cannot. The brightest straight line is found by consensus; then, in steps
-of a pixel, its profile across is centred with a Gaussian window that moves until it rests. Profiles near the borders of
+**Line.** It is sought in the board's own plane, where it is straight: the difference (laser - ambient) is
+laid out flat by the pose of the board. Only what lies within the board's squares counts, so that a line on
+the table beside it cannot. The brightest straight line is found by consensus; then, in steps of a pixel, its
+profile across is centred with a Gaussian window that moves until it rests. Profiles near the borders of
 squares are rejected: there the paper, not the light, makes the slope.
 
-Laser plane through its lines on boards.
-
-Weighted least squares over views, wrong ones rejected.
-
-Every view gives one straight line in space; how far it lies off a plane is two numbers (two points of it with the
-spread of all its points). Their covariance is that of the board's pose, which all points of a view share, and of the
-line's place in the image; so a thousand points of one view do not count as a thousand. A plane is constrained by lines
-that are not all the same one (three points that are not collinear); the covariance states how well, and what is not
+**Plane.** Every view gives one straight line in space; its distance from a plane is two numbers (two points
+of it with the spread of all its points). Their covariance is that of the board's pose, which all points of a
+view share, and of the line's place in the image; so a thousand points of one view do not count as a thousand.
+A plane is constrained by lines that are not all the same one; the covariance states how well, and what is not
 known to a tenth of a degree and of a millimetre is refused.
 """
 
@@ -45,31 +38,18 @@ _TOO_SHORT = "the laser line is seen on less than a square of the board: let it 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLine:
-    """The line of one view.
+    """The line of one view."""
 
-    Attributes:
-        points_m: (n, 3) on the board, camera frame [m].
-        uv: (n, 2) [px] the same in the image.
-        sigma_px: How sure the place of the whole line is, across it.
-        rms_px: RMS distance of single points from it.
-    """
-
-    points_m: Float
-    uv: Float
-    sigma_px: float
-    rms_px: float
+    points_m: Float  # (n, 3) on the board, camera frame [m]
+    uv: Float  # (n, 2) [px] the same in the image
+    sigma_px: float  # standard deviation of the whole line's place, across it
+    rms_px: float  # rms distance of single points from it
 
 
 def line_on_board(
     laser: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel
 ) -> BoardLine:
-    """Points of the laser's line on the board.
-
-    Args:
-        laser, ambient: Frames (H, W).
-        placed: Where the board is.
-        board: Its squares.
-        optics: The camera, its frame that of the rig.
+    """Points of the laser's line on the board, from frames (H, W).
 
     Raises:
         FitError: There is no line across the board; the text is the reason.
@@ -88,10 +68,7 @@ def line_on_board(
 def _laid_flat(
     difference: Grey, T: Float, board: Board, pixel_m: float, optics: CameraModel
 ) -> tuple[Float, Float, float]:
-    """Rectify the image onto the board's plane.
-
-    Values (n,), their places (n, 2) [m] on the board, and the side of a texel [m].
-    """
+    """Values (n,), places (n, 2) [m] on the board's plane, and a texel's side [m]."""
     rows, columns = grid_shape(board)
     side = board.square_m
     texel_px = 0.6
@@ -107,10 +84,7 @@ def _laid_flat(
 
 
 def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> tuple[Float, Float]:
-    """Find the straight line that gathers most light, by consensus of pairs.
-
-    Returns its point (2,) and direction (2,).
-    """
+    """Point and direction (2,) of the line with most light, by consensus of pairs."""
     bright = values > max(_NOISE_TIMES * noise, 0.3 * float(np.percentile(values, 99.8)))
     if bright.sum() < _MIN_PROFILES:
         raise FitError("no laser line on the board: let the line cross it, in a room that is not too bright")
@@ -135,10 +109,7 @@ def _brightest_line(values: Float, at: Float, noise: float, within_m: float) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Centred:
-    """Line on the board fitted to its centred profiles.
-
-    Point and direction (2,), points (n, 3) [m], and its uncertainty.
-    """
+    """Line on the board: point and direction (2,), points (n, 3) [m], uncertainty."""
 
     point: Float
     along: Float
@@ -157,10 +128,7 @@ def _profiles(
     board: Board,
     optics: CameraModel,
 ) -> _Centred:
-    """Centre the line in its profiles and fit a straight line through the centres.
-
-    Profiles are a pixel apart.
-    """
+    """Centre the line in profiles a pixel apart, and fit a straight line to that."""
     rows, columns = grid_shape(board)
     side = board.square_m
     across = np.array([-along[1], along[0]])
@@ -222,10 +190,7 @@ def _profiles(
 
 
 def _sampled(image: Grey, uv: Float) -> Float:
-    """Interpolate values (...) of a float image (H, W) at uv (..., 2).
-
-    NaN outside.
-    """
+    """Values (...) of a float image (H, W) at uv (..., 2), interpolated; NaN outside."""
     height, width = image.shape
     u, v = np.moveaxis(uv.astype(np.float32), -1, 0)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
@@ -240,22 +205,13 @@ _WRONG_CHI2 = 22.0  # of two degrees of freedom: one in 60 000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewLine:
-    """One view's line in space.
-
-    Attributes:
-        name: Of the view.
-        points_m: (n, 3) [m], camera frame.
-        ends_m: (2, 3) two points of the line with the mean and the spread of all.
-        placed: The board it lies on.
-        sigma_px: How sure the line's place in the image is.
-        focal_px: Of the camera.
-    """
+    """One view's line in space."""
 
     name: str
-    points_m: Float
-    ends_m: Float
-    placed: BoardPose
-    sigma_px: float
+    points_m: Float  # (n, 3) [m], camera frame
+    ends_m: Float  # (2, 3) two points of the line with the mean and the spread of all
+    placed: BoardPose  # the board it lies on
+    sigma_px: float  # standard deviation of the line's place in the image
     focal_px: float
 
     @classmethod
@@ -271,8 +227,8 @@ class ViewLine:
     def covariance(self, normal: Float) -> Float:
         """(2, 2) [m^2] of the distances of both ends from a plane with this normal.
 
-        A board that turns or shifts moves a point along its ray: X' = X (1 + (b . shift + turn . (d x b)) / b . X),
-        with b the board's normal and d = X - centre.
+        A board that turns or shifts moves a point along its ray, with b its normal and d = X - centre:
+        X' = X (1 + (b . shift + turn . (d x b)) / b . X).
         """
         facing = self.placed.T_camera_board[:3, 2]
         d = self.ends_m - self.placed.centre_m
@@ -286,28 +242,17 @@ class ViewLine:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneFit:
-    """A measured laser plane.
+    """A measured laser plane."""
 
-    Attributes:
-        plane: normal . X = offset, offset positive.
-        covariance: (4, 4) of normal and offset [m]; of the normal only across itself.
-        rms_m: Distance of the used points from the plane.
-        used: (views,) the views it is from.
-        off_m: (views,) rms distance of each view's points.
-    """
-
-    plane: LaserPlane
-    covariance: Float
-    rms_m: float
-    used: Bool
-    off_m: Float
+    plane: LaserPlane  # normal . X = offset, offset positive
+    covariance: Float  # (4, 4) of normal and offset [m]; of the normal only across itself
+    rms_m: float  # distance of the used points from the plane
+    used: Bool  # (views,) the views it is from
+    off_m: Float  # (views,) rms distance of each view's points
 
     @property
     def normal_sigma_rad(self) -> float:
-        """Return the largest standard deviation of the normal [rad].
-
-        In the direction in which it is least certain.
-        """
+        """Largest standard deviation of the normal [rad], in its least certain direction."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     @property
@@ -320,8 +265,8 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
     """The plane through the lines of at least three views.
 
     Raises:
-        FitError: Too few views, too few agree, or their lines constrain no plane, or too weakly; the text states what
-            to do.
+        FitError: Too few views, too few agree, or their lines constrain no plane, or too weakly; the text
+            states what to do.
     """
     min_views = 3
     if len(views) < min_views:
@@ -352,10 +297,7 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
 
 
 def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
-    """Return normal and offset of the plane with the largest consensus.
-
-    Through two of the lines; most of the others agree with it.
-    """
+    """Normal and offset of the plane through two lines that most others agree with."""
     pairs: list[tuple[int, int]] = list(combinations(range(len(views)), 2))
     most_pairs = 300
     if len(pairs) > most_pairs:
@@ -404,10 +346,7 @@ def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float
 
 
 def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, float, Float]:
-    """Return normal, offset and their covariance (4, 4).
-
-    By Gauss-Newton on the rotation of the normal and the offset.
-    """
+    """Normal, offset, covariance (4, 4), by Gauss-Newton on rotation and offset."""
     middle = np.concatenate([view.ends_m for view in views]).mean(axis=0)
     level = float(normal @ middle)
     tangents, cov3 = np.eye(3)[:, :2], np.eye(3)
@@ -441,11 +380,7 @@ def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, flo
 
 
 def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
-    """Refuse data that do not determine the plane as well as needed.
-
-    Raises:
-        FitError: All points on one line, or too uncertain.
-    """
+    """Refuse points on one line, and a plane that is too uncertain."""
     offset_limit_m = 1e-4
     if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= offset_limit_m:
         return

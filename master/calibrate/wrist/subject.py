@@ -1,16 +1,10 @@
 """The command `wrist subject` measures palm pose, knuckles and fingers.
 
-Measure palm pose, knuckles and fingers of a subject from one guided motion.
-
-Kim et al. 2012 read the knuckles off the laser at its smallest extent.
-
-The place of a knuckle is measured by the laser where its finger bends most: there the line lies beside it. One motion
-shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is
-made of it is in `guided`, `subject_model` and `subject_fit`; here is what goes in, comes out and is refused.
-
-`phalanx calibrate wrist subject`: palm pose, knuckles and fingers.
-
-Of the subject who wears the device, from a guided motion.
+Of the subject who wears the device, from one guided motion (Kim et al. 2012 read the knuckles off the laser
+at its smallest extent). The place of a knuckle is measured by the laser where its finger bends most: there
+the line lies beside it. One motion shows that, and the flat hand, from which everything is counted, and a
+fist, in which fingertips are seen. The fit is in `subject_model` and `subject_fit`; here is what goes in,
+comes out and is refused.
 """
 
 from argparse import Namespace
@@ -27,8 +21,8 @@ from common.command_line import echo
 from common.errors import CalibrationError, FitError
 from common.hand.model import CHAINS, FINGERS, HandModel
 from common.messages import WristDetections
-from master.calibrate.tree_files import matrix_of, provenance, write_hand
-from master.calibrate.wrist.device import Device, device_of, print_line, write_device
+from master.calibrate.tree_files import matrix_of, print_lines, provenance, refusals_named, write_hand
+from master.calibrate.wrist.device import Device, device_of, write_device
 from master.calibrate.wrist.subject_fit import (
     FLAT,
     MOTION,
@@ -53,25 +47,15 @@ _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly mov
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """A device and a hand that explain what was seen.
+    """A device and a hand that explain what was seen."""
 
-    Attributes:
-        rig: The rig with its new `T_camera_palm`.
-        hand: The hand file with new knuckles, lengths and `palmar_scale`, under its old name.
-        report: Lines for a person.
-        chosen: Which strobe cycles were used.
-        seen: What was seen in them.
-        fit: What was fitted to it.
-        model: The forward function about the old rig and hand.
-    """
-
-    rig: RigCalibration
-    hand: HandProfile
-    report: tuple[str, ...]
-    chosen: Guided
-    seen: ImageObservations
+    rig: RigCalibration  # the rig with its new `T_camera_palm`
+    hand: HandProfile  # the hand file with new knuckles, lengths and `palmar_scale`, under its old name
+    report: tuple[str, ...]  # lines for a person
+    chosen: Guided  # which strobe cycles were used
+    seen: ImageObservations  # observations in them
     fit: Fit
-    model: SubjectModel
+    model: SubjectModel  # the measurement model about the old rig and hand
 
     @property
     def unknown(self) -> Unknown:
@@ -80,10 +64,7 @@ class Subject:
 
     @property
     def knuckle_sigma_m(self) -> Float:
-        """Return the standard deviations (4, 3) of the knuckles in the camera frame [m].
-
-        Of palm and hand file together.
-        """
+        """Standard deviations (4, 3) [m] of knuckles, by palm and hand file together."""
         by_x = self.model.knuckle_derivatives(self.fit.x)
         return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
 
@@ -102,18 +83,17 @@ def calibrate_subject(
     Args:
         cycles: What the slave saw, in order.
         rig: The device: laser plane, and a palm pose that is right to a centimetre and ten degrees.
-        camera: Its camera.
         hand: The hand as far as it is known, such as a hand of the user's length.
         source: Name of the data, for the provenance.
 
     Raises:
-        FitError: The motion was not done, or not seen, or nothing likely explains it; the text states what to do.
+        FitError: The motion was not done or seen, or nothing likely explains it; the text states what to do.
         CalibrationError: The rig lacks its laser plane or palm pose.
     """
     setup = WristSetup.of(rig, camera, HandModel.of(hand))
     model = SubjectModel(setup)
     laser = np.array([one.laser_uv for one in cycles]).reshape(-1, 5, 2)
-    points = model.flat(setup.on_plane(laser))[:, 1:]
+    points = model.axes.flat(setup.on_plane(laser))[:, 1:]
     chosen = guided(points[..., 1])
     tips = np.array([one.tip_uv for one in cycles])[chosen.row, 1:]
     tip_sigma_px = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
@@ -129,45 +109,28 @@ def calibrate_subject(
 
 
 def _pose_sigma(rig: RigCalibration) -> Float:
-    """Return the prior uncertainty (6,) of the palm pose in the rig file [rad, m].
-
-    Rotated about the wrist joint, and shifted.
+    """Prior deviations (6,) of the palm pose [rad, m]: rotation about wrist, shift.
 
     A rig whose maker knows how differently it is worn states so in the residual of the pose's provenance.
     """
     how = rig.provenance.get("T_camera_palm")
     stated = {} if how is None or how.tool == TOOL else how.residual
-    rotation, shift = (
-        np.radians(stated.get("rotation_sigma_deg", 0.0)),
-        1e-3 * stated.get("shift_sigma_mm", 0.0),
-    )
+    rotation = np.radians(stated.get("rotation_sigma_deg", 0.0))
+    shift = 1e-3 * stated.get("shift_sigma_mm", 0.0)
     if how is not None and how.tool == "calibrate wrist palm":
         return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
     return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
 
 
 def _length_sigma(hand: HandProfile) -> Float:
-    """Return the prior uncertainty (4,) of the finger lengths, as shares.
-
-    Less where markers measured them.
-    """
+    """Prior deviation (4,) of finger lengths, as shares; less where measured."""
     how = [hand.provenance.get(name) for name in _NAMES]
-    # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
-    length, measured = 0.04, 0.012
-    return np.array(
-        [
-            measured if one and one.tool == "calibrate hand" and len(one.residual) > 1 else length
-            for one in how
-        ]
-    )
+    known = [one is not None and one.tool == "calibrate hand" and len(one.residual) > 1 for one in how]
+    return np.where(known, 0.012, 0.04)  # measured: 1 mm; bones are 6.5 % off their shares, each alone
 
 
 def _check(fit: Fit, seen: ImageObservations) -> None:
-    """Refuse what does not reach the minimum, and what is not likely.
-
-    Raises:
-        FitError: With what to do.
-    """
+    """Refuse what does not reach the minimum, and what is not likely."""
     knuckles = (seen.bend != FLAT) & ~fit.fist
     if not knuckles.any() or not fit.fist.any():
         missing = "closes to a fist" if knuckles.any() else "bends straight fingers at their knuckles"
@@ -184,23 +147,14 @@ def _check(fit: Fit, seen: ImageObservations) -> None:
 
 
 def _check_likely(fit: Fit) -> None:
-    """Refuse fits that neither skin nor prior explains.
-
-    Raises:
-        FitError: With what is most unlikely.
-    """
+    """Refuse fits that neither skin nor prior explains; name what is most unlikely."""
     pull = np.abs(fit.x) / fit.prior_sigma
     worst = int(pull.argmax())
     most_rms = 1.5  # standard deviations: angles are free, so what is left is small
+    most_prior_rms = 1.5  # the same: one in a hundred subjects, of 14 numbers that a motion constrains
     unlikely = 3.0  # standard deviations
-    # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion constrains
-    most_prior_rms = 1.5
-    if (
-        fit.rms > most_rms
-        or pull[worst] > unlikely
-        or fit.prior_rms > most_prior_rms
-        or fit.unlike > unlikely
-    ):
+    far = fit.rms > most_rms or fit.prior_rms > most_prior_rms
+    if far or pull[worst] > unlikely or fit.unlike > unlikely:
         raise FitError(
             f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
             f" fingers {fit.unlike:.1f} times from their posture prior, and {_name(worst)} {pull[worst]:.1f} standard"
@@ -210,12 +164,11 @@ def _check_likely(fit: Fit) -> None:
 
 
 def most_bent(fit: Fit, knuckles: Bool) -> Float:
-    """(4,) how far straight fingers were bent at their knuckles [rad]."""
+    """Largest angle (4,) [rad] of straight fingers at their knuckles."""
     return fit.angles_rad[knuckles][..., MCP].max(axis=0)
 
 
 def _name(unknown: int) -> str:
-    """What number `unknown` of the vector is, for a person."""
     if unknown < 6:
         return f"the palm's {'rotation about' if unknown < 3 else 'shift along'} {'xyz'[unknown % 3]}"
     if unknown < 18:
@@ -224,7 +177,7 @@ def _name(unknown: int) -> str:
 
 
 def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
-    """Format the values before and after the fit for a person.
+    """The values before and after the fit for a person.
 
     Knuckles across (to the thumb), up (to the back) and along the hand.
     """
@@ -261,7 +214,6 @@ def _three(values: Float) -> str:
 def _documented(
     rig: RigCalibration, hand: HandProfile, fit: Fit, source: str
 ) -> tuple[RigCalibration, HandProfile]:
-    """Rig and hand with where they come from."""
     sigma = Unknown.of(np.sqrt(np.diag(fit.covariance)))
     left = {"laser_rms_mm": round(1e3 * fit.laser_m, 4), "tip_rms_px": round(fit.tip_px, 4)}
     rotation, shift = np.degrees(sigma.pose[:3].max()), 1e3 * sigma.pose[3:].max()
@@ -293,11 +245,9 @@ def subject(options: Namespace) -> None:
         )
     profile = load(options.hand or _hand_of(device.rig.hand, options.calibration, options.out), HandProfile)
     cycles = list(recorded_cycles(options.detections, device.camera.name))
-    try:
+    with refusals_named(options.recording):
         found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
-    except FitError as error:
-        raise FitError(f"{options.recording}: {error}") from error
-    print_line(found.report)
+    print_lines(found.report)
     if options.picture is not None:
         from master.calibrate.picture import draw_subject
 
@@ -310,10 +260,7 @@ def subject(options: Namespace) -> None:
 
 
 def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
-    """Return the path of the rig's hand file.
-
-    Beside the rig in the tree of the results if that has it, as the rig itself.
-    """
+    """Path of the rig's hand file, in the tree of the results if that has it."""
     trees = [calibration] if out is None else [out, calibration]
     paths = [tree / "hands" / f"{name}.json" for tree in trees]
     return next((path for path in paths if path.exists()), paths[-1])

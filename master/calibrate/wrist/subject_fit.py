@@ -1,28 +1,20 @@
 """A guided motion is segmented, and the most probable subject fitted to it.
 
-Segmentation of a subject's guided motion.
+**Segments.** The distance of the laser points shows how open the hand is: they are farthest on a flat hand
+and come nearer with every joint that bends. So a motion falls into its openings and what lies between them,
+and a few strobe cycles of each are all that a fit needs. Which bends are of the knuckles, and which are
+fists, is decided by the tips.
 
-Flat hand, knuckles flexed with straight fingers, flat hand, fist.
+**Fit.** Laser point and tip give four numbers of a finger in a strobe cycle, its angles are three unknowns;
+the rest comes from joint couplings, each as firm as people keep to it. A flat hand is flat and a finger that
+bends at its knuckle is straight, to a few degrees; a fist closes in natural ratios, about. Knuckles,
+thickness and length are those of a hand of its size, about. What none of that determines keeps its prior, and
+the covariance shows it: above all, a knuckle that lies farther from the camera looks like a thicker finger,
+and all knuckles shifted alike like a palm that is shifted.
 
-How far the laser points lie shows how open the hand is, whatever else is still unknown: they are farthest on a flat
-hand and come nearer with every joint that bends. So a motion falls into its openings and what lies between them, and
-a few strobe cycles of each are all that a fit needs. Which bends are of the knuckles, and which are fists, is decided
-later, by the tips.
-
-Most probable subject of a device as one least-squares problem.
-
-Given what was seen of a guided motion.
-
-Laser point and tip give four numbers of a finger in a strobe cycle, its angles are three unknowns; what is known of a
-subject comes from joint couplings as well, each as firm as people keep to it. A flat hand is flat and a finger that
-bends at its knuckle is straight, to a few degrees; a fist closes in natural ratios, about. Knuckles, thickness and
-length are those of a hand of its size, about. What none of that determines keeps its prior, and the
-covariance shows it: above all, a knuckle that lies farther from the camera looks like a thicker finger, and all
-knuckles shifted alike look like a palm that is shifted.
-
-The angles of each finger in each strobe cycle are eliminated (Schur complement), which leaves 26 unknowns. Steps are
-Levenberg-Marquardt; outliers are downweighted (Cauchy). Errors of skin, tips and couplings last as long as a bend
-does: its strobe cycles count together as a few.
+The angles of each finger in each strobe cycle are eliminated (Schur complement), which leaves 26 unknowns.
+Steps are Levenberg-Marquardt; outliers are downweighted (Cauchy). Errors of skin, tips and couplings last as
+long as a bend does: its strobe cycles count together as a few.
 """
 
 from dataclasses import dataclass
@@ -44,21 +36,16 @@ _FEWEST = 5  # strobe cycles of a bend
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guided:
-    """Strobe cycles that count (T), in order.
+    """Strobe cycles that count (T), in order."""
 
-    Attributes:
-        row: (T,) their numbers.
-        bend: (T,) number of the bend that each is of; FLAT: the hand is open.
-    """
-
-    row: Int
-    bend: Int
+    row: Int  # (T,) their numbers
+    bend: Int  # (T,) number of the bend that each is of; FLAT: the hand is open
 
 
 def guided(along_m: Float) -> Guided:
-    """Choose strobe cycles by how far the laser points lie [m].
+    """Choose strobe cycles by how far the laser points (T, 4) [m] lie.
 
-    Laser points (T, 4) of index ... little; NaN: not seen.
+    Index ... little; NaN: not seen.
 
     Raises:
         FitError: Fewer than three fingers bent, or the hand bent fewer than two times between openings.
@@ -74,17 +61,14 @@ def guided(along_m: Float) -> Guided:
     chosen = [_flattest(np.flatnonzero(flat), open_share)]
     number = [np.full(len(chosen[0]), FLAT)]
     for k, rows in enumerate(bends):
-        per_bend = 16
-        rows = _evenly(rows, open_share, max(per_bend * 2 // len(bends), _FEWEST))
+        rows = _evenly(rows, open_share, max(32 // len(bends), _FEWEST))
         chosen.append(rows)
         number.append(np.full(len(rows), k))
     return Guided(np.concatenate(chosen), np.concatenate(number))
 
 
 def openness(along_m: Float) -> Float:
-    """Return the openness (T,) of the hand as a share of the laser points' ways.
-
-    The share that the points have gone from the nearest to the farthest.
+    """Openness (T,) of the hand, 0...1 from its nearest to its farthest laser points.
 
     Raises:
         FitError: Fewer than three fingers are seen to bend.
@@ -95,8 +79,7 @@ def openness(along_m: Float) -> Float:
         if len(seen) >= 2 * _FEWEST:
             edge = 0.02  # share of outliers beyond the ends of a way
             low[f], high[f] = np.quantile(seen, [edge, 1.0 - edge])
-    moved_m = 0.015  # of the laser point of a finger that bent
-    moved = high - low > moved_m
+    moved = high - low > 0.015  # way of the laser point of a finger that bent
     fingers = 3  # that must be seen
     if moved.sum() < fingers:
         raise FitError(
@@ -111,10 +94,7 @@ def openness(along_m: Float) -> Float:
 
 
 def _bends(open_share: Float, flat: Bool) -> list[Int]:
-    """Return the strobe cycles of each flexion.
-
-    What lies between openings and goes at least half of the way.
-    """
+    """Strobe cycles of each flexion: between openings, at least half of the way."""
     bends: list[Int] = []
     known = np.flatnonzero(np.isfinite(open_share))
     edges = np.flatnonzero(np.diff(np.r_[True, flat[known], True]))
@@ -127,13 +107,9 @@ def _bends(open_share: Float, flat: Bool) -> list[Int]:
 
 
 def _flattest(rows: Int, open_share: Float) -> Int:
-    """Pick some of the more open half of the rows.
-
-    A hand stays flat for longer than it passes by.
-    """
+    """Some of the more open half of the rows: a flat hand stays flat for longer."""
     half = rows[np.argsort(open_share[rows])][len(rows) // 2 :]
-    per_flat = 6
-    return np.unique(half[np.linspace(0.0, len(half) - 1.0, per_flat).astype(np.int64)])
+    return np.unique(half[np.linspace(0.0, len(half) - 1.0, 6).astype(np.int64)])
 
 
 def _evenly(rows: Int, open_share: Float, count: int) -> Int:
@@ -147,9 +123,7 @@ def _evenly(rows: Int, open_share: Float, count: int) -> Int:
 _LASER_SIGMA_M = 8e-4  # of skin of another shape than the cones
 _FLAT_RAD = np.radians(4.0)  # how flat people hold a hand
 _STRAIGHT_RAD = np.radians(5.0)  # how straight they keep a finger that bends at its knuckle
-_ASIDE_RAD = np.radians(
-    17.0
-)  # 5 of a finger, who keeps to it all the time: its strobe cycles together count as one
+_ASIDE_RAD = np.radians(17.0)  # 5 of a finger that keeps to it: its strobe cycles together count as one
 _ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
 _OUTLIER_SIGMAS = 2.5  # standard deviations from which an observation is downweighted
 _GUESS_SIGMA = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
@@ -161,78 +135,46 @@ _KNUCKLES, _FIST = 0, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservations:
-    """Image observations of strobe cycles (T), fingers index ... little.
+    """Observations of strobe cycles (T), fingers index ... little; NaN: not seen."""
 
-    NaN: not seen.
-
-    Attributes:
-        laser_m: (T, 4, 2) on the plane, across and along [m].
-        tip_uv: (T, 4, 2) [px].
-        tip_sigma_px: (T, 4) as the slave reports.
-        bend: (T,) as of `guided.Guided`.
-    """
-
-    laser_m: Float
-    tip_uv: Float
-    tip_sigma_px: Float
-    bend: Int
+    laser_m: Float  # (T, 4, 2) on the plane, across and along [m]
+    tip_uv: Float  # (T, 4, 2) [px]
+    tip_sigma_px: Float  # (T, 4) as the slave reports
+    bend: Int  # (T,) as of `Guided`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The most probable subject.
+    """The most probable subject."""
 
-    Attributes:
-        x: (26,) as of `subject_model.Unknown`.
-        covariance: (26, 26).
-        prior_sigma: (26,) prior standard deviations.
-        angles_rad: (T, 4, 3) abduction, MCP, PIP.
-        fist: (T,) whether the strobe cycle is of a fist.
-        off: (T, 4, 4) seen minus fitted, in standard deviations: laser across and along, tip; NaN: not seen, or past
-            the end of the laser's branch.
-        rms: Of `off`, outliers at their limit.
-        unlike: Rms of what fingers did against their joint couplings, in standard deviations.
-        laser_m, tip_px: What is left at laser points and tips, median.
-    """
-
-    x: Float
-    covariance: Float
-    prior_sigma: Float
-    angles_rad: Float
-    fist: Bool
+    x: Float  # (26,) as of `subject_model.Unknown`
+    covariance: Float  # (26, 26)
+    prior_sigma: Float  # (26,) prior standard deviations
+    angles_rad: Float  # (T, 4, 3) abduction, MCP, PIP
+    fist: Bool  # (T,) whether the strobe cycle is of a fist
+    # (T, 4, 4) seen minus fitted, in standard deviations: laser across and along, tip; NaN: not seen, or past
+    # the end of the laser's branch
     off: Float
-    rms: float
-    unlike: float
-    laser_m: float
+    rms: float  # of `off`, outliers at their limit
+    unlike: float  # rms of what fingers did against their joint couplings, in standard deviations
+    laser_m: float  # this and tip_px: median residual of laser points and tips
     tip_px: float
 
     @property
     def prior_rms(self) -> float:
-        """Return the rms change from the prior in standard deviations.
-
-        Over as many numbers as the motion determined.
-        """
+        """Rms change from the prior in standard deviations, per number determined."""
         measured = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
         return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / measured))
 
 
 def prior_sigma(pose: Float, length: Float) -> Float:
-    """Return the prior standard deviations of a subject (26,).
-
-    With the palm's pose (6,) [rad, m] and the lengths of fingers (4,).
-    """
+    """Prior deviations (26,), with the palm's pose (6,) [rad, m], lengths (4,)."""
     knuckle_m = 3e-3  # against a hand of this size, per axis
     return np.r_[pose, np.full(12, knuckle_m), np.full(4, SPREAD), length]
 
 
 def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> Fit:
-    """Fit subject and angles.
-
-    Args:
-        model: Forward function about the first guess.
-        seen: What was seen.
-        sigma: (26,) how far the first guess may be off, as of `prior_sigma`.
-    """
+    """Fit subject and angles; the first guess may be off by `sigma` (26,)."""
     problem = _Problem(model, seen, sigma)
     x, guess, covariance = np.zeros(UNKNOWN), problem.guessed(np.zeros(UNKNOWN)), np.empty(0)
     for rounds in _ROUNDS:  # what a rough pose takes for an outlier may be none
@@ -242,10 +184,7 @@ def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Guess:
-    """Initial guess of angles, fists and inliers.
-
-    Angles (T, 4, 3), which strobe cycles (T,) are of a fist, and which observations (T, 4) count.
-    """
+    """Angles (T, 4, 3), which cycles (T,) are fists, which observations (T, 4) count."""
 
     angles: Float
     fist: Bool
@@ -253,10 +192,7 @@ class _Guess:
 
 
 class _Problem:
-    """Residuals, posture priors and steps of the subject fit.
-
-    Its state was prepared by the constructor.
-    """
+    """Residuals, posture priors and steps of the subject fit."""
 
     def __init__(self, model: SubjectModel, seen: ImageObservations, sigma: Float) -> None:
         self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
@@ -270,10 +206,7 @@ class _Problem:
         self._share = np.minimum(independent / count, 1.0)  # (T,) what a strobe cycle counts
 
     def guessed(self, x: Float) -> "_Guess":
-        """Guess the angles from joint couplings alone.
-
-        A flexion is that of a fist if it suits a fist better.
-        """
+        """Angles by joint couplings alone; a flexion is a fist if it suits one better."""
         grid = np.zeros((2, len(_GRID_RAD), 4, LOCAL))
         grid[_KNUCKLES, ..., MCP] = grid[_FIST, ..., PIP] = _GRID_RAD[:, None]
         grid[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
@@ -319,7 +252,7 @@ class _Problem:
         return x, guess, covariance
 
     def result(self, x: Float, guess: _Guess, covariance: Float) -> Fit:
-        """The result with what is left."""
+        """The fit with its residuals."""
         off = np.where(guess.used[..., None], self._off(x, guess.angles), np.nan)
         known = np.isfinite(off)
         rms = float(np.sqrt(np.mean(np.minimum(np.abs(off[known]), 2.0 * _OUTLIER_SIGMAS) ** 2)))
@@ -333,20 +266,14 @@ class _Problem:
         )  # fmt: skip
 
     def _off(self, x: Float, angles: Float) -> Float:
-        """Return seen minus fitted (T, 4, 4) in standard deviations.
-
-        NaN: not seen. A finger that the laser misses is far.
-        """
+        """Seen minus fitted (T, 4, 4) in deviations; NaN: not seen; far: laser misses."""
         shown = self._model(x, angles)
         off = (self._data - shown) / self._sigma
         farthest = 8.0  # of a finger that the laser should meet and does not
         return np.where(np.isnan(shown) & np.isfinite(self._data), farthest, off)
 
     def _prior_rows(self, guess: _Guess) -> tuple[Float, Float]:
-        """Return the residuals (T, 4, 3) of the posture priors and their derivatives.
-
-        By the angles (T, 4, 3, 3).
-        """
+        """Residuals (T, 4, 3) of posture priors, and derivatives by angles (T, 4, 3, 3)."""
         angles, fist, flat = guess.angles, guess.fist, self._bend == FLAT
         ratio = np.broadcast_to(self._model.mcp_per_pip, angles.shape[:2])
         by = np.zeros((*angles.shape[:2], LOCAL, LOCAL))
@@ -367,7 +294,7 @@ class _Problem:
         return float((self._share * (data + grid)).sum() + ((x / self.prior_sigma) ** 2).sum())
 
     def _normal(self, x: Float, guess: _Guess) -> "_Normal":
-        """Build the normal equations at a point, with outliers down-weighted."""
+        """The normal equations at a point, with outliers down-weighted."""
         off = np.nan_to_num(self._off(x, guess.angles))
         pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)], axis=-1)
         root = np.repeat((1.0 + pairs / _OUTLIER_SIGMAS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
@@ -391,30 +318,16 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations of shared unknowns and of each finger's angles.
+    """Normal equations of 26 shared unknowns and each cycle's angles (T, 4, 3)."""
 
-    Unknowns that all strobe cycles share (26), and angles that belong to one finger in one strobe cycle (T, 4, 3).
-
-    Attributes:
-        own: (T, 4, 3, 3) information of the angles.
-        mixed: (T, 4, 3, 26).
-        own_pull: (T, 4, 3).
-        shared: (26, 26).
-        shared_pull: (26,).
-    """
-
-    own: Float
+    own: Float  # this, mixed and shared: (T, 4, 3, 3), (T, 4, 3, 26) and (26, 26) information
     mixed: Float
-    own_pull: Float
+    own_pull: Float  # this and shared_pull: (T, 4, 3) and (26,)
     shared: Float
     shared_pull: Float
 
     def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
-        """Eliminate the angles and return the reduced normal equations.
-
-        Information (26, 26) and gradient (26,) without the angles, and what gives the angles' steps from the step of
-        the rest.
-        """
+        """Information (26, 26), gradient (26,) without the angles; and the angles' part."""
         eye = damping * np.eye(LOCAL)
         own = self.own * (1.0 + eye) + 1e-9 * np.eye(LOCAL)
         by_shared = _solve(own, self.mixed)
@@ -434,13 +347,11 @@ class _Normal:
 def fists_of(cost: Float) -> Bool:
     """Classify flexions as fists by the cost of either kind (B, 2).
 
-    Tips distinguish the kinds, and some tips are false.
-
-    A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.
+    Tips distinguish the kinds, and some tips are false. A bend that suits both kinds about equally is of the
+    one that nothing else is: people are asked for both.
     """
     better: Float = np.log((cost[:, _KNUCKLES] + 1.0) / (cost[:, _FIST] + 1.0))
-    clearly = 2.0  # ratio of costs
-    clear = np.abs(better) > np.log(clearly)
+    clear = np.abs(better) > np.log(2.0)  # ratio of costs
     if clear.any() and (better[clear] > 0.0).all():
         return clear
     if clear.any() and (better[clear] < 0.0).all():

@@ -1,11 +1,9 @@
 """Measurement model of a wrist device for a subject, and its derivatives.
 
-For a hand of which little is known.
-
-Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
-and how long. Unknown in each strobe cycle are three angles per finger; the DIP follows the PIP. What is seen are the
-laser point on its plane and the fingertip. Both are made as the master does (`master.calibrate.laser_intersection`,
-`common.hand.model`), so that what is fitted is what will be used.
+Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how
+thick it is and how long. Unknown in each strobe cycle are three angles per finger; the DIP follows the PIP.
+What is seen are the laser point on its plane and the fingertip. Both are made as the master does
+(`master.calibrate.laser_intersection`, `common.hand.model`), so that what is fitted is what will be used.
 """
 
 from dataclasses import dataclass
@@ -32,18 +30,13 @@ _ROTATION_STEP = np.radians(0.5)  # of central differences
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknown:
-    """What is unknown of a subject, as changes of a setup.
+    """What is unknown of a subject, as changes of a setup."""
 
-    Attributes:
-        pose: (6,) turn [rad] about the wrist joint and shift [m] of the palm, camera axes. A strap holds a device at
-            the wrist and lets it turn: knuckles that lie elsewhere indicate a turn first.
-        knuckle_m: (4, 3) shift of each knuckle, palm frame.
-        thick, long: (4,) natural logarithms of the factors of thickness and length.
-    """
-
+    # (6,) rotation [rad] about the wrist joint and shift [m] of the palm, camera axes. A strap holds a device
+    # at the wrist and lets it turn: knuckles that lie elsewhere indicate a rotation first
     pose: Float
-    knuckle_m: Float
-    thick: Float
+    knuckle_m: Float  # (4, 3) shift of each knuckle, palm frame
+    thick: Float  # this and long: (4,) natural logarithms of the factors of thickness and length
     long: Float
 
     @classmethod
@@ -53,15 +46,11 @@ class Unknown:
 
 
 class SubjectModel:
-    """Laser points and tips of one device and hand as a function of the unknowns.
-
-    Its state was prepared by the constructor.
-    """
+    """Laser points and tips of one device and hand as a function of the unknowns."""
 
     def __init__(self, setup: WristSetup) -> None:
-        self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        rays = 32
-        self._intersection, self._tips = LaserIntersection(setup, rays), Fingertips.of(setup.model)
+        self._setup, self._surface, self.axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
+        self._intersection, self._tips = LaserIntersection(setup, rays=32), Fingertips.of(setup.model)
         self._root = setup.model.rest_position_m[CHAINS[:, 0]]
         synergy = FlexionSynergy.of(setup.model)
         distance = np.linalg.norm(transform(setup.T_camera_palm, self._root[FINGERS].mean(axis=0)))
@@ -72,10 +61,6 @@ class SubjectModel:
     def none(self) -> Unknown:
         """No change."""
         return Unknown.of(np.zeros(UNKNOWN))
-
-    def flat(self, point_m: Float) -> Float:
-        """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""
-        return self._axes.flat(point_m)
 
     def palm(self, unknown: Unknown) -> Float:
         """T_camera_palm (4, 4)."""
@@ -88,7 +73,7 @@ class SubjectModel:
         return transform(self.palm(unknown), self._root[FINGERS] + unknown.knuckle_m)
 
     def knuckle_derivatives(self, x: Float) -> Float:
-        """How the knuckles move with what is unknown, (4, 3, 26)."""
+        """Derivatives (4, 3, 26) of the knuckles by the unknowns."""
         out = np.empty((4, 3, UNKNOWN))
         nudge = 1e-5
         for k, step in enumerate(nudge * np.eye(UNKNOWN)):
@@ -97,21 +82,14 @@ class SubjectModel:
         return out
 
     def __call__(self, x: Float, angles: Float) -> Float:
-        """Predict laser point (across, along) [m] and tip [px] of every finger.
+        """Laser point (across, along) [m] and tip [px] (T, 4, 4); NaN: the laser misses.
 
-        (T, 4, 4), NaN where the laser misses.
-
-        Args:
-            x: (26,) as of `Unknown`.
-            angles: (T, 4, 3) abduction, MCP, PIP [rad].
+        Unknowns x (26,) as of `Unknown`, angles (T, 4, 3) abduction, MCP, PIP [rad].
         """
         return self._seen([self._surface_of(Unknown.of(x), angles)])[0]
 
     def derivatives(self, x: Float, angles: Float) -> tuple[Float, Float]:
-        """Return the derivatives by the unknowns and by the angles.
-
-        (T, 4, 4, 26) by the unknowns, (T, 4, 4, 3) by the angles; 0 where not known.
-        """
+        """Derivatives (T, 4, 4, 26) by unknowns, (T, 4, 4, 3) by angles; 0: not known."""
         shift_step, share_step = 5e-4, 0.02  # of central differences
         steps = np.r_[np.full(3, _ROTATION_STEP), np.full(3, shift_step), np.full(2, share_step)]
         ways = np.zeros((8, UNKNOWN))
@@ -136,30 +114,21 @@ class SubjectModel:
         return out, np.moveaxis(per_pip[8:], 0, -1)
 
     def _surface_of(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
-        """Return the finger surface spheres and the tips in the camera frame.
-
-        Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m].
-        """
+        """Spheres (T, 4, K, 3), radii (4, K) and tips (T, 4, 3) [m] in the camera frame."""
         whole = np.zeros((len(angles), 5, 4))
         whole[:, FINGERS, :3] = angles
         whole[:, FINGERS, DIP] = self.dip_per_pip * angles[..., 2]
         chains = self._setup.model.chains(whole)
         long, shift, thick = np.ones((5, 1, 1)), np.zeros((5, 1, 3)), np.ones((5, 1))
-        long[FINGERS, 0, 0], shift[FINGERS, 0], thick[FINGERS, 0] = (
-            np.exp(unknown.long),
-            unknown.knuckle_m,
-            np.exp(unknown.thick),
-        )
+        long[FINGERS, 0, 0], thick[FINGERS, 0] = np.exp(unknown.long), np.exp(unknown.thick)
+        shift[FINGERS, 0] = unknown.knuckle_m
         root = self._root[:, None]
         chains = Chains(root + shift + long * (chains.position_m - root), chains.rotation)
         surface = PalmarSurface(thick * self._surface.palmar_m, thick * self._surface.radius_m)
         spheres = surface.spheres(chains)
         tips, palm = self._tips.points(chains), self.palm(unknown)
-        return (
-            transform(palm, spheres[:, FINGERS]),
-            surface.radius_m[FINGERS],
-            transform(palm, tips[:, FINGERS]),
-        )
+        tips_m = transform(palm, tips[:, FINGERS])
+        return transform(palm, spheres[:, FINGERS]), surface.radius_m[FINGERS], tips_m
 
     def _seen(self, surfaces: list[tuple[Float, Float, Float]]) -> Float:
         """(P, T, 4, 4) laser points and tips of P hands."""
@@ -172,10 +141,8 @@ class SubjectModel:
 
 def fitted_profile(model: HandModel, unknown: Unknown) -> HandProfile:
     """The hand file with the knuckles, lengths and thickness of its subject."""
-    place, thick = (
-        model.rest_position_m.copy(),
-        PalmarSurface.of(model).palmar_m[FINGERS] * np.exp(unknown.thick)[:, None],
-    )
+    place = model.rest_position_m.copy()
+    thick = PalmarSurface.of(model).palmar_m[FINGERS] * np.exp(unknown.thick)[:, None]
     for f, chain in enumerate(CHAINS[FINGERS]):
         root = place[chain[0]].copy()
         place[chain] = root + unknown.knuckle_m[f] + np.exp(unknown.long[f]) * (place[chain] - root)

@@ -1,12 +1,9 @@
-"""Page Checklist: what is not as it should be, each with what to do.
-
-Otherwise it states that all is well.
-"""
+"""Page Checklist: what is not as it should be, each with what to do."""
 
 from nicegui import ui
 
 from common.messages import CheckItem, Checklist
-from master.console.controls import readable
+from master.console.controls import every, readable
 from master.console.state import ConsoleState
 
 
@@ -25,9 +22,7 @@ def build(state: ConsoleState) -> None:
         with box:
             _fill(checklist, now if isinstance(now, str) else "")
 
-    update()
-    update_s = 0.5
-    ui.timer(update_s, update)
+    every(0.5, update)
 
 
 def _fill(checklist: Checklist | None, why: str) -> None:

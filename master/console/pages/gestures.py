@@ -13,7 +13,7 @@ from common.calibration import load
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.errors import CalibrationError, PhalanxError
 from common.messages import Gesture
-from master.console.controls import gesture_line, readable
+from master.console.controls import every, gesture_line, readable
 from master.console.state import ConsoleState
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -42,16 +42,11 @@ def _now(state: ConsoleState) -> None:
             or "<p class='soft'>No hand is seen.</p>"
         )
 
-    update()
-    update_s = 0.2
-    ui.timer(update_s, update)
+    every(0.2, update)
 
 
 def hand_html(hand: str, now: dict[str, Gesture]) -> str:
-    """Return the gestures of one hand as HTML.
-
-    A pose is shown as words, a pinch as a bar, a dial as a gauge.
-    """
+    """Return one hand's gestures as HTML: pose in words, pinch a bar, dial a gauge."""
     pose, pinch, dial, point = (now.get(kind) for kind in ("pose", "pinch", "dial", "point"))
     parts = [f"<h2>{escape(readable(hand))}</h2>"]
     name = "no pose" if pose is None else readable(pose.name)
@@ -77,7 +72,6 @@ def _bar(title: str, words: str, share: float, of: str) -> str:
 
 
 def _dial(angle_rad: float | None) -> str:
-    """Draw a gauge whose needle is rotated clockwise by the angle."""
     known = angle_rad is not None and not math.isnan(angle_rad)
     degrees = math.degrees(angle_rad) if angle_rad is not None and known else 0.0
     words = f"{degrees:+.0f}°" if known else "none"
@@ -105,8 +99,7 @@ def _show_events(state: ConsoleState) -> None:
             "<ul>" + "".join(lines) + "</ul>" if lines else "<p class='soft'>Nothing yet.</p>"
         )
 
-    update()
-    ui.timer(1.0, update)
+    every(1.0, update)
 
 
 def _phase(gesture: Gesture) -> str:
@@ -117,10 +110,7 @@ def _phase(gesture: Gesture) -> str:
 
 
 def _poses(state: ConsoleState) -> None:
-    """Build the controls for the user's own poses.
-
-    They are recorded and deleted by the same commands as in a terminal.
-    """
+    """Build the controls for the user's own poses, with the same commands as in a terminal."""
     with ui.element("section").classes("panel wide").props('aria-label="Poses of your own"'):
         ui.label("Poses of your own").classes("panel-title")
         ui.label(
@@ -166,8 +156,7 @@ def _poses(state: ConsoleState) -> None:
         if process is not None:
             progress.set_text("\n".join(process.tail(8)))
 
-    update()
-    ui.timer(1.0, update)
+    every(1.0, update)
 
 
 def poses_of(state: ConsoleState) -> tuple[str, ...]:

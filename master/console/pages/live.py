@@ -1,7 +1,4 @@
-"""Page Live: camera pictures, the hand in 3D and its tracking state.
-
-It shows how much of the hand is known, and what it does.
-"""
+"""Page Live: camera pictures, the hand in 3D, its tracking state and gestures."""
 
 from html import escape
 
@@ -11,6 +8,7 @@ from common.messages import HandPose
 from master.console.controls import (
     CameraView,
     HandBox,
+    every,
     gesture_lines,
     hand_line,
     joint_states,
@@ -95,10 +93,7 @@ def _camera(state: ConsoleState, camera: str) -> None:
 
 
 def _hands(state: ConsoleState) -> None:
-    """Build the text on the hands as one piece of HTML.
-
-    A screen reader and a copy thus find plain words.
-    """
+    """Build the text on the hands as one piece of HTML: a screen reader and a copy find plain words."""
     text = ui.html("", sanitize=False).classes("words")
 
     def update() -> None:
@@ -114,15 +109,11 @@ def _hands(state: ConsoleState) -> None:
             parts.append(f"<h2>No hand</h2><p class='soft'>{escape(_why_none(state))}</p>")
         text.set_content("".join(parts))
 
-    update()
-    ui.timer(_UPDATE_S, update)
+    every(_UPDATE_S, update)
 
 
 def joints(pose: HandPose) -> str:
-    """Return the 26 joints as HTML dots, one row per finger.
-
-    Each dot states its joint and state.
-    """
+    """Return the 26 joints as HTML dots with their states, one row per finger."""
     rows: dict[str, list[str]] = {}
     for name, state, tracked in joint_states(pose):
         finger = name.split("-")[0]

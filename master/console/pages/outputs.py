@@ -1,14 +1,7 @@
 """Page Outputs shows what goes to other programs, and recordings.
 
-Settings of the live outputs, and the process that follows them.
-
-The page changes the settings. All of it blocks.
-
-Live outputs on the page.
-
-For each output they show a switch and the address, whether it is open, and what it sent.
-
-The page Outputs: what goes to other programs, and recordings.
+The page changes the settings file; a process of its own follows it and sends. File and process functions
+block.
 """
 
 import asyncio
@@ -25,6 +18,7 @@ from common.calibration import parse, save
 from common.calibration.output_settings import OutputPart, OutputSettings
 from common.errors import PhalanxError
 from common.messages import Health
+from master.console.controls import every
 from master.console.recording_panel import play_panel, recording_panel
 from master.console.state import ConsoleState
 from master.outputs.network.outputs import OUTPUTS, switched_on
@@ -48,9 +42,7 @@ def read_outputs(state: ConsoleState) -> OutputSettings:
 
 
 def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> OutputSettings:
-    """Change one output in the settings file, whole or not at all.
-
-    The process runs while any output is on.
+    """Change one output in the settings file, whole or not at all, and `follow` it.
 
     Raises:
         CalibrationError: The file is broken or read-only, or a value is none; the text names the key.
@@ -69,9 +61,7 @@ def change_output(state: ConsoleState, name: str, change: dict[str, object]) -> 
 
 
 def follow(state: ConsoleState, settings: OutputSettings) -> None:
-    """Run the output process exactly while some output is on.
-
-    A process that somebody else started is left alone.
+    """Run the output process exactly while some output is on, unless another's runs.
 
     Raises:
         PhalanxError: It cannot be started.
@@ -86,10 +76,7 @@ def follow(state: ConsoleState, settings: OutputSettings) -> None:
 
 
 def _of_others(state: ConsoleState) -> bool:
-    """Return whether somebody else runs the output process.
-
-    Our own process that has just ended stays visible a moment longer, so this waits until it is gone.
-    """
+    """Return whether somebody else runs the output process, once our own has gone from the bus."""
     gone_s = 3.0  # so long one that has ended is still seen on the bus
     until = time.monotonic() + (gone_s if state.local.get(SENDING) is not None else 0.0)
     while NAME in state.alive and time.monotonic() < until:
@@ -160,9 +147,7 @@ def output_panel(state: ConsoleState) -> None:
         if process is not None:
             log.set_text("\n".join(process.tail(4)))
 
-    update()
-    update_s = 1.0
-    ui.timer(update_s, update)
+    every(1.0, update)
 
 
 def status_words(name: str, report: Health | None) -> str:

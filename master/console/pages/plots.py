@@ -1,13 +1,11 @@
-"""Page Plots: the last minute of latency, rates, loss, clocks and temperature.
-
-It is redrawn once a second.
-"""
+"""Page Plots: the last minute of latency, rates, loss, clocks and temperature."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nicegui import ui
 
+from master.console.controls import every
 from master.console.state import SPAN_S, ConsoleState, History
 
 _GREY = "#7d8590"  # readable on light and on dark
@@ -16,10 +14,7 @@ _COLOURS = ("#2f81f7", "#e3702f", "#2da44e", "#bf4b8a", "#9a6700", "#0e9aa7", "#
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One plot: its title with the unit, and the names of its series.
-
-    A series is a whole name, or the beginning of names that ends with a dot.
-    """
+    """One plot: title with unit, and whole names of series, or starts with a dot."""
 
     title: str
     series: tuple[str, ...]
@@ -52,9 +47,7 @@ def build(state: ConsoleState) -> None:
             chart.update()
             words.set_text(latest_words(names, state.history))
 
-    update()
-    update_s = 1.0
-    ui.timer(update_s, update)
+    every(1.0, update)
 
 
 def names_of(plot: Plot, history: History) -> list[str]:

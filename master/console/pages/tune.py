@@ -1,20 +1,6 @@
 """Page Tune sets cameras, marker colours and the filter of each rig.
 
-Colours of a camera's markers on the page.
-
-It shows which one is being tuned, its hue, saturation and value, and what is tinted.
-
-Controls of one camera on the page Tune.
-
-They cover settings, colours, picking colours in the picture, save and revert.
-
-Filter of one rig on the page Tune.
-
-It is tried on the running master at once, then saved or taken back.
-
-Page Tune: settings and colours of each camera, and the filter of each rig.
-
-Every change acts at once.
+Every change acts at once on the running slave or master, until it is saved or taken back.
 """
 
 import asyncio
@@ -49,7 +35,7 @@ HUES = 180  # OpenCV's
 
 
 class ColourPanel:
-    """Holds the controls, and the colours that they show."""
+    """Controls of the markers' hue, saturation and value, and what is tinted."""
 
     def __init__(
         self,
@@ -60,11 +46,8 @@ class ColourPanel:
     ) -> None:
         """Build them in the present slot.
 
-        Args:
-            markers: Names; the first is chosen.
-            on_change: Called with each new colour of a marker.
-            on_forget: Called with the marker whose colour is to be forgotten.
-            tint: Called with whose pixels are to be tinted in the picture.
+        `on_change` gets each new colour of a marker, `on_forget` the marker whose colour is to be forgotten,
+        `tint` the markers whose pixels are to be tinted in the picture.
         """
         self._markers, self._on_change, self._tint = markers, on_change, tint
         self._colours: dict[str, Range] = {}
@@ -169,7 +152,6 @@ def _ends(control: ui.range) -> tuple[int, int]:
 
 
 def _middle(colour: Range) -> str:
-    """The colour in the middle of a range, as CSS."""
     low, high = colour.low, colour.high
     span = (high[0] - low[0]) % HUES
     hue = (low[0] + span / 2.0) % HUES
@@ -192,13 +174,7 @@ class CameraPanel:
     """Controls of one page for one camera, with the last answer of the slave."""
 
     def __init__(self, state: ConsoleState, camera: str, markers: tuple[str, ...]) -> None:
-        """Build them in the present slot.
-
-        Args:
-            state: What the console knows.
-            camera: Name of the camera.
-            markers: Those of its rigs.
-        """
+        """Build them in the present slot; `markers` are those of its rigs."""
         self._state, self._camera, self._markers = state, camera, markers
         self._tuner = state.tuner(camera)
         self._client: Client = ui.context.client
@@ -275,10 +251,7 @@ class CameraPanel:
         self._do(self._save_both, f"saved to the camera file of {self._camera}", "saved")
 
     def _save_both(self) -> InUse:
-        """Save the slave's file, then the copy on this machine.
-
-        The copy is a different file where the slave is elsewhere.
-        """
+        """Save the slave's file, then this machine's copy, another file where the slave is elsewhere."""
         saved = self._tuner.save()
         path = self._state.camera_path(self._camera)
         if path.exists():
@@ -286,8 +259,6 @@ class CameraPanel:
         return saved
 
     def _do(self, step: Callable[[], InUse], done: str = "", state: str = "") -> None:
-        """Ask on a thread, then show the answer or the error."""
-
         async def work() -> None:
             self._spin.set_visibility(True)
             try:
@@ -306,7 +277,6 @@ class CameraPanel:
         background_tasks.create(work(), name=f"tune {self._camera}")
 
     def _show(self, now: InUse) -> None:
-        """Show what the camera has; what it does not know at all is not offered."""
         self._now = now
         self._error.set_visibility(False)
         self._spin.set_visibility(False)
@@ -317,55 +287,25 @@ class CameraPanel:
         self._colours.show(now.markers)
 
     def _fail(self, text: str) -> None:
-        """Show the slave's error text unchanged, and the settings now in effect."""
-        self._error.set_text(text)
-        self._error.set_visibility(True)
         with self._client:
             ui.notify(text, type="negative", multi_line=True, close_button="OK")
         if self._now is not None:
-            now, shown = self._now, text
-            self._show(now)
-            self._error.set_text(shown)
-            self._error.set_visibility(True)
+            self._show(self._now)  # which hides the error
+        self._error.set_text(text)
+        self._error.set_visibility(True)
 
 
 # Name of the key, title, unit, factor to the key's unit, slider from, to, decimals, logarithmic, what it does.
+# fmt: off
 _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ...] = (
-    (
-        "min_cutoff_hz",
-        "Cut-off at rest",
-        "Hz",
-        1.0,
-        0.5,
-        30.0,
-        1,
-        True,
-        "lower: calmer at rest, later to start",
-    ),
+    ("min_cutoff_hz", "Cut-off at rest", "Hz", 1.0, 0.5, 30.0, 1, True, "lower: calmer at rest, later to start"),
     ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 6000.0, 0, False, "higher: less lag in quick motion"),
-    (
-        "d_cutoff_hz",
-        "Cut-off of the speed",
-        "Hz",
-        1.0,
-        0.5,
-        30.0,
-        1,
-        True,
-        "how quickly the filter follows a change of speed",
-    ),
-    (
-        "jitter_m",
-        "Jitter left at rest",
-        "mm",
-        1e-3,
-        0.02,
-        3.0,
-        2,
-        True,
-        "noisier signals are filtered more, down to this",
-    ),
+    ("d_cutoff_hz", "Cut-off of the speed", "Hz", 1.0, 0.5, 30.0, 1, True,
+     "how quickly the filter follows a change of speed"),
+    ("jitter_m", "Jitter left at rest", "mm", 1e-3, 0.02, 3.0, 2, True,
+     "noisier signals are filtered more, down to this"),
 )
+# fmt: on
 
 
 def filter_panel(state: ConsoleState, rig: str) -> None:

@@ -1,12 +1,7 @@
 """Set-up builds command lines, and forms from their options.
 
-Form fields of a calibration, read from the command's own options.
-
-Thus page and command line cannot differ.
-
-Command lines of the processes that the set-up starts or asks to be started.
-
-They are cameras, masters and calibrations.
+Form fields of a calibration are read from the command's own options: page and command line cannot differ. The
+command lines are those of cameras, masters and calibrations that the page starts, or asks a person to start.
 """
 
 import os
@@ -36,17 +31,13 @@ _UNITS = {"_m_s": "m/s", "_mm": "mm", "_px": "px", "_ms": "ms", "_deg": "°"}
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One option or argument of a command.
+    """One option or argument of a command, as an entry of a form.
 
     Attributes:
         name: Its name among the options that are read.
         flag: On the command line, such as --square-mm; empty for an argument.
-        label: For a person.
-        help: What it means.
         shape: How it is entered.
         default: What it is if nothing is entered; None: left out.
-        required: Whether the command needs it.
-        choices: Of a choice.
         low, high: Bounds of a number.
     """
 
@@ -71,9 +62,7 @@ def fields_of(command: Command) -> tuple[Field, ...]:
 
 
 def arguments_of(fields: tuple[Field, ...], values: Mapping[str, Value]) -> list[str]:
-    """Return the command line for `values` (by field name).
-
-    Fields that are at their default, or empty, are omitted.
+    """Return the command line for `values` by field name, without defaults.
 
     Raises:
         CalibrationError: A required field is empty, or a number is none or out of range.
@@ -118,8 +107,6 @@ def _text(field: Field, value: Value) -> str | None:
 
 
 class _Declared(ArgumentParser):
-    """A parser that remembers what is declared, in that order."""
-
     def __init__(self) -> None:
         self.actions: list[Action] = []
         super().__init__(add_help=False)
@@ -164,7 +151,6 @@ def _value(default: object) -> Value:
 
 
 def _shape(action: Action) -> Shape:
-    """How an option is entered."""
     if action.nargs == 0:
         return "flag"
     if action.choices is not None:
@@ -202,10 +188,10 @@ class Commands:
         return self.settings.calibration.resolve()
 
     def environment(self) -> dict[str, str]:
-        """Return the environment variables of the processes, with the rig key.
+        """Return the environment of the processes, with the rig key.
 
-        The rig key may not stand on a command line. Where the key is a keys folder's, the processes inherit where
-        that folder is, and each camera has a certificate and a secret in it from here on.
+        The key may not stand on a command line. Where it is a keys folder's, the processes inherit where that
+        folder is, and each camera has a certificate and a secret in it from here on.
 
         Raises:
             PhalanxError: There is no key.
@@ -218,12 +204,10 @@ class Commands:
         return {ENVIRONMENT: key}
 
     def camera(self, camera: CameraPlan, view: str, epoch_ns: int) -> list[str]:
-        """The slave of a camera of this machine.
+        """The slave of a camera of this machine, simulated or USB.
 
-        Args:
-            camera: Simulated, or USB.
-            view: What simulated cameras look at, a key of `VIEWS` or any scene.
-            epoch_ns: When that begins, the same for all, `epoch_of(view)`.
+        Simulated ones look at `view`, a key of `VIEWS` or any scene, which begins at `epoch_ns`,
+        `epoch_of(view)` for all.
         """
         line = [
             sys.executable,
@@ -242,10 +226,7 @@ class Commands:
         return [*line, *self._driver(camera, view, epoch_ns), "--seconds", f"{seconds:g}", "-o", str(out)]
 
     def pi(self, camera: CameraPlan) -> tuple[str, str]:
-        """Return the two commands for a camera on a Pi.
-
-        A person runs one here, to bring the files to the Pi, and one there, to start its slave.
-        """
+        """Return the commands for a camera on a Pi: here to copy files, there to start."""
         host = camera.device or f"{camera.name}.local"
         there = "calib_json"
         copy = f"rsync -a {shlex.quote(f'{self.tree}/')} {shlex.quote(host)}:{there}/"
@@ -332,10 +313,7 @@ class Commands:
 
 
 def epoch_of(view: str) -> int:
-    """Return when the scene of a view begins, on this machine's monotonic clock [ns].
-
-    A hand that is held still never begins.
-    """
+    """Return when a view's scene begins [ns, monotonic]; a still hand never does."""
     never_s = 36_000.0  # a hand that begins to move so much later is held still
     soon_s = 3.0  # until slaves have joined
     later_s = never_s if view == "still" else soon_s
@@ -343,21 +321,14 @@ def epoch_of(view: str) -> int:
 
 
 def out_of(command: str, work: Path) -> Path:
-    """Return where a command writes its output.
-
-    The output is a page to print, pictures, or a tree of calibration files.
-    """
-    return {
-        "board": work / "board.pdf",
-        "cube": work / "box.pdf",
-        "capture": work / "views",
-    }.get(command, work / "tree")
+    """Return where a command writes: a page to print, pictures, or a tree of files."""
+    return {"board": work / "board.pdf", "cube": work / "box.pdf", "capture": work / "views"}.get(
+        command, work / "tree"
+    )
 
 
 def world_of_project() -> Path:
-    """Return the calib_json tree used as the simulated world.
-
-    It is the one that comes with the source, or that of the working directory.
+    """Return the calib_json tree of the simulated world, of the source or the cwd.
 
     Raises:
         CalibrationError: Neither is there.

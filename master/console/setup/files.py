@@ -1,18 +1,10 @@
 """Set-up page writes its files, for the camera modes that were chosen.
 
-Sensors and modes that a camera may have.
-
-Each comes with all that a camera file needs to begin with. docs/cameras.md gives the reasons.
-
-Row times are those of the sensors' Linux drivers, line length over pixel rate, times the rows that are added up to one
-of the picture. Exposure and gains are where to start from: a bright room, markers well exposed and little smeared.
-
-Files that the set-up page writes: its own plan, cameras, rig, hand and key.
-
-An old file is kept beside the tree's.
-
-What was entered on the page and no calibration file has a place for (which camera is simulated, which is a USB one)
-stands in console/setup.json of the same tree, so that the set-up goes on where it was left.
+docs/cameras.md gives the reasons of the modes. Row times are those of the sensors' Linux drivers, line length
+over pixel rate, times the rows that are added up to one of the picture. Exposure and gains are where to start
+from: a bright room, markers well exposed and little smeared. A file that is replaced is kept under old/ of
+the tree. What no calibration file has a place for (which camera is simulated, which is a USB one) stands in
+console/setup.json of the same tree.
 """
 
 import os
@@ -47,9 +39,6 @@ class Mode:
     """One mode of one sensor.
 
     Attributes:
-        title: For the list.
-        size_px: Width and height of the picture.
-        rate_hz: Frames a second.
         row_time_us: From one row to the next; 0: all at once, or not known.
         view: How much of the lens's full view is in the picture.
         exposure_us, gain, colour_gains: Where to start from.
@@ -82,7 +71,11 @@ class Mode:
         )
 
 
-_GLOBAL = "all rows at once"
+def _usb_mode(width: int, height: int, rate_hz: float) -> Mode:
+    title = f"{width} x {height} at {rate_hz:g} Hz"
+    return Mode(title, (width, height), rate_hz, 0.0, "row time not known", colour_gains=(1.0, 1.0))
+
+
 MODES: dict[Kind, dict[str, Mode]] = {
     "simulated": {},
     "pi": {
@@ -93,21 +86,15 @@ MODES: dict[Kind, dict[str, Mode]] = {
         "imx708-fast": Mode(
             "Camera Module 3 (IMX708), fast", (768, 432), 115.0, 18.4, "two thirds of the width", focus_m=0.6
         ),
-        "imx296": Mode("Global Shutter Camera (IMX296)", (728, 544), 60.0, 0.0, f"full view, {_GLOBAL}"),
+        "imx296": Mode(
+            "Global Shutter Camera (IMX296)", (728, 544), 60.0, 0.0, "full view, all rows at once"
+        ),
     },
     "usb": {
-        "vga60": Mode(
-            "640 x 480 at 60 Hz", (640, 480), 60.0, 0.0, "row time not known", colour_gains=(1.0, 1.0)
-        ),
-        "vga30": Mode(
-            "640 x 480 at 30 Hz", (640, 480), 30.0, 0.0, "row time not known", colour_gains=(1.0, 1.0)
-        ),
-        "hd30": Mode(
-            "1280 x 720 at 30 Hz", (1280, 720), 30.0, 0.0, "row time not known", colour_gains=(1.0, 1.0)
-        ),
-        "hd60": Mode(
-            "1280 x 720 at 60 Hz", (1280, 720), 60.0, 0.0, "row time not known", colour_gains=(1.0, 1.0)
-        ),
+        "vga60": _usb_mode(640, 480, 60.0),
+        "vga30": _usb_mode(640, 480, 30.0),
+        "hd30": _usb_mode(1280, 720, 30.0),
+        "hd60": _usb_mode(1280, 720, 60.0),
     },
 }
 SIMULATED = "as-simulated"
@@ -126,15 +113,10 @@ def modes_of(kind: Kind) -> dict[str, str]:
 
 
 def new_file(kind: Kind, mode: str, name: str, truth: Path) -> CameraCalibration:
-    """Return the initial file of a camera that was chosen on the page.
+    """Return the first file of a camera: the chosen mode, no lens and no colours.
 
-    It has the chosen mode, no lens and no colours.
-
-    Args:
-        kind: Of the camera.
-        mode: A key of `modes_of(kind)`.
-        name: Of the camera.
-        truth: Tree of the simulated world, whose cameras a simulated one is like.
+    `mode` is a key of `modes_of(kind)`; a simulated camera is like that of the simulated world in tree
+    `truth`.
 
     Raises:
         CalibrationError: The simulated world has no such camera.
@@ -161,10 +143,9 @@ WORLDS_EIGHT = {2: "desk-back3"}
 
 
 class CameraPlan(Part, frozen=True):
-    """One camera as entered on the page: what it is, where, and more options.
+    """One camera as entered on the page.
 
-    Where is the device of a USB camera, or the host of a Pi; the options are those of its slave, such as `--control
-    gain=32`.
+    `device`: of a USB camera, or the host of a Pi. `options`: of its slave, such as `--control gain=32`.
     """
 
     name: Name
@@ -175,10 +156,7 @@ class CameraPlan(Part, frozen=True):
 
 
 class Plan(Part, frozen=True):
-    """Contents of console/setup.json: what was entered on the page.
-
-    `truth`: tree of the simulated world.
-    """
+    """Contents of console/setup.json; `truth`: tree of the simulated world."""
 
     version: Literal[1] = 1
     rig: Name = "desk"
@@ -208,9 +186,7 @@ class Plan(Part, frozen=True):
 
 
 def load_plan(tree: Path) -> Plan:
-    """Load the saved plan of the page.
-
-    It is a new plan where nothing was entered.
+    """Load the saved plan of the page; a new one where nothing was entered.
 
     Raises:
         CalibrationError: The file is broken.
@@ -220,9 +196,7 @@ def load_plan(tree: Path) -> Plan:
 
 
 def plan_of_rig(tree: Path, name: str) -> Plan:
-    """Derive the plan from a rig's files where nothing was entered on the page.
-
-    Its cameras count as ones that somebody else starts.
+    """Derive the plan from a rig's files; somebody else starts its cameras.
 
     Raises:
         CalibrationError: The rig's file is broken.
@@ -247,9 +221,7 @@ def save_plan(tree: Path, plan: Plan) -> None:
 
 
 def write_cameras(tree: Path, plan: Plan) -> list[Path]:
-    """Write the camera files of the plan, and save the plan.
-
-    A file of the same mode stays as it is, with lens and colours.
+    """Write plan and camera files; a file of the same mode keeps lens and colours.
 
     Raises:
         CalibrationError: A name stands twice, a simulated world has no such camera, a file cannot be written.
@@ -273,10 +245,7 @@ def write_cameras(tree: Path, plan: Plan) -> list[Path]:
 
 
 def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
-    """Return whether lens and colours of one mode hold for the other.
-
-    They do where size and read-out are the same.
-    """
+    """Return whether lens and colours hold for both: same size and read-out."""
     return (one.width_px, one.height_px, one.row_time_us, one.focus_m) == (
         other.width_px,
         other.height_px,
@@ -286,9 +255,7 @@ def same_mode(one: CameraCalibration, other: CameraCalibration) -> bool:
 
 
 def write_rig(tree: Path, plan: Plan) -> list[Path]:
-    """Write rig, hand and key of the plan, and save the plan.
-
-    Measured camera places stay while the cameras are the same.
+    """Write the plan, its rig, hand and key; places of the same cameras stay.
 
     Raises:
         CalibrationError: No cameras yet, no hand is of that length, or a file cannot be written.
@@ -341,9 +308,7 @@ def key_of(tree: Path, given: bytes | None) -> str:
 
 
 def keep_old(tree: Path, path: Path) -> Path | None:
-    """Copy a file that is about to be replaced into old/DATE/ of the tree.
-
-    Return None if there is no such file.
+    """Copy a file that is about to be replaced into old/DATE/; None if there is none.
 
     Raises:
         CalibrationError: It cannot be copied.

@@ -1,12 +1,7 @@
 """Job runs a calibration and reads its progress from its output.
 
-Progress of a calibration, read from the lines that it prints.
-
-A line holds `7 of 25`, `40 %`, or a step with its number.
-
-A running calibration.
-
-It runs one command after the other, with their lines, their progress, and results to be taken over.
+It runs its stages one after the other. Progress is a line with `7 of 25`, `40 %`, or a step with its number.
+Results are written below the job's own folder, and taken over into the tree in use by `Job.use`.
 """
 
 import re
@@ -28,10 +23,7 @@ _SHARE = re.compile(r"\b(\d{1,3}) %")
 
 
 def share_of(line: str) -> float | None:
-    """Return the share of the work that a line reports as done, 0..1.
-
-    None if it reports none.
-    """
+    """Return the share of work that a line reports as done, 0..1, or None."""
     if found := _COUNT.search(line):
         done, whole = int(found[1]), int(found[2])
         return min(done / whole, 1.0) if whole else None
@@ -41,10 +33,7 @@ def share_of(line: str) -> float | None:
 
 
 def progress(lines: Iterable[str]) -> float | None:
-    """Return the last share of work that any line reports.
-
-    None if none does.
-    """
+    """Return the last share of work that any line reports; None if none does."""
     last = None
     for line in lines:
         share = share_of(line)
@@ -53,10 +42,7 @@ def progress(lines: Iterable[str]) -> float | None:
 
 
 def fault(lines: Iterable[str]) -> str:
-    """Return the error that a failed command printed last.
-
-    It includes what to do, as its author wrote it.
-    """
+    """Return the error that a failed command printed last, with what to do."""
     printed = [line.strip() for line in lines if line.strip()]
     for place, line in reversed(list(enumerate(printed))):
         if line.startswith(("phalanx: ", "phalanx-slave: ", "meet: ")):
@@ -85,10 +71,7 @@ class JobState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Commands that run at once: name of the process -> its command line.
-
-    `keyboard`: it waits for Enter.
-    """
+    """Commands that run at once, by process; `keyboard`: they wait for Enter."""
 
     title: str
     commands: dict[str, list[str]]
@@ -96,10 +79,7 @@ class Stage:
 
 
 class Job:
-    """Calibration stages that run one after the other on a thread of their own.
-
-    It holds their lines and what the tree was at the start.
-    """
+    """Calibration stages that run one after the other on a thread of their own."""
 
     def __init__(
         self,
@@ -111,16 +91,10 @@ class Job:
         work: Path,
         ended: Callable[[], None] = lambda: None,
     ) -> None:
-        """Begin.
+        """Begin; `stages` are each made when their turn comes.
 
-        Args:
-            title: For messages.
-            stages: Each made when its turn comes.
-            local: Where processes are started.
-            environment: Theirs.
-            tree: The calib_json tree in use, into which `use` writes.
-            work: New folder of this job.
-            ended: Called at the end, on the job's thread.
+        `use` writes into `tree`, the one in use; `work` is a new folder of this job; `ended` is called on its
+        thread.
 
         Raises:
             CalibrationError: The folder cannot be made.
@@ -129,8 +103,7 @@ class Job:
         self.state, self.error, self.stage = JobState.RUNNING, "", ""
         self.keyboard = False
         self.used: tuple[Path, ...] = ()
-        lines = 400
-        self.lines: deque[str] = deque(maxlen=lines)
+        self.lines: deque[str] = deque(maxlen=400)
         self._stages, self._local, self._environment, self._ended = tuple(stages), local, environment, ended
         self._stop = threading.Event()
         self._now: dict[str, LocalProcess] = {}
@@ -146,10 +119,7 @@ class Job:
 
     @property
     def share(self) -> float | None:
-        """Return the progress of the job over all its stages, 0..1.
-
-        None if no progress is reported.
-        """
+        """Return the progress over all stages, 0..1; None if none is reported."""
         if self.state is JobState.DONE:
             return 1.0
         own = progress(line for one in list(self._now.values()) for line in list(one.lines))
@@ -202,10 +172,9 @@ class Job:
     def use(self) -> tuple[Path, ...]:
         """Write the results into the tree in use and return the files written.
 
-        What was there is kept under old/.
-
         Raises:
-            CalibrationError: There is nothing, a file is broken, or one of the tree changed since the job began.
+            CalibrationError: There is nothing, a file is broken, or one of the tree changed since the job
+                began.
         """
         results = self.results()
         if not results:
@@ -248,8 +217,7 @@ class Job:
         }
         while any(one.ended() is None for one in self._now.values()):
             failed = any(one.ended() not in (None, 0) for one in self._now.values())
-            poll_s = 0.1
-            if failed or self._stop.wait(poll_s):
+            if failed or self._stop.wait(0.1):
                 break
         codes = {name: self._end(name, one) for name, one in self._now.items()}
         for one in self._now.values():
@@ -271,7 +239,6 @@ class Job:
 
 
 def _files(tree: Path) -> dict[Path, bytes]:
-    """The calibration files of a tree as they are now."""
     found: dict[Path, bytes] = {}
     for folder in _KINDS:
         for path in (tree / folder).glob("*.json"):

@@ -1,7 +1,7 @@
 """Master that tracks nothing, so cameras can be seen before calibration.
 
-It gives the start and carries the bus. Run as `python -m master.console.setup.meet --rig NAME --calibration DIR ...`,
-as `phalanx run`.
+It gives the start and carries the bus. Run as `python -m master.console.setup.meet --rig NAME --calibration
+DIR ...`.
 """
 
 import os
@@ -32,14 +32,12 @@ def meet(words: Sequence[str]) -> None:
     with ExitStack() as stack:
         link = host_bus(options.bus, cameras)
         stack.callback(link.close)
-        start_s = 5.0
         ingest = Ingest(
-            cameras, link_key(os.environ, options.key_file), SystemClock(), *ends, options.bus, start_s
+            cameras, link_key(os.environ, options.key_file), SystemClock(), *ends, options.bus, 5.0
         )
         stack.callback(ingest.close)
         previous: frozenset[str] | None = None
-        poll_s = 0.2
-        while not stop.wait(poll_s):
+        while not stop.wait(0.2):
             while ingest.get(0.0) is not None:
                 pass  # nothing is tracked
             if (here := ingest.connected) != previous:

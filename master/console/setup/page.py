@@ -1,7 +1,4 @@
-"""Set-up page: steps on the left, the panel of one step on the right.
-
-Each step is marked as done, to do or stale.
-"""
+"""Set-up page: steps on the left, the panel of one step on the right."""
 
 from collections.abc import Callable
 from functools import partial
@@ -48,13 +45,10 @@ def build(state: ConsoleState) -> None:
     steps = _Steps(session, nav, panel, desk)
     desk.go = steps.go
     steps.go(session.here or steps.first())
-    poll_s = 1.0
-    ui.timer(poll_s, steps.update)
+    ui.timer(1.0, steps.update)
 
 
 class _Steps:
-    """Which panel is open, and the list of steps beside it."""
-
     def __init__(self, session: Session, nav: ui.element, panel: ui.column, desk: Desk) -> None:
         self._session, self._nav, self._panel, self._desk = session, nav, panel, desk
         self._here = ""

@@ -1,10 +1,6 @@
 """Panels of steps 1 and 2 choose cameras, markers and hand.
 
-Panel of step 1: how many cameras, what kind, which sensor in which mode.
-
-Panel of step 2: which markers, whose hand, and the rig key.
-
-The key keeps unknown senders out.
+Step 2 also makes the rig key, which keeps unknown senders out.
 """
 
 import re
@@ -29,18 +25,12 @@ from master.console.setup.files import (
 from master.console.setup.parts import Desk, heading
 
 NAMES = ("left", "right", "left2", "right2", "camera5", "camera6", "camera7", "camera8")
-_TALK = {
-    "usb": "Device, such as /dev/v4l/by-id/…",
-    "pi": "Host of the Pi, such as pi@left.local",
-}
+_TALK = {"usb": "Device, such as /dev/v4l/by-id/…", "pi": "Host of the Pi, such as pi@left.local"}
 
 
 def panel_cameras(desk: Desk) -> None:
     """Fill the panel."""
-    heading(
-        "Choose cameras",
-        "Two or more. Lenses, places and colours are measured by the next steps.",
-    )
+    heading("Choose cameras", "Two or more. Lenses, places and colours are measured by the next steps.")
     rows = _Rows(desk.session.plan)
     with ui.row().classes("items-end"):
         kind = ui.select(KINDS, label="Kind of cameras", value=rows.kind).classes("w-72")
@@ -76,7 +66,7 @@ def panel_cameras(desk: Desk) -> None:
 
 
 class _Rows:
-    """The cameras as they are entered. Holds the plan that they change."""
+    """The cameras as they are entered."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -165,9 +155,7 @@ def panel_rig(desk: Desk) -> None:
     plan = desk.session.plan
     heading("Markers and hand", "Which markers are painted, on whose hand. A measured hand can follow later.")
     name = ui.input(
-        "Name of the rig",
-        value=plan.rig,
-        validation={"letters, digits and - only": _is_name},
+        "Name of the rig", value=plan.rig, validation={"letters, digits and - only": _is_name}
     ).classes("w-72")
     ui.label("Markers").props('id="setup-markers"')
     markers = ui.radio({key: title for key, (title, _) in MARKER_SETS.items()}, value=plan.marker_set)

@@ -1,12 +1,7 @@
 """Panel of step 5 samples the colours of the markers.
 
-Marker colours set by a click.
-
-It finds which pixel of the whole frame was meant, reads which colour the camera took, and keeps it.
-
-Panel of step 5: colours of the markers.
-
-They are set by a click on each in the picture of each camera.
+A click on each marker in each camera's picture, converted to a pixel of the whole frame, has the slave sample
+it.
 """
 
 import json
@@ -21,6 +16,7 @@ from common.calibration import CameraCalibration, HsvRange, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Command, Health, Preview
 from common.recording.pictures import jpeg_size
+from master.console.controls import InUse
 from master.console.setup.files import keep_old
 from master.console.setup.parts import Desk, heading, jpeg_url
 
@@ -28,41 +24,25 @@ from master.console.setup.parts import Desk, heading, jpeg_url
 def pixel_of(
     camera: CameraCalibration, preview_px: tuple[int, int], at_px: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the full-frame pixel under a point of the camera's preview.
-
-    Centres of pixels are whole numbers in both.
-    """
+    """Return the full-frame pixel under a preview's; whole numbers: pixel centres."""
     scale_u, scale_v = camera.width_px / preview_px[0], camera.height_px / preview_px[1]
     u, v = (at_px[0] + 0.5) * scale_u - 0.5, (at_px[1] + 0.5) * scale_v - 0.5
     return min(max(u, 0.0), camera.width_px - 1.0), min(max(v, 0.0), camera.height_px - 1.0)
 
 
 def pick(camera: str, marker: str, uv: tuple[float, float]) -> Command:
-    """Return the command that samples a marker's colour around a pixel.
-
-    The pixel is one of the newest frame.
-    """
+    """Return the command that samples a colour around a pixel of the newest frame."""
     return Command(camera, "pick", json.dumps({"marker": marker, "uv": [round(uv[0], 1), round(uv[1], 1)]}))
 
 
 def ranges_of(health: Health) -> dict[str, HsvRange]:
     """Return the colours in use that a camera's answer reports."""
-    found: dict[str, HsvRange] = {}
-    for key in health.metrics:
-        if key.startswith("marker.") and key.endswith(".h_low"):
-            name = key.removeprefix("marker.").removesuffix(".h_low")
-            low, high = (
-                tuple(round(health.metrics[f"marker.{name}.{letter}_{end}"]) for letter in "hsv")
-                for end in ("low", "high")
-            )
-            found[name] = HsvRange(hsv_low=(low[0], low[1], low[2]), hsv_high=(high[0], high[1], high[2]))
-    return found
+    markers = InUse.of(health).markers
+    return {name: HsvRange(hsv_low=one.low, hsv_high=one.high) for name, one in markers.items()}
 
 
 def keep_colours(tree: Path, camera: str, ranges: Mapping[str, HsvRange]) -> Path:
-    """Write the colours reported by a camera of another machine into its file here.
-
-    Lens and settings stay.
+    """Write the colours that another machine's camera reports into its file here.
 
     Raises:
         CalibrationError: The file is missing, broken, or cannot be written.
@@ -81,8 +61,6 @@ _KEYS = {"ArrowLeft": (-1, 0), "ArrowRight": (1, 0), "ArrowUp": (0, -1), "ArrowD
 
 @dataclass(slots=True)
 class _Choice:
-    """Current pick: camera and marker, crosshair position and preview size."""
-
     camera: str
     marker: str
     at: tuple[float, float] | None = None
@@ -119,7 +97,7 @@ def panel_colours(desk: Desk) -> None:
 
 
 def _serve(desk: Desk) -> None:
-    """Offer to hold the simulated hand still, and show who must run."""
+    """Offer to hold the simulated hand still."""
     session = desk.session
     if session.plan.simulated and session.view != "still":
 
@@ -131,7 +109,6 @@ def _serve(desk: Desk) -> None:
 
 
 def _known(desk: Desk, camera: str) -> set[str]:
-    """Markers that the file of a camera has a colour of."""
     path = desk.session.tree / "cameras" / f"{camera}.json"
     try:
         return set(load(path, CameraCalibration).markers or {})
@@ -140,10 +117,7 @@ def _known(desk: Desk, camera: str) -> set[str]:
 
 
 class _ColourChoice:
-    """Picture to click on, with what is being picked.
-
-    It also holds which markers each camera knows.
-    """
+    """Picture to click on, what is being picked, and which markers each camera knows."""
 
     def __init__(self, desk: Desk, rig: RigCalibration) -> None:
         self._desk, self._rig = desk, rig
@@ -174,8 +148,7 @@ class _ColourChoice:
         with ui.row():
             ui.button("Save colours", on_click=self._save).props('icon="save"')
             ui.button("Next: track", on_click=lambda: self._desk.go("track")).props("flat")
-        picture_s = 0.2
-        ui.timer(picture_s, self._show)
+        ui.timer(0.2, self._show)
         self._show_state()
 
     async def _click(self, event: events.MouseEventArguments) -> None:

@@ -1,16 +1,9 @@
 """Panels of lenses and of all other calibrations run wizards.
 
-Panel of step 4: lenses and places of the cameras.
-
-They are measured from a printed board that is shown to the cameras.
-
-All calibrations as wizards, made of one form each.
-
-A form states what it is for, what is needed, what to do, fields and result.
+Step 4 measures lenses and places from a printed board; each other calibration is a form of its `Wizard`.
 """
 
 import json
-from pathlib import Path
 from typing import cast
 
 from nicegui import ui
@@ -52,20 +45,20 @@ def panel_lens(desk: Desk) -> None:
 def _print(desk: Desk) -> None:
     paper = ui.select(["A4", "A3", "A2", "letter"], label="Paper", value="A4").classes("w-40")
 
-    async def draw() -> None:
-        await desk.attempt(lambda: desk.session.start(WIZARDS["board"], {"paper": paper.value}))
+    def draw() -> Job:
+        return desk.session.start(WIZARDS["board"], {"paper": paper.value})
 
     ui.label("Print it at 100 %, measure the ruler (100 mm), glue it on something flat and stiff.").classes(
         "setup-text"
     )
-    ui.button("Make the page", on_click=draw).props('icon="grid_on"')
+    ui.button("Make the page", on_click=lambda: desk.attempt(draw)).props('icon="grid_on"')
     job_view(desk, lambda: desk.session.jobs.get("board"), lambda: None)
 
 
 def verdict(job: Job) -> str:
     """What the residuals of the fit mean, and whether to do it again."""
     path = job.work / "result.json"
-    return judged(_read(path)) if path.exists() else ""
+    return judged(cast(dict[str, object], json.loads(path.read_text()))) if path.exists() else ""
 
 
 def judged(numbers: dict[str, object]) -> str:
@@ -73,7 +66,8 @@ def judged(numbers: dict[str, object]) -> str:
     rms = float(cast(float, numbers["rms_px"]))
     pairs = cast(list[dict[str, float]], numbers["pairs"])
     off = [abs(pair["edge_sd_mm"]) / max(abs(pair["edge_mean_mm"]), 1e-9) for pair in pairs]
-    poor = [name for name, lens in _lenses(numbers).items() if lens]
+    cameras = cast(dict[str, dict[str, dict[str, str]]], numbers["cameras"])
+    poor = [name for name, lens in cameras.items() if lens["coverage"]["advice"]]
     text = f"Corners fit to {rms:.2f} px; squares come out alike to {100 * max(off, default=0.0):.1f} %. "
     good_px, poor_px = 0.6, 1.2  # of all corners, root mean square
     squares_share = 0.01
@@ -85,16 +79,6 @@ def judged(numbers: dict[str, object]) -> str:
         return text + "Fair: usable; more views, held stiller, would make it better."
     more = f" It would gain most by more views for {', '.join(poor)}: in corners and tilted." if poor else ""
     return text + "Good: use it." + more
-
-
-def _lenses(numbers: dict[str, object]) -> dict[str, str]:
-    """Camera -> what would help it most."""
-    cameras = cast(dict[str, dict[str, dict[str, str]]], numbers["cameras"])
-    return {name: lens["coverage"]["advice"] for name, lens in cameras.items()}
-
-
-def _read(path: Path) -> dict[str, object]:
-    return cast(dict[str, object], json.loads(path.read_text()))
 
 
 def panel_more(desk: Desk) -> None:
@@ -140,20 +124,14 @@ def build_wizard(desk: Desk, wizard: Wizard) -> None:
     if reason and wizard.prepared:
         ui.label(reason).classes("setup-text")
     job_view(
-        desk,
-        lambda: desk.session.jobs.get(wizard.command),
-        lambda: None,
-        early=wizard.command == "capture",
+        desk, lambda: desk.session.jobs.get(wizard.command), lambda: None, early=wizard.command == "capture"
     )
     if wizard.master != "none":
         previews(desk)
 
 
 def _cannot_record(desk: Desk, wizard: Wizard) -> str:
-    """Return why the page cannot make the recording itself.
-
-    Empty where it can, or where none is needed.
-    """
+    """Return why the page cannot make the recording itself, or ""."""
     if not wizard.prepared:
         return ""
     try:
@@ -164,8 +142,6 @@ def _cannot_record(desk: Desk, wizard: Wizard) -> str:
 
 
 class _Form:
-    """The fields of one wizard. Holds what was entered."""
-
     def __init__(self, wizard: Wizard) -> None:
         self._wizard = wizard
         fields = {

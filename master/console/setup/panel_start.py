@@ -1,16 +1,10 @@
-"""Panels of steps 3 and 6 start the cameras and the master.
-
-Panel of step 3: the cameras run and are seen on the bus.
-
-They run here or on their Pis.
-
-Panel of step 6: the master tracks, and reports whether all is well.
-"""
+"""Panels of steps 3 and 6 start the cameras and the master."""
 
 import numpy as np
 from nicegui import ui
 
 from common.messages import HandPose
+from master.console.controls import every
 from master.console.setup.commands import VIEWS
 from master.console.setup.parts import Desk, command_line, heading, previews
 
@@ -46,15 +40,11 @@ def panel_start(desk: Desk) -> None:
         session.stop_cameras()
         session.stop_master()
 
-    async def start() -> None:
-        await desk.attempt(go)
-
-    async def stop() -> None:
-        await desk.attempt(end)
-
     with ui.row():
-        ui.button("Start cameras" if here else "Look for cameras", on_click=start).props('icon="play_arrow"')
-        ui.button("Stop", on_click=stop).props('flat icon="stop"')
+        ui.button("Start cameras" if here else "Look for cameras", on_click=lambda: desk.attempt(go)).props(
+            'icon="play_arrow"'
+        )
+        ui.button("Stop", on_click=lambda: desk.attempt(end)).props('flat icon="stop"')
         ui.button("Next: lenses and places", on_click=lambda: desk.go("lens")).props("flat")
     who = ui.label().props('role="status"')
     wrong = ui.label().classes("setup-error").props('role="alert"')
@@ -67,9 +57,7 @@ def panel_start(desk: Desk) -> None:
         who.set_text(f"waiting for {', '.join(absent)}" if absent else f"all {len(names)} cameras are there")
         wrong.set_text("\n".join(session.failures()))
 
-    look()
-    poll_s = 0.5
-    ui.timer(poll_s, look)
+    every(0.5, look)
 
 
 def panel_track(desk: Desk) -> None:
@@ -83,18 +71,9 @@ def panel_track(desk: Desk) -> None:
         session.show("standard" if session.view in ("still", "board") else session.view)
         return True
 
-    def end() -> None:
-        session.stop_master()
-
-    async def start() -> None:
-        await desk.attempt(go)
-
-    async def stop() -> None:
-        await desk.attempt(end)
-
     with ui.row():
-        ui.button("Start tracking", on_click=start).props('icon="play_arrow"')
-        ui.button("Stop", on_click=stop).props('flat icon="stop"')
+        ui.button("Start tracking", on_click=lambda: desk.attempt(go)).props('icon="play_arrow"')
+        ui.button("Stop", on_click=lambda: desk.attempt(session.stop_master)).props('flat icon="stop"')
         ui.button("See the hand", on_click=lambda: ui.navigate.to("/live")).props('flat icon="visibility"')
     status = ui.label().classes("text-h6").props('role="status" data-testid="tracking"')
     hands = ui.label().classes("setup-text")
@@ -119,9 +98,7 @@ def panel_track(desk: Desk) -> None:
                 for line in lines:
                     ui.label(line).classes("setup-text")
 
-    look()
-    poll_s = 0.5
-    ui.timer(poll_s, look)
+    every(0.5, look)
 
 
 def _state(desk: Desk, posing: bool) -> str:

@@ -1,11 +1,4 @@
-"""Panels share these parts and the view of a running calibration.
-
-Parts that all panels of the set-up page use.
-
-They are actions off the event loop, errors, commands to copy and live pictures.
-
-View of a running calibration: progress, output, what to press, result.
-"""
+"""Panels share these parts and the view of a running calibration."""
 
 import base64
 from collections.abc import Callable
@@ -16,6 +9,7 @@ from typing import TypeVar
 from nicegui import run, ui
 
 from common.errors import PhalanxError
+from master.console.controls import every
 from master.console.setup.job import Job, JobState
 from master.console.setup.session import Session
 
@@ -27,12 +21,7 @@ _EMPTY = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw==
 class Desk:
     """One window of the set-up page.
 
-    It holds the session and where a panel reports what went wrong.
-
-    Attributes:
-        session: Of the console.
-        go: Shows the panel of a step.
-        complain: Shows an error until the next action; empty: none.
+    `go` shows the panel of a step; `complain` shows an error until the next action, or none if empty.
     """
 
     session: Session
@@ -40,10 +29,7 @@ class Desk:
     complain: Callable[[str], None]
 
     async def attempt(self, action: Callable[[], T]) -> T | None:
-        """Run a slow action off the event loop.
-
-        An error is shown, and None is returned.
-        """
+        """Run a slow action off the event loop; an error is shown, and None is returned."""
         self.complain("")
         try:
             return await run.io_bound(action)
@@ -92,8 +78,7 @@ def previews(desk: Desk) -> None:
             there = name in state.alive
             text.set_text(f"{name}: {'live' if picture else 'there' if there else 'waiting for it'}")
 
-    picture_s = 0.2
-    ui.timer(picture_s, update)
+    ui.timer(0.2, update)
 
 
 def _preview(name: str) -> tuple[ui.image, ui.label]:
@@ -147,14 +132,10 @@ def job_view(
     words: Callable[[Job], str] = lambda _job: "",
     early: bool = False,
 ) -> None:
-    """Build the view; it follows whatever `job` returns.
+    """Build the view of progress, output, buttons and result of what `job` returns.
 
-    Args:
-        desk: Of the window.
-        job: The job to show; None: none yet.
-        used: Called once its result was taken over.
-        words: What its result means, for a person.
-        early: Whether what runs can be ended early and still be used.
+    `used` is called once its result was taken over; `words` states what it means, for a person; `early`: what
+    runs can be ended early and still be used.
     """
     shown: tuple[int, JobState] | None = None
     with ui.column().classes("w-full") as box:
@@ -189,9 +170,7 @@ def job_view(
                 if not running:
                     _result(desk, now, used, words)
 
-    follow()
-    poll_s = 0.4
-    ui.timer(poll_s, follow)
+    every(0.4, follow)
 
 
 def _buttons(desk: Desk, row: ui.row, job: Job, *, early: bool) -> None:
@@ -199,22 +178,13 @@ def _buttons(desk: Desk, row: ui.row, job: Job, *, early: bool) -> None:
     if job.state is not JobState.RUNNING:
         return
 
-    async def cancel() -> None:
-        await desk.attempt(job.cancel)
-
-    async def finish() -> None:
-        await desk.attempt(job.finish)
-
-    async def following() -> None:
-        await desk.attempt(job.send)
-
     with row:
         if early:
-            ui.button("That is enough", on_click=finish).props('flat icon="done"')
-        ui.button("Next", on_click=following).props('icon="keyboard_return"').bind_visibility_from(
-            job, "keyboard"
-        )
-        ui.button("Cancel", on_click=cancel).props('flat icon="close"')
+            ui.button("That is enough", on_click=lambda: desk.attempt(job.finish)).props('flat icon="done"')
+        ui.button("Next", on_click=lambda: desk.attempt(job.send)).props(
+            'icon="keyboard_return"'
+        ).bind_visibility_from(job, "keyboard")
+        ui.button("Cancel", on_click=lambda: desk.attempt(job.cancel)).props('flat icon="close"')
 
 
 def _result(desk: Desk, job: Job, used: Callable[[], None], words: Callable[[Job], str]) -> None:

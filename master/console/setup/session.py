@@ -1,14 +1,8 @@
 """Session holds the plan, processes and finished steps of a set-up.
 
-Progress of a set-up, derived from its files alone.
-
-It states which steps are done, which are to do, and which are stale and why.
-
-State of the set-up page: plan, cameras, master and calibrations.
-
-Cameras and master are those that the page started; the calibrations are those that run.
-
-One of it for all windows of a console. Its methods wait for processes, so pages call them off the event loop.
+What is done, to do or stale is derived from the files alone (`steps_of`). One session for all windows of a
+console, with the cameras, master and calibrations that the page started. Its methods wait for processes: call
+them off the event loop.
 """
 
 import logging
@@ -40,14 +34,7 @@ class Done(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of the set-up.
-
-    Attributes:
-        key: Its name in code and in the page.
-        title: For a person.
-        state: Whether it is done.
-        why: What the state is derived from, or what is to be done.
-    """
+    """One step of the set-up: key, title, state, and where the state comes from."""
 
     key: str
     title: str
@@ -56,10 +43,7 @@ class Step:
 
 
 def steps_of(tree: Path, plan: Plan, *, keyed: bool = False) -> tuple[Step, ...]:
-    """Return the steps whose results are files, in order.
-
-    `keyed`: the console was given a key, so the tree needs none.
-    """
+    """Return the steps whose results are files; `keyed`: the tree needs no key."""
     cameras, broken = _cameras(tree, plan)
     rig, rig_error = _rig(tree, plan)
     return (
@@ -68,11 +52,6 @@ def steps_of(tree: Path, plan: Plan, *, keyed: bool = False) -> tuple[Step, ...]
         Step("lens", "Lenses and places", *_measured(plan, cameras, rig)),
         Step("colours", "Colours of the markers", *_coloured(plan, cameras, rig)),
     )
-
-
-def usable(tree: Path, plan: Plan) -> bool:
-    """Return whether the files are sufficient to track a hand."""
-    return all(step.state is not Done.TO_DO for step in steps_of(tree, plan))
 
 
 def _cameras(tree: Path, plan: Plan) -> tuple[dict[str, CameraCalibration], str]:
@@ -165,10 +144,7 @@ LENS = "lens"  # the job of the main line: capture, then stereo
 
 
 class Session:
-    """Set-up session: plan, last opened step, simulated view and running jobs.
-
-    The step is the one opened last, the view is that of the simulated cameras, and jobs are keyed by their command.
-    """
+    """Set-up session: plan, last step, view of simulated cameras, jobs by command."""
 
     def __init__(self, state: ConsoleState) -> None:
         """Go on where the files of the console's tree are.
@@ -202,10 +178,7 @@ class Session:
 
     @property
     def master(self) -> LocalProcess | None:
-        """Return the running master of this console.
-
-        It is one that tracks, one that only meets the cameras, or a calibration.
-        """
+        """This console's running master: it tracks, only meets cameras, or calibrates."""
         return self.state.local.running().get(MASTER)
 
     @property
@@ -262,9 +235,7 @@ class Session:
             self.plan = plan
 
     def start_cameras(self, view: str) -> None:
-        """Start or restart all cameras of this machine.
-
-        Simulated ones look at `view`.
+        """Start or restart all cameras of this machine; simulated ones look at `view`.
 
         Raises:
             PhalanxError: There is no rig or no key yet, or a process cannot be started.
@@ -281,9 +252,7 @@ class Session:
 
     def show(self, view: str) -> None:
         """Let simulated cameras look at `view`; others, and those that do already, go on."""
-        if (
-            self.plan.simulated and (view != self.view or not self.cameras_running)
-        ) or not self.cameras_running:
+        if not self.cameras_running or (self.plan.simulated and view != self.view):
             self.start_cameras(view)
 
     def stop_cameras(self) -> None:
@@ -296,9 +265,7 @@ class Session:
                 thread.join()
 
     def start_master(self) -> None:
-        """Start the master.
-
-        It tracks if lenses and places are known; otherwise it only meets the cameras.
+        """Start the master; while lenses or places are unknown it only meets cameras.
 
         Raises:
             PhalanxError: There is no rig or no key yet; another master runs; a process cannot be started.
@@ -316,10 +283,9 @@ class Session:
         self.state.local.stop(MASTER)
 
     def start_lens(self, values: Mapping[str, Value]) -> Job:
-        """Pictures of the board from all cameras, then the fit of lenses and places.
+        """Take pictures of the board with all cameras, then fit lenses and places.
 
-        Args:
-            values: Fields of `calibrate cameras capture`.
+        `values`: fields of `calibrate cameras capture`.
 
         Raises:
             PhalanxError: A field is none; another calibration runs.
@@ -345,10 +311,7 @@ class Session:
     def start(self, wizard: Wizard, values: Mapping[str, Value], *, record: bool = False) -> Job:
         """Begin a calibration with the form's values.
 
-        Args:
-            wizard: Which.
-            values: By field.
-            record: First make the recording that it is of, with the cameras of this machine.
+        `record`: first make the recording that it is of, with the cameras of this machine.
 
         Raises:
             PhalanxError: A field is none; another calibration runs; what it needs is not there.
@@ -367,17 +330,15 @@ class Session:
             line = self.commands.calibrate(wizard.command, values, work, live=live)
             if wizard.master == "run" and live and self.master is None and not self.foreign_master:
                 self.start_master()
-            if wizard.master != "none" and not record and self.plan.simulated and self.tree:
-                self.show(wizard.scene)
             keyed = wizard.master != "none"
+            if keyed and not record and self.plan.simulated:
+                self.show(wizard.scene)
             name = MASTER if wizard.master == "capture" and (live or not wizard.live) else "calibrate"
             stages.append(lambda: Stage(wizard.title, {name: line}, wizard.keyboard and live))
             return self._begin(wizard.command, wizard.title, stages, work, keyed=keyed)
 
     def use(self, job: Job) -> tuple[Path, ...]:
-        """Write a job's results into the tree.
-
-        A master that only meets the cameras then gives way to one that tracks.
+        """Write a job's results into the tree; a master that met cameras then tracks.
 
         Raises:
             PhalanxError: As of `Job.use` and `start_master`.
@@ -414,10 +375,7 @@ class Session:
         return job
 
     def _after(self) -> None:
-        """Restore cameras and master after a job has ended.
-
-        Cameras that the job borrowed come back, and somebody must carry the bus again.
-        """
+        """Restore the cameras and the master that a job borrowed: somebody must carry the bus again."""
         try:
             with self._lock:
                 cameras, master = self._bring_back
@@ -429,7 +387,7 @@ class Session:
             _LOG.warning("after a calibration: %s", error)
 
     def _stop_own(self) -> None:
-        """Cameras and master of the plan before end: they would go on with other files."""
+        """End cameras and master: they would go on with files of the plan before."""
         self.stop_cameras()
         self.stop_master()
 
@@ -470,10 +428,7 @@ def wizard_named(command: str) -> Wizard:
 
 
 def _plan(state: ConsoleState) -> Plan:
-    """Return the saved plan of the page, or one derived from the rig's file.
-
-    The saved plan counts if it is of a rig that the console was started to show.
-    """
+    """Return the page's saved plan if the console shows its rig, else that of the rig's file."""
     tree, rigs = state.settings.calibration, state.settings.rigs
     plan = load_plan(tree)
     if plan.cameras and (not rigs or plan.rig in rigs):

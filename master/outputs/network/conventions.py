@@ -1,21 +1,10 @@
 """Other programs name sides and clocks by these conventions.
 
-Left or right side of a hand, as other programs name it.
-
-A pose determines it by its shape, so no hand file is needed.
-
-Conversion of times to the clocks that other programs use.
-
-The master's time on this machine's clock, and on the wall's.
-
-Messages of a master are stamped with its monotonic clock. Beside it, on one machine, that is our own; on another
-machine it is offset, which the echoes of its reports give (`common.link.clock_offset`). A recording that is
-played has the
-times of its making, which other programs would take for long ago, or for a time to come and wait for it: its messages
-are stamped as they are played, and keep their distances where it is played as fast as it was made.
-
-OSC and ROS 2 want the wall clock, which may be set at any time; it is asked here (for the moment of sending also in
-`ros2_link`), and never for a duration.
+Messages of a master are stamped with its monotonic clock: on one machine our own, else offset as the echoes
+of its reports give (`common.link.clock_offset`). A recording that is played has the times of its making,
+which other programs would take for long ago: its messages are stamped as they are played. OSC and ROS 2 want
+the wall clock, which may be set at any time; it is asked here (for the moment of sending also in `ros2`), and
+never for a duration.
 """
 
 import time
@@ -55,21 +44,12 @@ class Times(Protocol):
         ...
 
     def wall_ns(self, t_ns: int) -> int:
-        """Return nanoseconds since 1970 at the master's time `t_ns`.
-
-        UTC, by this machine's clock.
-        """
+        """Nanoseconds since 1970 (UTC, this machine's clock) at the master's time."""
         ...
 
 
 class MasterTimes:
-    """Estimates of the master's clock and the wall clock against ours.
-
-    Holds how the master's clock runs against ours, as its echoes measure, how the wall clock does, and by how much
-    the times of a recording that is played are shifted.
-
-    Echoes come from one thread, times are asked for on any.
-    """
+    """Master's and wall clock against ours; pushed by one thread, read by any."""
 
     def __init__(
         self, monotonic_ns: Callable[[], int] = now_ns, wall_clock_ns: Callable[[], int] = time.time_ns
@@ -81,18 +61,12 @@ class MasterTimes:
         self._played_ns = 0
 
     def push(self, asked_ns: int, master_ns: int, answered_ns: int) -> None:
-        """Take an echo of the master's clock.
-
-        Our clock when the master was asked and when its answer came, its clock in between [ns].
-        """
+        """Take an echo: our clock at question and answer, the master's between [ns]."""
         self._echoes.push(asked_ns, master_ns, master_ns, answered_ns)
 
     @property
     def offset_ns(self) -> int:
-        """Return the master's clock minus ours [ns].
-
-        0 where no echo contradicts that both are one machine.
-        """
+        """The master's clock minus ours [ns]; 0 where both may be one machine."""
         estimate = self._echoes.estimate()
         if estimate is None or abs(estimate.offset_ns) <= estimate.bound_ns:
             return 0

@@ -1,25 +1,14 @@
 """The Lab Streaming Layer carries hands as streams of this machine.
 
-Confinement of a library's sockets to this machine.
+One outlet a hand, opened with its first pose; a sample a pose, at the time at which the pose holds. LSL's
+clock is this machine's, so a recording aligns hands with EEG, EMG, eye trackers or whatever other machines
+measure. liblsl, a C++ library that pylsl's wheels bring for the usual machines only, is imported when the
+output is switched on. Names and meanings were read in pylsl 1.18 (info.py, outlet.py, util.py,
+lib/__init__.py).
 
-The library listens on every network, and has no setting to do otherwise.
-
-Linux gives a socket that is bound to a device only what comes through that device. The loopback device carries all that
-a machine sends to itself, under each of its addresses, and nothing else.
-
-Parts of pylsl that Phalanx uses.
-
-Its interface as types, and the one place that imports it.
-
-It needs liblsl, a C++ library that its wheels bring for the usual machines only, so it is imported when the output is
-switched on. Names and meanings were read in pylsl 1.18 (info.py, outlet.py, util.py, lib/__init__.py).
-
-Hands as streams of the Lab Streaming Layer.
-
-To be recorded beside EEG, EMG, eye trackers and markers.
-
-One outlet a hand, opened with its first pose; a sample a pose, at the time at which the pose holds. The clock of LSL
-is this machine's, so a recording aligns hands with whatever other machines measure.
+It listens on every network, and has no setting to do otherwise: its sockets are bound to the loopback device.
+Linux gives such a socket only what comes through that device, which carries all that a machine sends to
+itself, under each of its addresses, and nothing else.
 """
 
 import importlib
@@ -49,10 +38,9 @@ Socket = tuple[int, str]
 
 
 def sockets() -> frozenset[Socket]:
-    """Return the descriptors of all sockets of this process.
+    """Return descriptor and kernel name of all sockets of this process.
 
-    Each with its own name in the kernel, as another one may have the number later; none where the system does not
-    report them.
+    The name, because another socket may have the number later; none where the system does not report them.
     """
     found: set[Socket] = set()
     if _FOLDER.is_dir():
@@ -64,13 +52,7 @@ def sockets() -> frozenset[Socket]:
 
 
 def keep_here(before: Collection[Socket], ports: range) -> bool:
-    """Bind new sockets that listen everywhere to the loopback device.
-
-    Those at one of the ports that were not there before.
-
-    Args:
-        before: `sockets` before the library opened its own.
-        ports: Where it may listen.
+    """Bind the sockets opened since `before` that listen everywhere at `ports` to lo.
 
     Returns:
         Whether each is bound; False: there is one that is not, or the system cannot determine it, or do it.
@@ -119,44 +101,28 @@ ListenAddress = 127.0.0.1
 """
 
 
-class XmlElement(Protocol):
-    """`pylsl.XMLElement`: the description of a stream."""
-
-    def append_child(self, name: str) -> "XmlElement":
-        """A new element below this one."""
-        ...
-
-    def append_child_value(self, name: str, value: str) -> "XmlElement":
-        """A new element with a text below this one; returns this one."""
-        ...
+class _XmlElement(Protocol):
+    def append_child(self, name: str) -> "_XmlElement": ...
+    def append_child_value(self, name: str, value: str) -> "_XmlElement": ...  # this one, not the child
 
 
-class Info(Protocol):
-    """`pylsl.StreamInfo`: what a stream is."""
-
-    def desc(self) -> XmlElement:
-        """Its description."""
-        ...
+class _Info(Protocol):
+    def desc(self) -> _XmlElement: ...
 
 
-class Outlet(Protocol):
-    """`pylsl.StreamOutlet`: a stream that this process offers.
+class _Outlet(Protocol):
+    """A stream that this process offers until nothing holds it any more."""
 
-    It is offered until nothing holds it any more.
-    """
-
-    def push_sample(self, x: Sequence[float], timestamp: float) -> None:
-        """Offer one sample of all channels; `timestamp` [s] on `local_clock`."""
-        ...
+    def push_sample(self, x: Sequence[float], timestamp: float) -> None: ...  # [s] on `local_clock`
 
 
-class Library(Protocol):
+class _Library(Protocol):
     """The module `pylsl`."""
 
     IRREGULAR_RATE: float
     cf_float32: int
 
-    def StreamInfo(  # noqa: D102
+    def StreamInfo(
         self,
         name: str,
         type: str,  # noqa: A002
@@ -164,39 +130,26 @@ class Library(Protocol):
         nominal_srate: float,
         channel_format: int,
         source_id: str,
-    ) -> Info: ...
+    ) -> _Info: ...
 
-    def StreamOutlet(self, info: Info, chunk_size: int, max_buffered: int) -> Outlet:
-        """Offer a stream.
-
-        For a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`.
-        """
-        ...
-
-    def local_clock(self) -> float:
-        """LSL's clock on this machine [s]."""
-        ...
-
-    def set_config_content(self, content: str) -> None:
-        """Configure liblsl, once, before anything else.
-
-        Raises `NotImplementedError` before liblsl 1.17.7.
-        """
-        ...
+    # For a slow inlet it keeps `max_buffered` * 100 samples. Raises `RuntimeError`.
+    def StreamOutlet(self, info: _Info, chunk_size: int, max_buffered: int) -> _Outlet: ...
+    def local_clock(self) -> float: ...  # [s]
+    # Once, before anything else. Raises `NotImplementedError` before liblsl 1.17.7.
+    def set_config_content(self, content: str) -> None: ...
 
 
-def load_library(scope: str, bound_scope: str | None) -> Library:
-    """Import the module and set who can find its streams.
+def load_library(scope: str, bound_scope: str | None) -> _Library:
+    """Import the module and set who can find its streams, "machine" or "network".
 
-    Args:
-        scope: "machine" or "network".
-        told: What liblsl was configured with before in this process, which is for ever; None: nothing yet.
+    `bound_scope`: what liblsl was configured with before in this process, which is for ever; None: nothing
+    yet.
 
     Raises:
         PhalanxError: It is not installed, has no liblsl, or one that is too old or was configured otherwise.
     """
     try:
-        library = cast(Library, importlib.import_module("pylsl"))
+        library = cast(_Library, importlib.import_module("pylsl"))
     except ImportError as error:
         raise PhalanxError(f"pylsl is not installed: {INSTALL}") from error
     except (OSError, RuntimeError) as error:  # liblsl is loaded at once
@@ -225,10 +178,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def channels() -> tuple[tuple[str, str, str], ...]:
-    """Return label, type and unit of every channel.
-
-    20 angles, 26 times x y z, whether each joint is observed.
-    """
+    """Label, type, unit of 124 channels: 20 angles, 26 times x y z, 26 times tracked."""
     angles = [
         (f"{finger}.{angle}", "Angle", "radians")
         for finger in FINGERS
@@ -246,31 +196,20 @@ def sample_of(pose: HandPose) -> Float:
 
 
 class LslSink:
-    """A `Sink` that offers every hand as a stream; other messages are nothing to it.
-
-    Holds the library, the outlets, and how LSL's clock runs against ours.
-    """
+    """A `Sink` that offers every hand as a stream; it ignores other messages."""
 
     _bound_scope: ClassVar[str | None] = None  # the library is one for the process, and listens once
 
     def __init__(self, settings: LslOutput, times: Times) -> None:
-        """Load the library.
-
-        Raises:
-            PhalanxError: It, or liblsl, is missing.
-        """
-        self._library: Library = load_library(settings.scope, LslSink._bound_scope)
+        """Load the library; PhalanxError: it, or liblsl, is missing."""
+        self._library: _Library = load_library(settings.scope, LslSink._bound_scope)
         LslSink._bound_scope = settings.scope
         self._name, self._scope, self._times = settings.name, settings.scope, times
-        self._outlets: dict[str, Outlet] = {}
+        self._outlets: dict[str, _Outlet] = {}
         self._clock = self._compared()
 
     def write(self, message: ResultMessage) -> None:
-        """Offer one pose.
-
-        Raises:
-            PhalanxError: No stream could be opened.
-        """
+        """Offer one pose; PhalanxError: no stream could be opened."""
         if not isinstance(message, HandPose):
             return
         outlet = self._outlets.get(message.hand)
@@ -286,7 +225,7 @@ class LslSink:
         """Take the streams back: an outlet ends with the last that holds it."""
         self._outlets.clear()
 
-    def _opened(self, hand: str) -> Outlet:
+    def _opened(self, hand: str) -> _Outlet:
         rows = channels()
         # The same hand of the same machine is the same source: an inlet takes it up again after a restart.
         source = f"phalanx-{socket.gethostname()}-{hand}"

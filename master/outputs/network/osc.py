@@ -1,23 +1,13 @@
 """Open Sound Control carries hands, objects, contact and gestures over UDP.
 
-OSC bundles whose numbers are filled in.
-
-python-osc writes a message once, after that only its numbers change.
-
-Encoding some 300 arguments anew for every pose would cost a millisecond; filling them in costs some microseconds.
-(Open Sound Control 1.0: everything is big-endian and a multiple of four bytes, arguments come last, in their order;
-a bundle is `#bundle`, a time tag, and its elements, each behind its size.)
-
-UDP socket towards one receiver, who may be absent.
-
-Whoever listens receives.
-
-Hands, objects, contact and gestures as Open Sound Control.
-
-For sound and light, patches and sketches.
-
 Each message of the master is one bundle whose time tag is the epoch it describes, in one datagram (addresses:
-docs/outputs.md). What is not known has no message in its bundle. All is in the rig's frame, in metres and radians.
+docs/outputs.md). What is not known has no message in its bundle. All is in the rig's frame, in metres and
+radians.
+
+python-osc encodes a message once, after that only its numbers are filled in: some microseconds, where some
+300 arguments anew for every pose would cost a millisecond. (Open Sound Control 1.0: everything is big-endian
+and a multiple of four bytes, arguments come last, in their order; a bundle is `#bundle`, a time tag, and its
+elements, each behind its size.)
 """
 
 import socket
@@ -43,23 +33,14 @@ _HEADER = 4  # words: "#bundle" and the time tag
 
 @dataclass(frozen=True, slots=True)
 class Blank:
-    """One message whose numbers are to be filled in.
-
-    Attributes:
-        address: Where it goes.
-        texts: Arguments that never change, before the numbers.
-        numbers: Types of the numbers: f, i.
-    """
+    """One message whose numbers are to be filled in."""
 
     address: str
-    texts: tuple[str, ...]
-    numbers: str
+    texts: tuple[str, ...]  # arguments that never change, before the numbers
+    numbers: str  # types of the numbers: f, i
 
     def element(self) -> bytes:
-        """Return the message as an element of a bundle.
-
-        Its size, then itself, with zeros for numbers.
-        """
+        """Return the message as an element of a bundle, with zeros for numbers."""
         builder = OscMessageBuilder(self.address)
         for text in self.texts:
             builder.add_arg(text, OscMessageBuilder.ARG_TYPE_STRING)
@@ -70,10 +51,7 @@ class Blank:
 
 
 class BlankBundle:
-    """A bundle of messages of which only time and numbers change.
-
-    Holds it as words of 32 bits, with zeros.
-    """
+    """A bundle of messages of which only time and numbers change."""
 
     def __init__(self, blanks: Sequence[Blank]) -> None:
         elements = [np.frombuffer(blank.element(), _BIG) for blank in blanks]
@@ -87,12 +65,9 @@ class BlankBundle:
         self._slots: Int = np.concatenate(slots)
 
     def filled(self, wall_ns: int, numbers: Words, present: Bool | None = None) -> bytes:
-        """The bundle as bytes.
+        """The bundle as bytes, time tag `wall_ns` since 1970.
 
-        Args:
-            wall_ns: Nanoseconds since 1970 for the time tag.
-            numbers: All numbers in order, as bits: `floats` and `ints`.
-            present: Which messages are in it; None: all.
+        `numbers`: all in order, as bits: `floats` and `ints`. `present`: which messages are in it; None: all.
         """
         words = self._words.copy()
         seconds, rest = divmod(wall_ns, 1_000_000_000)
@@ -116,16 +91,10 @@ def ints(values: npt.ArrayLike) -> Words:
 
 
 class UdpSender:
-    """Holds the socket and the address, looked up once. Safe to close twice."""
+    """UDP socket towards one receiver, who may be absent; the host is looked up once."""
 
     def __init__(self, host: str, port: int, key: str) -> None:
-        """Open the socket.
-
-        `key` is where the settings state the address, for errors.
-
-        Raises:
-            PhalanxError: The host is unknown.
-        """
+        """Open the socket; `key` names its settings; PhalanxError: unknown host."""
         self._fix = f"{key}.host, {key}.port of the output settings"
         try:
             family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -143,11 +112,7 @@ class UdpSender:
             ) from error
 
     def send(self, packet: bytes) -> None:
-        """Send one datagram.
-
-        Raises:
-            PhalanxError: This machine cannot: no route, no permission.
-        """
+        """Send one datagram; PhalanxError: this machine cannot: no route, no permission."""
         try:
             try:
                 self._socket.send(packet)
@@ -170,28 +135,17 @@ _XYZW = [1, 2, 3, 0]
 
 
 class OscSink:
-    """A `Sink` that sends each message as one OSC bundle.
-
-    Holds the socket, the blanks, and a count of poses.
-    """
+    """A `Sink` that sends each message as one OSC bundle."""
 
     def __init__(self, settings: OscOutput, times: Times) -> None:
-        """Open the socket.
-
-        Raises:
-            PhalanxError: The host is unknown.
-        """
+        """Open the socket; PhalanxError: the host is unknown."""
         self._times = times
         self._blanks: dict[Hashable, BlankBundle] = {}
         self._count = 0
         self._udp = UdpSender(settings.host, settings.port, "osc")
 
     def write(self, message: ResultMessage) -> None:
-        """Send one message.
-
-        Raises:
-            PhalanxError: This machine cannot send there.
-        """
+        """Send one message; PhalanxError: this machine cannot send there."""
         wall_ns = self._times.wall_ns(message.t_ns)
         if isinstance(message, HandPose):
             packet = self._hand(message, wall_ns)
@@ -231,11 +185,7 @@ class OscSink:
 
     def _object(self, pose: ObjectPose, wall_ns: int) -> bytes | None:
         numbers = np.concatenate(
-            [
-                floats(pose.position_m),
-                floats(pose.orientation_wxyz[_XYZW]),
-                ints([pose.tracked]),
-            ]
+            [floats(pose.position_m), floats(pose.orientation_wxyz[_XYZW]), ints([pose.tracked])]
         )
         if np.isnan(pose.position_m).any():
             return None
@@ -280,10 +230,7 @@ class OscSink:
 
 
 def hand_blanks(hand: str, side: Side) -> list[Blank]:
-    """Return the messages of a hand.
-
-    Its number and latency, every joint, the angles of every finger.
-    """
+    """Return a hand's messages: number and latency, joints, angles of each finger."""
     top = f"/phalanx/hand/{side}"
     return [
         Blank(f"{top}/frame", (hand,), "if"),

@@ -1,17 +1,9 @@
 """Live outputs have names, and each runs on a thread of its own.
 
-Live outputs by name.
-
-What each takes, where it sends to, and how it is made.
-
-An output is a `Sink`. Its file is imported when it is switched on: what its library is, nobody else needs.
-
-One live output as it runs.
-
-Its queue and its thread, so that it can be slow, fail or hang by itself.
-
-States: *closed* (not made yet, or it failed; it is made again after a while, for ever) and *open*. What comes while it
-is closed, or while its queue is full, is lost to this output alone, and counted.
+An output is a `Sink`, imported when it is switched on: what its library is, nobody else needs. It can be
+slow, fail or hang by itself. States: *closed* (not made yet, or it failed; it is made again after a while,
+for ever) and *open*. What comes while it is closed, or while its queue is full, is lost to this output alone,
+and counted.
 """
 
 import os
@@ -32,18 +24,12 @@ from master.outputs.web.listening import is_loopback, is_open
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One row of the registry.
+    """One row of the registry."""
 
-    Attributes:
-        takes: Types of messages that it is for; others never come to it.
-        part: Its settings; where they differ, it is made anew.
-        where: Where it sends to, for a person.
-        make: Opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is reported, and it is retried.
-    """
-
-    takes: tuple[type[ResultMessage], ...]
-    part: Callable[[OutputSettings], OutputPart]
-    where: Callable[[OutputSettings], str]
+    takes: tuple[type[ResultMessage], ...]  # types of messages that it is for; others never come to it
+    part: Callable[[OutputSettings], OutputPart]  # its settings; where they differ, it is made anew
+    where: Callable[[OutputSettings], str]  # where it sends to, for a person
+    # opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is reported, and it is retried
     make: Callable[[OutputSettings, Times], Sink]
 
 
@@ -99,11 +85,9 @@ OUTPUTS: dict[str, Output] = {
 
 
 def who_reads(name: str, settings: OutputSettings) -> str | None:
-    """State who else can read an output that leaves this machine.
+    """State who else can read an output that leaves this machine; None: it does not.
 
-    Also what they can do; None where the output does not leave it.
-
-    These protocols have no encryption and no login: that they leave the machine is the choice of who wrote the file.
+    These protocols have no encryption and no login: who wrote the file chose that they leave the machine.
     """
     match name:
         case "osc" | "vmc":
@@ -134,27 +118,17 @@ FIRST_RETRY_S = 1.0
 
 
 class Counters:
-    """Counts of one output since the process began.
-
-    They outlive the output's being switched off.
-
-    Attributes:
-        sent: Messages that it took.
-        failed: Times it could not be opened, or broke on a message.
-        dropped: Messages that it was too slow for, or that came while it was not open.
-        trouble: Why it is not open; empty while nothing is wrong.
-    """
+    """Counts of one output since the process began, also while it is switched off."""
 
     def __init__(self) -> None:
-        self.sent = self.failed = self.dropped = 0
-        self.trouble = ""
+        self.sent = 0  # messages that it took
+        self.failed = 0  # times it could not be opened, or broke on a message
+        self.dropped = 0  # messages that it was too slow for, or that came while it was not open
+        self.trouble = ""  # why it is not open; empty while nothing is wrong
 
 
 class OutputLine:
-    """Feeds one `Sink` on a thread of its own from a queue that drops its oldest.
-
-    Holds the queue, and the sink while it is open.
-    """
+    """Feeds one `Sink` on a thread of its own from a queue that drops its oldest."""
 
     def __init__(
         self,
@@ -164,10 +138,7 @@ class OutputLine:
         notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
-        """Start at once.
-
-        `make` opens the sink and is called on the line's own thread, again after each failure.
-        """
+        """Start at once; `make` opens the sink on the line's thread, again on failure."""
         self._name, self._make, self._counters, self._notify = name, make, counters, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._queue: deque[ResultMessage] = deque()
@@ -189,10 +160,7 @@ class OutputLine:
         return len(self._queue)
 
     def offer(self, message: ResultMessage) -> None:
-        """Queue one message without waiting.
-
-        The oldest makes room, or the message is lost while the output is closed.
-        """
+        """Queue one message without waiting; the oldest makes room, or it is lost."""
         with self._changed:
             if self._sink is None:
                 self._counters.dropped += 1
@@ -273,10 +241,7 @@ class OutputLine:
             self._notify(f"{self._name}: closing: {error}")
 
     def _failed(self, error: Exception) -> None:
-        """Count a failure, and report it once.
-
-        The same trouble again is not reported.
-        """
+        """Count a failure, and report it once."""
         self._counters.failed += 1
         text = str(error)
         if text != self._counters.trouble:

@@ -1,29 +1,13 @@
 """ROS 2 receives hands and objects as standard messages over zenoh.
 
-Names that ROS 2 uses on zenoh.
+No ROS is installed: this joins the router of ROS 2's middleware rmw_zenoh by a zenoh session of its own (not
+the bus's). rmw_zenoh finds publishers by liveliness tokens that describe all about them, and reads each topic
+at a key of domain, topic, type and the hash of the type's description. Written from its public description
+(github.com/ros2/rmw_zenoh, docs/design.md and the token layout in liveliness_utils, Jazzy to Kilted). Types,
+CDR and hashes are rosbags'.
 
-Keys of topics, liveliness tokens of nodes and publishers, gids, attachments.
-
-ROS 2's middleware rmw_zenoh finds publishers by tokens that describe all about them, and reads each topic at a key
-that holds domain, topic, type and the hash of the type's description. Written from its public description
-(github.com/ros2/rmw_zenoh, docs/design.md and the token layout in liveliness_utils, Jazzy to Kilted).
-
-Publishers of ROS 2 on a zenoh session of their own.
-
-The session joins the router of rmw_zenoh; no ROS is installed.
-
-The other file that knows zenoh: this session belongs to ROS's network, not to the bus.
-
-Hands and objects as ROS 2's standard messages, in CDR.
-
-Types, serialization and hashes of types are rosbags'.
-
-Everything stands in the frame `FRAME`: the rig frame, x right, y down, z away from the reference camera, which ROS
-calls an optical frame (REP 103). Metres, radians, quaternions xyzw; stamps are the wall clock's.
-
-ROS 2 as a live output.
-
-Hands and objects on standard topics, by rmw_zenoh's own network, without ROS.
+Everything stands in the frame `FRAME`: the rig frame, x right, y down, z away from the reference camera,
+which ROS calls an optical frame (REP 103). Metres, radians, quaternions xyzw; stamps are the wall clock's.
 """
 
 import json
@@ -55,17 +39,11 @@ QOS = "::,10:,:,:,,"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic that is published.
+    """One topic that is published."""
 
-    Attributes:
-        name: As ROS writes it, from the root: "/phalanx/right/joints".
-        type_name: "geometry_msgs/msg/PoseArray".
-        type_hash: RIHS01_ and 64 hexadecimal digits (REP 2016).
-    """
-
-    name: str
-    type_name: str
-    type_hash: str
+    name: str  # from the root: "/phalanx/right/joints"
+    type_name: str  # "geometry_msgs/msg/PoseArray"
+    type_hash: str  # RIHS01_ and 64 hexadecimal digits (REP 2016)
 
     @property
     def dds_type(self) -> str:
@@ -80,18 +58,11 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """The node that publishes.
+    """The node that publishes."""
 
-    Attributes:
-        domain: ROS_DOMAIN_ID.
-        zid: Id of the zenoh session, as zenoh writes it.
-        namespace: "/" or "/some/name".
-        name: Of the node.
-    """
-
-    domain: int
-    zid: str
-    namespace: str
+    domain: int  # ROS_DOMAIN_ID
+    zid: str  # id of the zenoh session, as zenoh writes it
+    namespace: str  # "/" or "/some/name"
     name: str
 
     def token(self) -> str:
@@ -108,27 +79,18 @@ class Node:
 
 
 def gid_of(token: str) -> bytes:
-    """Return the id (16 bytes) of the entity with this token.
-
-    Its XXH3 hash of 128 bits, lower half first, little-endian.
-    """
+    """Id (16 bytes) of an entity: XXH3-128 of its token, low half first, little end."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
 def attachment(number: int, t_ns: int, gid: bytes) -> bytes:
-    """Return the attachment of a message.
-
-    Its number, when it was sent [ns since 1970], and the publisher's gid.
-    """
+    """Pack the attachment of a message: number, time sent [ns since 1970], gid."""
     gid_bytes = 16
     return struct.pack("<qqB", number, t_ns, gid_bytes) + gid
 
 
 def ros_name(name: str) -> str:
-    """Return `name` as a valid part of a ROS name.
-
-    Letters, digits and underscores, no digit first.
-    """
+    """Return `name` with letters, digits and underscores only, no digit first."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return f"_{plain}" if plain[:1].isdigit() else plain
 
@@ -142,19 +104,10 @@ _RETRY = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor"
 
 
 class RosPublishers:
-    """A ROS 2 node and its publishers.
-
-    Holds the session, and for each topic its publisher, token and number of messages.
-    """
+    """A ROS 2 node and its publishers."""
 
     def __init__(self, router: str, domain: int, namespace: str, name: str) -> None:
-        """Join the router at `router`, for example tcp/127.0.0.1:7447.
-
-        A router that is not there is tried again.
-
-        Raises:
-            BusError: The endpoint is malformed.
-        """
+        """Join the router, like tcp/127.0.0.1:7447; BusError: malformed endpoint."""
         timeout_ms = 1000
         settings: dict[str, object] = {
             "mode": "client",
@@ -182,13 +135,7 @@ class RosPublishers:
         return len(self._session.info.routers_zid()) > 0
 
     def publish(self, topic: Topic, payload: bytes | memoryview) -> None:
-        """Send one message, CDR with its header of four bytes.
-
-        The first message of a topic declares its publisher.
-
-        Raises:
-            BusError: The session is gone.
-        """
+        """Send CDR with its header; the first declares the topic; BusError: session gone."""
         try:
             publisher = self._publishers.get(topic.name)
             if publisher is None:
@@ -208,8 +155,6 @@ class RosPublishers:
 
 
 class _Publisher:
-    """Holds the publisher of one topic, its token and how many messages it sent."""
-
     def __init__(self, session: zenoh.Session, key: str, token: str) -> None:
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         self._token = session.liveliness().declare_token(token)
@@ -222,11 +167,8 @@ class _Publisher:
 
 
 FRAME = "phalanx_optical_frame"
-POSES, STATES, FLAGS = (
-    "geometry_msgs/msg/PoseArray",
-    "sensor_msgs/msg/JointState",
-    "std_msgs/msg/UInt8MultiArray",
-)
+POSES, STATES = "geometry_msgs/msg/PoseArray", "sensor_msgs/msg/JointState"
+FLAGS = "std_msgs/msg/UInt8MultiArray"
 POSE, TRANSFORMS = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
 _ANGLES = ("abduction", "flexion", "pip", "dip")
 _THUMB_ANGLES = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
@@ -234,9 +176,8 @@ ANGLES = tuple(
     f"{finger}_{angle}" for finger in FINGERS for angle in (_THUMB_ANGLES if finger == "thumb" else _ANGLES)
 )
 _STORE = get_typestore(Stores.ROS2_JAZZY)
-_TYPES: dict[str, Any] = dict(
-    _STORE.types
-)  # dataclasses that rosbags makes; they have no static types of their own
+# dataclasses that rosbags makes; they have no static types of their own
+_TYPES: dict[str, Any] = dict(_STORE.types)
 
 
 @cache
@@ -246,16 +187,12 @@ def topic(name: str, type_name: str) -> Topic:
 
 
 def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]]:
-    """All that is published of one pose of a hand.
+    """Return topic and CDR of all that is published of one pose of a hand.
 
-    Args:
-        pose: In the rig frame.
-        wall_ns: When it holds, nanoseconds since 1970.
-
-    Returns:
-        Topic and CDR of each: /phalanx/HAND/joint_poses (26, only while all are valid, for a NaN stops viewers),
-        /phalanx/HAND/joint_states (angles that are known), /phalanx/HAND/joint_flags (26: 0 invalid, 1 valid,
-        2 tracked), and /tf with a frame HAND/JOINT for each valid joint.
+    /phalanx/HAND/joint_poses (26, only while all are valid, for a NaN stops viewers),
+    /phalanx/HAND/joint_states (angles that are known), /phalanx/HAND/joint_flags (26: 0 invalid, 1 valid, 2
+    tracked), and /tf with a frame HAND/JOINT for each valid joint. `wall_ns`: when the pose holds,
+    nanoseconds since 1970.
     """
     hand, header = ros_name(pose.hand), _header(wall_ns)
     valid = (
@@ -288,10 +225,7 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
 
 
 def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryview]]:
-    """Return the ROS 2 messages of an object.
-
-    /phalanx/object/NAME/pose, with its covariance, and its frame on /tf; nothing while its pose is unknown.
-    """
+    """Return topic and CDR of /phalanx/object/NAME/pose and /tf; none while unknown."""
     if not (np.isfinite(pose.position_m).all() and np.isfinite(pose.orientation_wxyz).all()):
         return []
     name, header = ros_name(pose.object), _header(wall_ns)
@@ -322,14 +256,9 @@ def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryv
 def _states(pose: HandPose, header: object) -> object:
     angles = pose.angles_rad.ravel()
     known = np.flatnonzero(np.isfinite(angles))
+    names = [f"{ros_name(pose.hand)}/{ANGLES[k]}" for k in known.tolist()]
     nothing = np.empty(0)
-    return _TYPES[STATES](
-        header=header,
-        name=[f"{ros_name(pose.hand)}/{ANGLES[k]}" for k in known.tolist()],
-        position=angles[known],
-        velocity=nothing,
-        effort=nothing,
-    )
+    return _TYPES[STATES](header=header, name=names, position=angles[known], velocity=nothing, effort=nothing)
 
 
 def _header(wall_ns: int) -> object:
@@ -351,23 +280,15 @@ def _cdr(name: str, type_name: str, message: object) -> tuple[Topic, memoryview]
 
 
 class Ros2Sink:
-    """A `Sink`. Holds the node `phalanx` in ROS's network."""
+    """A `Sink`: the node `phalanx` in ROS's network."""
 
     def __init__(self, settings: Ros2Output, times: Times) -> None:
-        """Join the router.
-
-        Raises:
-            BusError: It is not there.
-        """
+        """Join the router; BusError: the endpoint is malformed."""
         self._times, self._router = times, settings.router
         self._publishers = RosPublishers(settings.router, settings.domain_id, "/", "phalanx")
 
     def write(self, message: ResultMessage) -> None:
-        """Publish a hand or an object.
-
-        Raises:
-            BusError: The router is gone.
-        """
+        """Publish a hand or an object; BusError: the router is gone."""
         if not self._publishers.joined:
             raise BusError(f"ros2: the router at {self._router} is gone")
         if isinstance(message, HandPose):

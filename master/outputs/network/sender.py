@@ -1,13 +1,7 @@
 """The sender of `phalanx send` feeds the live outputs from the bus.
 
-Sender that feeds the live outputs from the bus.
-
-Follows their settings file, obeys commands, reports.
-
-On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file states
-otherwise; `report` states how it is; `stop` ends it.
-
-`phalanx send`: the live outputs as one process beside a running master.
+A process beside a running master, "outputs" on the bus. It follows its settings file and reports. Commands:
+`on` and `off`, body {"output": "osc"}, switch one until the file states otherwise; `report`; `stop` ends it.
 """
 
 import secrets
@@ -45,21 +39,14 @@ class Switch(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def settings_of(path: Path) -> OutputSettings:
-    """The settings file; where there is none called default.json, the defaults.
-
-    Raises:
-        CalibrationError: It is broken, or there is none.
-    """
+    """Load the settings file, or defaults for no default.json; CalibrationError."""
     if path.name == "default.json" and not path.exists():
         return default_outputs()
     return load(path, OutputSettings)
 
 
 class Sender:
-    """Set of live outputs.
-
-    Holds the settings, which outputs are on, a line for each of those, and the counts of each.
-    """
+    """Set of live outputs: those that are on have a line each."""
 
     def __init__(
         self,
@@ -68,13 +55,7 @@ class Sender:
         notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
-        """Switch on what the settings have on, or exactly what `only` names.
-
-        `only` overrides the settings.
-
-        Raises:
-            PhalanxError: `only` names an output that there is not.
-        """
+        """Switch on what the settings have on, or exactly what `only` names."""
         refuse_unknown(only)
         self._settings, self._notify = settings, notify
         self._clock: Clock = SystemClock() if clock is None else clock
@@ -105,12 +86,8 @@ class Sender:
         return where if reader is None else f"{where}; {reader}"
 
     def switch(self, name: str, *, on: bool) -> None:
-        """Switch one output.
-
-        Raises:
-            PhalanxError: There is no such output.
-        """
-        _known(name)
+        """Switch one output; PhalanxError: there is no such output."""
+        refuse_unknown([name])
         with self._lock:
             line = self._lines.pop(name, None)
             if on and line is not None:
@@ -125,11 +102,9 @@ class Sender:
             self.counters_by_name[name].trouble = ""
 
     def use(self, settings: OutputSettings) -> None:
-        """Apply other settings from now on.
+        """Apply other settings: recreate what is set otherwise, switch a changed `on`.
 
-        An output that is on and is set otherwise is recreated; a changed `on` switches.
-
-        Outputs that were chosen by name (`only`) stay chosen, whatever the file states.
+        Where `only` chose the outputs, `on` switches nothing.
         """
         with self._lock:
             before, self._settings = self._settings, settings
@@ -152,10 +127,7 @@ class Sender:
                     line.offer(message)
 
     def health(self, lost: int = 0) -> Health:
-        """Return the present health report.
-
-        `lost`: messages that this process was too slow to take from the bus.
-        """
+        """Return the health report; `lost`: messages not taken from the bus in time."""
         counts = {"received": self._received, "lost": lost}
         metrics: dict[str, float] = {}
         with self._lock:
@@ -169,11 +141,7 @@ class Sender:
         return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def obey(self, command: Command) -> None:
-        """Obey a command, except `stop`.
-
-        Raises:
-            PhalanxError: Unknown verb or output, or a body that is none. The text lists what there is.
-        """
+        """Obey a command, except `stop`; PhalanxError lists what there is."""
         if command.verb in ("on", "off"):
             try:
                 body = msgspec.json.decode(command.body, type=Switch)
@@ -195,12 +163,7 @@ class Sender:
 
 
 class Housekeeping:
-    """Background tasks of the sender, on a thread of its own.
-
-    File, report, echoes of the master's clock.
-
-    Holds the bus and the file, which belong to the caller.
-    """
+    """Background tasks of the sender, on a thread of its own."""
 
     def __init__(self, sender: Sender, bus: Bus, path: Path, subscribers: Collection[Subscription]) -> None:
         self._sender, self._bus, self._path, self._subscribers = sender, bus, path, subscribers
@@ -209,13 +172,7 @@ class Housekeeping:
         self._clock = SystemClock()
 
     def step(self, notify: Callable[[str], None]) -> None:
-        """Run one step of the background tasks.
-
-        Use the file if it changed, ask the master for its time, publish the report.
-
-        Raises:
-            BusError: The bus is closed.
-        """
+        """Use the file if it changed, ask the master for its time, publish the report."""
         if self._monitored.changed([self._path]):
             try:
                 self._sender.use(settings_of(self._path))
@@ -245,9 +202,7 @@ def run_sender(
     stop: threading.Event,
     notify: Callable[[str], None],
 ) -> None:
-    """Send until `stop` is set or the command `stop` comes.
-
-    The bus belongs to the caller.
+    """Send until `stop` is set or the command `stop` comes; the bus stays open.
 
     Raises:
         BusError: The bus is closed.
@@ -294,10 +249,7 @@ def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Cal
 
 
 def _drain(subscribers: list[Subscription], sender: Sender) -> None:
-    """Forward all pending messages.
-
-    If there are none, wait for a hand, since the other messages come with hands.
-    """
+    """Forward what waits; else wait for a hand, with which all else comes."""
     hands, *others = subscribers
     poll_s = 0.02
     message = hands.get(poll_s)
@@ -315,18 +267,10 @@ def _push(sender: Sender, message: Message) -> None:
 
 
 def refuse_unknown(names: Collection[str]) -> None:
-    """Refuse names of outputs that there are not.
-
-    Raises:
-        PhalanxError: With what there is.
-    """
+    """Refuse names of outputs that there are not; PhalanxError lists what there is."""
     for name in names:
-        _known(name)
-
-
-def _known(name: str) -> None:
-    if name not in OUTPUTS:
-        raise PhalanxError(f"output {name!r}: unknown; there are {', '.join(OUTPUTS)}")
+        if name not in OUTPUTS:
+            raise PhalanxError(f"output {name!r}: unknown; there are {', '.join(OUTPUTS)}")
 
 
 def send(options: Namespace) -> None:
@@ -352,11 +296,7 @@ def send(options: Namespace) -> None:
 
 
 def _refuse_second(connection: ZenohBus) -> None:
-    """Two would send everything twice, and answer each other's commands.
-
-    Raises:
-        BusError: One is there.
-    """
+    """BusError if one runs: two would send everything and answer commands twice."""
     if NAME in connection.alive():
         raise BusError(
             f"{NAME!r} is on the bus already: another `phalanx send` runs beside this master;"

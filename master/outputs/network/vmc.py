@@ -1,10 +1,8 @@
 """Virtual Motion Capture carries hands as bones of a VRM avatar.
 
-Bones of a VRM avatar's hands from the poses of a hand.
-
-Local rotations and positions, in Unity's axes.
-
-Three frames, and one rest pose:
+OSC over UDP, protocol.vmc.info, 3.1. Two datagrams a pose, each below the size that a network splits: what is
+available, the time and the root; then the bones of the hand. Bones of which nothing is known are left out, so
+that the avatar keeps them as they are. Three frames, and one rest pose:
 
 - *avatar*: OpenXR axes, right-handed: x to the avatar's right, y up, z to its back.
 - *Unity*: left-handed: x right, y up, z to the front. A place (x, y, z) of the avatar frame is (x, y, -z) there, and a
@@ -14,18 +12,11 @@ Three frames, and one rest pose:
   hand to -x, palms and finger pads down; thumbs point half way between their fingers and the front, parallel to the
   ground, rolled outward by 90 degrees: their nails face half way between the front and the other hand.
 
-A normalized bone is turned by nothing in the T-pose, whichever way it points. So a joint whose orientation is R_A_joint
-in the avatar frame, and B there in the T-pose, turns its bone by G = R_A_joint B^T, and the local rotation of a bone is
-that seen from its parent's, L = G_parent^T G. The bones of the fingers hang on the hand: Unity has no metacarpals, and
-calls the thumb's metacarpal its proximal bone. For joints of one chain the room cancels out; the hand's own bone hangs
-on an arm that nobody tracks and that is taken to be in the T-pose.
-
-Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol.
-
-OSC over UDP, protocol.vmc.info, 3.1.
-
-Two datagrams a pose, each below the size that a network splits: what is available, the time and the root; then the
-bones of the hand. Bones of which nothing is known are left out, so that the avatar keeps them as they are.
+A normalized bone is turned by nothing in the T-pose, whichever way it points. So a joint whose orientation is
+R_A_joint in the avatar frame, and B there in the T-pose, turns its bone by G = R_A_joint B^T, and the local
+rotation of a bone is L = G_parent^T G. The bones of the fingers hang on the hand: Unity has no metacarpals,
+and calls the thumb's metacarpal its proximal bone. For joints of one chain the room cancels out; the hand's
+own bone hangs on an arm that nobody tracks and that is taken to be in the T-pose.
 """
 
 from dataclasses import dataclass
@@ -46,20 +37,14 @@ _FINGERS = ("Thumb", "Index", "Middle", "Ring", "Little")
 _JOINT_PALM = np.diag([-1.0, 1.0, -1.0])  # palm axes -> axes of the wrist joint in a flat hand
 
 JOINT_OF_BONE = (WRIST, *(int(joint) for chain in CHAINS for joint in chain[:3]))  # (16,)
-_PARENT = (
-    -1,
-    *(parent for f in range(5) for parent in (0, 1 + 3 * f, 2 + 3 * f)),
-)  # row of each bone's parent
-_PARENT_ROWS = np.array(_PARENT[1:])
+# rows of the parents of all bones but the first, the hand's
+_PARENT_ROWS = np.array([parent for f in range(5) for parent in (0, 1 + 3 * f, 2 + 3 * f)])
 _ROWS = np.array(JOINT_OF_BONE)
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _hamilton() -> Float:
-    """Return the linear map (16, 4) of quaternion multiplication.
-
-    From all products of an element of a with one of b to the quaternion a b, wxyz.
-    """
+    """Linear map (16, 4) from the products a_i b_j to the quaternion a b, wxyz."""
     table = np.zeros((4, 4, 4))
     table[0] = np.eye(4)  # 1 times anything
     table[:, 0] = np.eye(4)
@@ -73,19 +58,13 @@ _PRODUCT = _hamilton()
 
 
 def bone_names(side: Side) -> tuple[str, ...]:
-    """Return Unity's `HumanBodyBones` of one hand (16).
-
-    The hand, then thumb ... little from the palm outward.
-    """
+    """Return Unity's `HumanBodyBones` of one hand (16): hand, thumb ... little."""
     top = side.capitalize()
     return (f"{top}Hand", *(f"{top}{finger}{segment}" for finger in _FINGERS for segment in _SEGMENTS))
 
 
 def t_pose(side: Side) -> Float:
-    """Return T-pose orientations (16, 3, 3) of the joints behind the bones.
-
-    Joint axes -> avatar axes.
-    """
+    """Return T-pose orientations (16, 3, 3): joint axes -> avatar axes."""
     out = 1.0 if side == "right" else -1.0
     half = np.sqrt(0.5)
     finger = _axes(np.array([out, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
@@ -95,24 +74,15 @@ def t_pose(side: Side) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bones:
-    """The bones of one hand, rows as `bone_names`, Unity's axes; NaN: not known.
+    """The bones of one hand, rows as `bone_names`, Unity's axes; NaN: not known."""
 
-    Attributes:
-        position_m: (16, 3) [m] from the parent bone, in the parent's turned frame; row 0 is NaN, see `hand_bone`.
-        rotation_xyzw: (16, 4) quaternion against the parent bone.
-    """
-
+    # (16, 3) [m] from the parent bone, in the parent's turned frame; row 0 is NaN, see `hand_bone`
     position_m: Float
-    rotation_xyzw: Float
+    rotation_xyzw: Float  # (16, 4) quaternion against the parent bone
 
 
 class BoneMap:
-    """Map from poses of one side to bones.
-
-    Holds the T-pose, and the rotation from rig to avatar, as linear maps.
-
-    Quaternions all along: the maps are products with constant ones, and there is no trigonometry in a pose.
-    """
+    """Map from poses of one side to bones: products with constant quaternions only."""
 
     def __init__(self, side: Side, R_avatar_rig: Float) -> None:
         """For one side; `R_avatar_rig` (3, 3): rig axes -> avatar axes."""
@@ -123,10 +93,7 @@ class BoneMap:
         self._to_bone = np.stack([before @ one for one in after])  # (16, 4, 4): orientation wxyz -> G
 
     def bones(self, pose: HandPose) -> Bones:
-        """Return all bones of a pose.
-
-        The bone of the hand is rotated as the palm is oriented in the room, behind an arm in the T-pose.
-        """
+        """Return all bones of a pose; the hand's is turned as the palm in the room."""
         joint = np.where(pose.valid[_ROWS, None], pose.orientation_wxyz[_ROWS], np.nan)
         bone = (self._to_bone @ joint[..., None])[..., 0]  # G, (16, 4) wxyz
         parent = bone[_PARENT_ROWS] * _CONJUGATE
@@ -141,10 +108,7 @@ class BoneMap:
         return Bones(position, mirrored_xyzw(local))
 
     def flexed(self, R_forearm_palm: Float) -> Float:
-        """Return the rotation xyzw (4,) of the hand's bone for a flexed wrist.
-
-        Flexed by `R_forearm_palm` (3, 3); Unity's axes.
-        """
+        """Return xyzw (4,) of the hand's bone for a wrist at `R_forearm_palm` (3, 3)."""
         C = self._rest[0] @ _JOINT_PALM  # palm axes of the T-pose -> avatar
         return mirrored_xyzw(matrix_to_quaternion(C @ R_forearm_palm @ C.T))
 
@@ -181,17 +145,10 @@ _STILL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class VmcSink:
-    """A `Sink` that sends every pose as bones.
-
-    It ignores other messages. Holds the socket and the blanks.
-    """
+    """A `Sink` that sends every pose as bones; it ignores other messages."""
 
     def __init__(self, settings: VmcOutput, times: Times) -> None:
-        """Open the socket.
-
-        Raises:
-            PhalanxError: The host is unknown.
-        """
+        """Open the socket; PhalanxError: the host is unknown."""
         self._settings, self._times = settings, times
         rotation = quaternion_to_matrix(np.array(settings.q_avatar_rig))
         sides: tuple[Side, ...] = ("left", "right")
@@ -206,11 +163,7 @@ class VmcSink:
         self._udp = UdpSender(settings.host, settings.port, "vmc")
 
     def write(self, message: ResultMessage) -> None:
-        """Send one pose.
-
-        Raises:
-            PhalanxError: This machine cannot send there.
-        """
+        """Send one pose; PhalanxError: this machine cannot send there."""
         if not isinstance(message, HandPose):
             return
         side = side_of(message)
@@ -231,10 +184,7 @@ class VmcSink:
         self._udp.close()
 
     def _rows(self, pose: HandPose, side: Side) -> tuple[Float, Float]:
-        """Return positions (16, 3) [m] and rotations xyzw (16, 4).
-
-        The hand's own bone is as the settings state.
-        """
+        """Positions (16, 3) [m] and xyzw (16, 4), the hand's as the settings state."""
         bones = self._maps[side].bones(pose)
         place, quaternion = bones.position_m, bones.rotation_xyzw
         place[0] = (self._settings.forearm_m if side == "right" else -self._settings.forearm_m, 0.0, 0.0)

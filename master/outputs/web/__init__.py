@@ -40,9 +40,7 @@ def static_dir() -> Path:
 
 
 def three_js_path() -> Path:
-    """Return the path of the three.js bundle that comes with NiceGUI.
-
-    It is an ES module that exports THREE, OrbitControls, GLTFLoader.
+    """Path of NiceGUI's three.js: an ES module with THREE, OrbitControls, GLTFLoader.
 
     Raises:
         PhalanxError: NiceGUI is not installed, or has moved its bundle.

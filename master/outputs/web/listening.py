@@ -1,10 +1,9 @@
 """Web pages that other machines may open.
 
-They are encrypted by a certificate of this machine's own, or plain where that is requested.
-
-The certificate signs itself. It is not of the rig's authority on purpose: a certificate of that may be shown by whoever
-listens only to be the master (docs/security.md), and nobody should have to trust a rig's authority in his browser.
-The browser asks once; what it shows is compared with the fingerprint that is printed at the start.
+They are encrypted by a certificate of this machine's own, or plain where that is requested. The certificate
+signs itself. It is not of the rig's authority on purpose: a certificate of that may be shown by whoever
+listens only to be the master (docs/security.md), and nobody should have to trust a rig's authority in his
+browser. The browser asks once; what it shows is compared with the fingerprint that is printed at the start.
 """
 
 import os
@@ -36,22 +35,14 @@ _ANYWHERE = frozenset({"0.0.0.0", "::"})
 
 @dataclass(frozen=True, slots=True)
 class PageCertificate:
-    """A page's own certificate.
+    """A page's own certificate."""
 
-    Attributes:
-        context: For the server's sockets: TLS 1.2 or later.
-        fingerprint: SHA-256 as browsers show it, in pairs of hexadecimal digits.
-    """
-
-    context: ssl.SSLContext
-    fingerprint: str
+    context: ssl.SSLContext  # for the server's sockets: TLS 1.2 or later
+    fingerprint: str  # SHA-256 as browsers show it, in pairs of hexadecimal digits
 
 
 def is_loopback(host: str) -> bool:
-    """Check whether an address is reached from this machine alone.
-
-    Of names only localhost is: the others may change.
-    """
+    """Whether an address is reached from this machine alone; of names localhost."""
     return loopback(f"tcp/[{host}]:0")
 
 
@@ -61,21 +52,16 @@ def is_open(environment: Mapping[str, str]) -> bool:
 
 
 def private_folder(environment: Mapping[str, str]) -> Path:
-    """Return the folder of this user's page passwords and certificates.
-
-    It is ~/.config/phalanx; whoever writes there makes it.
-    """
+    """Return the folder of page passwords and certificates, ~/.config/phalanx."""
     base = environment.get("XDG_CONFIG_HOME") or str(Path("~/.config").expanduser())
     return Path(base) / "phalanx"
 
 
 def page_certificate(folder: Path, host: str, now: datetime | None = None) -> PageCertificate:
-    """Return the page certificate kept in `folder` (page.pem, with its key).
-
-    It is made anew where there is none, or it does not fit.
+    """Return the page certificate kept in `folder`; make it where none fits.
 
     Args:
-        folder: Made with mode 0700 where it is missing.
+        folder: Made with mode 0700 where it is missing; page.pem holds certificate and key.
         host: Address that is listened on; the certificate names it, and this machine.
         now: The present.
 
@@ -98,11 +84,7 @@ def page_certificate(folder: Path, host: str, now: datetime | None = None) -> Pa
 
 
 def read_private(path: Path) -> bytes:
-    """What is in a file of secrets, at most 64 KiB of it.
-
-    Raises:
-        PhalanxError: It cannot be read, or others can read it.
-    """
+    """Read at most 64 KiB of a file of secrets; PhalanxError: others can read it."""
     try:
         mode = path.stat().st_mode
         with path.open("rb") as file:
@@ -116,13 +98,7 @@ def read_private(path: Path) -> bytes:
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a file that its owner alone can read, at once.
-
-    Its folder is made, for the owner alone, where it is missing.
-
-    Raises:
-        PhalanxError: It cannot be written.
-    """
+    """Write a file that its owner alone can read, in such a folder; PhalanxError."""
     half = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -141,22 +117,14 @@ def machine_names() -> frozenset[str]:
 
 
 def places_of(host: str) -> tuple[str, ...]:
-    """Return the addresses at which a browser finds a page on `host`.
-
-    It is the host itself, or where the page listens everywhere, each IPv4 address.
-
-    Those that other machines reach come first, this machine's own last.
-    """
+    """Addresses of a page on `host` for a browser, those for other machines first."""
     if host not in _ANYWHERE:
         return (f"[{host}]" if ":" in host else host,)
     return (*dict.fromkeys(one for one in _addresses() if not ip_address(one).is_loopback), "127.0.0.1")
 
 
 def _addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine.
-
-    Linux reports them for each network; elsewhere, and without one, they are those of its name.
-    """
+    """IPv4 addresses of this machine: on Linux of each network, else of its name."""
     found: list[str] = []
     if sys.platform == "linux":
         from fcntl import ioctl

@@ -1,22 +1,14 @@
 """The server sends hands and pages to browsers.
 
-Small server for browsers.
+The page by HTTP; hands and objects as JSON by WebSocket at /hands. One thread with one event loop, whatever
+the number of clients. Each client has room for the newest text of each key (a hand, an object): who reads too
+slowly skips, delays nobody, and costs no memory.
 
-It serves the page and its files by HTTP, and the offered messages by WebSocket at /hands.
-
-One thread with one event loop, whatever the number of clients. Each client has room for the newest text of each key (a
-hand, an object) and no more: who reads too slowly skips, delays nobody, and costs no memory. Who is gone is forgotten.
-
-A browser lets any page of any site open a WebSocket to this machine, so a request whose `Origin` is not this very
-server is refused, and so is one that calls this server by a foreign name (a site may point its own name at 127.0.0.1).
-Where other machines reach it, it wants to be shown a key, and is encrypted (`RequestFilter`, docs/security.md).
-
-Hands and objects for web pages.
-
-JSON by WebSocket in the joint order of WebXR, and the page that shows them.
-
-On this machine it is plain, for whoever is on it. Where other machines reach it, it is encrypted by the certificate of
-this machine's pages and wants to be shown a key (docs/security.md); with --open it is plain there, but wants the key.
+A browser lets any page of any site open a WebSocket to this machine, so a request whose `Origin` is not this
+very server is refused, and so is one that calls this server by a foreign name (a site may point its own name
+at 127.0.0.1). On this machine it is plain. Where other machines reach it, it wants to be shown a key, and is
+encrypted by the certificate of this machine's pages unless --open is given (`RequestFilter`,
+docs/security.md).
 """
 
 import asyncio
@@ -47,6 +39,7 @@ from master.outputs.web import object_json, static_dir, three_js_path, webxr_jso
 from master.outputs.web.listening import (
     is_loopback,
     is_open,
+    machine_names,
     page_certificate,
     places_of,
     private_folder,
@@ -57,9 +50,7 @@ from master.outputs.web.listening import (
 PATH: Final = "/hands"
 CLIENTS = 16
 SEND_BUFFER_BYTES = 32 * 1024  # about five poses: what lies in the system's buffer is old when it is read
-OPEN_S = (
-    5.0  # for who connects to state what is wanted; so long an unknown sender of nothing keeps a connection
-)
+OPEN_S = 5.0  # for who connects to state what is wanted; so long a sender of nothing keeps a connection
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -77,26 +68,18 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class RequestFilter:
-    """What stands before a server that other machines reach.
+    """What stands before a server that other machines reach."""
 
-    Attributes:
-        key: Has to be shown, as `?key=…` or by the cookie that the page then has; None: nobody is asked.
-        tls: Encrypts; None: plain.
-    """
-
+    # has to be shown, as `?key=…` or by the cookie that the page then has; None: nobody is asked
     key: str | None = None
-    tls: ssl.SSLContext | None = None
+    tls: ssl.SSLContext | None = None  # None: plain
 
 
 class Mailbox:
-    """What one client has not been sent yet: the newest text of each key.
-
-    Attributes:
-        skipped: Texts that a newer one of the same key replaced before they were sent.
-    """
+    """What one client has not been sent yet: the newest text of each key."""
 
     def __init__(self) -> None:
-        self.skipped = 0
+        self.skipped = 0  # texts that a newer one of the same key replaced before they were sent
         self._newest: dict[str, bytes] = {}
         self._filled = asyncio.Event()
 
@@ -115,15 +98,12 @@ class Mailbox:
 
 
 class WebServer:
-    """Serves until it is closed.
-
-    Holds the listening socket, the thread with its loop, the newest texts on their way to it, and a mailbox per client.
-    """
+    """Serves until it is closed."""
 
     def __init__(
         self, host: str, port: int, *, clients: int = CLIENTS, request_filter: RequestFilter | None = None
     ) -> None:
-        """Listen at once, behind the guard; `port` 0 takes any that is free.
+        """Listen at once, behind the filter; `port` 0 takes any that is free.
 
         Raises:
             PhalanxError: The address cannot be had, or three.js is not installed.
@@ -157,9 +137,7 @@ class WebServer:
         return self._skipped + sum(mailbox.skipped for mailbox in list(self._mailboxes.values()))
 
     def offer(self, key: str, text: bytes) -> None:
-        """Send `text` (JSON, UTF-8) to every client without ever waiting.
-
-        A newer text of `key` replaces one not yet sent.
+        """Send JSON to every client without waiting; a newer text of `key` replaces it.
 
         Raises:
             PhalanxError: The server has ended.
@@ -220,10 +198,7 @@ class WebServer:
             mailbox.put(texts)
 
     async def _client(self, connection: ServerConnection) -> None:
-        """Serve one client until it disconnects.
-
-        A client for whom there is no room, since many came at once, is disconnected at once.
-        """
+        """Serve one client until it disconnects; disconnect it where there is no room."""
         if len(self._mailboxes) >= self._clients:
             await connection.close(1013, f"{self._clients} clients are connected already")
             return
@@ -282,10 +257,7 @@ class WebServer:
 
 
 async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
-    """Send the newest messages of a mailbox to a client.
-
-    `send` waits while the client does not read, and meanwhile the mailbox keeps the newest.
-    """
+    """Send a mailbox, which keeps the newest text while the client does not read."""
     try:
         while True:
             for text in await mailbox.take():
@@ -295,10 +267,7 @@ async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
 
 
 def foreign(headers: Headers, own_names: frozenset[str]) -> str | None:
-    """Return why a request comes from a foreign web page.
-
-    That is, neither from a page of this server nor from a program; None where it is from one of these.
-    """
+    """Return why a request comes from a foreign web page; None: it does not."""
     try:
         host, origin = headers.get("Host", ""), headers.get("Origin")
     except MultipleValuesError:
@@ -320,9 +289,7 @@ def _is_address(name: str) -> bool:
 
 
 def _own_names(host: str) -> frozenset[str]:
-    machine = socket.gethostname().lower()
-    names = {"localhost", host.lower(), machine, f"{machine.split('.')[0]}.local"}
-    return frozenset(name for name in names if name and not _is_address(name))
+    return frozenset(name for name in machine_names() | {host.lower()} if name and not _is_address(name))
 
 
 def _listening(host: str, port: int) -> socket.socket:
@@ -366,11 +333,7 @@ KEY_FILE = "web.key"
 
 
 def request_filter_of(settings: WebOutput, environment: Mapping[str, str]) -> RequestFilter:
-    """What stands before the page: nothing on this machine, key and TLS elsewhere.
-
-    Raises:
-        PhalanxError: Key or certificate cannot be read or written.
-    """
+    """Filter of a page: none on this machine, key and TLS elsewhere; PhalanxError."""
     if is_loopback(settings.host):
         return RequestFilter()
     folder = private_folder(environment)
@@ -393,29 +356,15 @@ def address_of(settings: WebOutput, environment: Mapping[str, str]) -> str:
 
 
 class WebSink:
-    """A `Sink` for browsers.
-
-    Attributes:
-        server: Who is connected, and how much slow clients skipped.
-    """
+    """A `Sink` for browsers."""
 
     def __init__(self, settings: WebOutput, environment: Mapping[str, str] | None = None) -> None:
-        """Listen at the address of the settings.
-
-        Raises:
-            PhalanxError: The address cannot be had, three.js is not installed, or key or certificate cannot be used.
-        """
+        """Listen at the address of the settings; PhalanxError as `WebServer`."""
         request_filter = request_filter_of(settings, os.environ if environment is None else environment)
         self.server = WebServer(settings.host, settings.port, request_filter=request_filter)
 
     def write(self, message: ResultMessage) -> None:
-        """Offer a hand or an object to every client.
-
-        Costs nothing while there is none. Other messages are ignored.
-
-        Raises:
-            PhalanxError: The server has ended.
-        """
+        """Offer a hand or an object to every client; other messages are ignored."""
         if self.server.clients == 0:
             return
         if isinstance(message, HandPose):

@@ -1,17 +1,14 @@
 """Hand as JSON in the joint order of WebXR Hand Input.
 
-Web pages, game engines and scripts read it.
-
-Two frames are offered. `webxr` (the usual): x right, y up, z towards the viewer, so that the hand is before an eye at
-the origin that looks along -z, as the reference camera does. It is the rig frame (x right, y down, z away) turned by pi
-about x, which maps
+Two frames are offered; the message states which. `webxr` (the usual): x right, y up, z towards the viewer, so
+that the hand is before an eye at the origin that looks along -z, as the reference camera does. It is the rig
+frame (x right, y down, z away) turned by pi about x:
 
     (x, y, z) -> (x, -y, -z)        w + xi + yj + zk -> i (w + xi + yj + zk) = -x + wi - zj + yk
 
-Joint axes need no turn: those of OpenXR (-z along the bone to the tip, +y dorsal) are those of WebXR. `rig` leaves all
-as it is. The message states which of the two it is in.
-
-Numbers are rounded to 1 um and 1e-6 of a quaternion: far below the noise, and half the bytes.
+Joint axes need no turn: those of OpenXR (-z along the bone to the tip, +y dorsal) are those of WebXR. `rig`
+leaves all as it is. Numbers are rounded to 1 um and 1e-6 of a quaternion: far below the noise, and half the
+bytes.
 """
 
 from math import isnan
@@ -43,34 +40,22 @@ _ENCODER = msgspec.json.Encoder()  # writes NaN as null
 
 
 class JointJson(Struct, frozen=True):
-    """One joint.
+    """One joint."""
 
-    Attributes:
-        name: As in WebXR Hand Input.
-        position: [m], frame of the message. None: not known.
-        orientation: Unit quaternion x, y, z, w with w >= 0, joint axes -> frame of the message. None: not known.
-        radius: From the joint to the skin [m]; NaN: not known.
-        valid: The pose may be used.
-        tracked: It is observed now, not inferred; tracked implies valid.
-        sigma_mm: Standard deviation of the position per axis [mm], root mean square of the three. NaN: not known.
-        source: none, measured, solved, held or wrist (`common.messages.Source`).
-    """
-
-    name: str
-    position: Triple | None
+    name: str  # as in WebXR Hand Input
+    position: Triple | None  # [m], frame of the message. None: not known
+    # unit quaternion x, y, z, w with w >= 0, joint axes -> frame of the message. None: not known
     orientation: Four | None
-    radius: float
-    valid: bool
-    tracked: bool
+    radius: float  # from the joint to the skin [m]; NaN: not known
+    valid: bool  # the pose may be used
+    tracked: bool  # it is observed now, not inferred; tracked implies valid
+    # standard deviation of the position per axis [mm], root mean square of the three. NaN: not known
     sigma_mm: float
-    source: str
+    source: str  # none, measured, solved, held or wrist (`common.messages.Source`)
 
 
 class HandJson(Struct, frozen=True, tag_field="type", tag="hand"):
-    """One hand at one time: the JSON object of `webxr_json`.
-
-    `joints` are 25 in the order of WebXR.
-    """
+    """One hand at one time: the JSON object of `webxr_json`, 25 joints."""
 
     version: int
     frame: Frame
@@ -82,10 +67,7 @@ class HandJson(Struct, frozen=True, tag_field="type", tag="hand"):
 
 
 class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
-    """One rigid object at one time: the JSON object of `object_json`.
-
-    Fields as in `JointJson` and `ObjectPose`.
-    """
+    """One object at one time: the JSON object of `object_json`, like `JointJson`."""
 
     version: int
     frame: Frame
@@ -99,10 +81,7 @@ class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
 
 
 def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
-    """Encode the pose as JSON (`HandJson`), without line feeds.
-
-    What is not known is null, never NaN.
-    """
+    """Encode the pose as JSON (`HandJson`); unknown is null, never NaN."""
     points = _points(pose.position_m[1:], frame)
     rotations = _quaternions(pose.orientation_wxyz[1:], frame)
     sigma_mm: Float = np.sqrt(np.einsum("jii->j", pose.cov_m2[1:]) / 3.0) * 1e3
@@ -125,10 +104,7 @@ def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
 
 
 def object_json(pose: ObjectPose, frame: Frame = "webxr") -> bytes:
-    """Encode the pose of an object as JSON (`ObjectJson`).
-
-    What is not known is null, never NaN.
-    """
+    """Encode the pose of an object as JSON (`ObjectJson`); unknown is null."""
     return _ENCODER.encode(
         ObjectJson(
             version=FORMAT_VERSION,
@@ -152,10 +128,7 @@ def _points(position_m: Float, frame: Frame) -> list[Triple | None]:
 
 
 def _quaternions(orientation_wxyz: Float, frame: Frame) -> list[Four | None]:
-    """Convert quaternions (N, 4) from the rig frame to the frame of the message.
-
-    They rotate to the rig frame, as w x y z; the result rotates to the frame of the message, as x y z w.
-    """
+    """Turn wxyz (N, 4) of the rig frame into xyzw of the message's frame."""
     order, signs = _QUATERNION_ORDER[frame]
     rotations = orientation_wxyz[:, order] * signs
     rotations = np.where(rotations[:, 3:] < 0.0, -rotations, rotations)

@@ -1,15 +1,13 @@
 """BVH export of a hand.
 
-Blender, Maya, MotionBuilder and most tools of motion capture read BVH files.
-
-The rest pose is that of the hand profile, in the palm frame: fingers along +z, the back of the hand up (+y). So every
-channel is zero at rest. A joint turns by its three rotation channels, about z, then its own x, then its own y:
+Blender, Maya, MotionBuilder and most tools of motion capture read BVH. The rest pose is that of the hand
+profile, in the palm frame: fingers along +z, the back of the hand up (+y), so every channel is zero at rest.
+A joint turns by its three rotation channels, about z, then its own x, then its own y:
 
     R = R_z R_x R_y        R_joint(rig) = up . product of R from the wrist on . R_joint(at rest)
 
-Where the bones of the poses are as long as those of the profile and turn with their joint, which the solver's are,
-that is all. A joint that stands elsewhere by more than 10 um in any frame has three position channels as well; they
-hold its whole offset from its parent, in place of OFFSET, as readers take them.
+A joint that stands elsewhere than its bone states by more than 10 um in any frame has three position channels
+as well; they hold its whole offset from its parent, in place of OFFSET, as readers take them.
 """
 
 from collections.abc import Callable
@@ -49,7 +47,6 @@ class Axes:
     """How places are written.
 
     Attributes:
-        unit: Of length.
         up: y: the rig frame turned by half a turn about its x, so that y is up in the picture of the reference camera
             and z comes out of it; rig: the rig frame as it is, y down and z ahead.
     """
@@ -79,15 +76,7 @@ def write_bvh(
     axes: Axes,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> tuple[int, ...]:
-    """Write a motion that was resampled.
-
-    Args:
-        path: The file; replaced only by a complete one.
-        motion: At a constant rate, rig frame.
-        skeleton: The hand at rest.
-        rate_hz: That rate.
-        axes: Unit and axes.
-        progress: Called with how many frames of how many are written.
+    """Write a motion at a constant rate, rig frame.
 
     Returns:
         The joints, without the wrist, that have position channels because their bone is not rigid.
@@ -111,10 +100,7 @@ def write_bvh(
 
 
 def _rest_offsets(skeleton: Skeleton) -> Float:
-    """Return the offset of each joint from its parent at rest (26, 3) [m].
-
-    The offsets are in the palm frame; the wrist's is zero.
-    """
+    """Offset of each joint from its parent at rest (26, 3) [m]; the wrist's is zero."""
     out = np.zeros((26, 3))
     for joint, parent in PARENT.items():
         out[joint] = skeleton.position_m[joint] - skeleton.position_m[parent]
@@ -122,10 +108,7 @@ def _rest_offsets(skeleton: Skeleton) -> Float:
 
 
 def _channels(motion: Motion, skeleton: Skeleton) -> tuple[Float, Float]:
-    """Return the rotation and the offset of each joint relative to its parent.
-
-    The rotation (T, 26, 4) is from rest, as seen from the parent; the offset is (T, 26, 3) [m].
-    """
+    """Rotation from rest (T, 26, 4) and offset (T, 26, 3) [m] of joints to parents."""
     from_rest = times(motion.orientation_wxyz, back(skeleton.orientation_wxyz))
     rotated, offset = from_rest.copy(), motion.position_m.copy()
     for joint, parent in PARENT.items():
@@ -138,10 +121,7 @@ def _channels(motion: Motion, skeleton: Skeleton) -> tuple[Float, Float]:
 def _hierarchy(
     joint: int, rest: Float, ends: dict[int, Float], free: tuple[int, ...], depth: int
 ) -> list[str]:
-    """Return the lines of a joint and of all its descendants.
-
-    `rest` and `ends` are in the unit of the file.
-    """
+    """Lines of a joint and its descendants; `rest`, `ends` in the file's unit."""
     tab, inner = "\t" * depth, "\t" * (depth + 1)
     moves = joint == WRIST or joint in free
     channels = ["Xposition", "Yposition", "Zposition"] if moves else []
@@ -182,11 +162,10 @@ def _frames(
 
 
 def euler_zxy_deg(rotation: Float) -> Float:
-    """Return the Euler angles (T, 3) [deg] about z, x, y of rotations (T, 3, 3).
+    """Euler angles (T, 3) [deg] about z, x, y of rotations R = R_z R_x R_y (T, 3, 3).
 
-    R = R_z R_x R_y; the angles have no jumps of a whole turn.
-
-    Where x is turned by a right angle, z and y are one axis, and y is taken as zero.
+    They have no jumps of a whole turn. Where x is turned by a right angle, z and y are one axis, and y is
+    taken as zero.
     """
     sine = np.clip(rotation[:, 2, 1], -1.0, 1.0)
     level = 1.0 - np.abs(sine) > 1e-12

@@ -29,14 +29,10 @@ def export(options: Namespace) -> None:
         from master.recording.export import truth
         from master.recording.export.take import Window
 
-        part, how = (
-            Window(options.from_s, options.to_s),
-            Reading(options.joints, options.unit, options.side, options.rate),
-        )
         wanted = truth.Wanted(
-            how,
+            Reading(options.joints, options.unit, options.side, options.rate),
             tuple(options.only or ()),
-            part,
+            Window(options.from_s, options.to_s),
             options.aligned,
             options.calibration,
             tuple(options.rig or ()),
@@ -56,14 +52,11 @@ def export(options: Namespace) -> None:
         (options.json_file, "--json"),
     ):
         _refuse(bool(given), option, "--compare", f"--to {options.to}")
-    _refuse(
-        options.to not in _MOTION and options.rate is not None, "--rate", "bvh and gltf", f"--to {options.to}"
-    )
-    _refuse(
-        options.to not in _MOTION and options.up is not None, "--up", "bvh and gltf", f"--to {options.to}"
-    )
-    _refuse(options.to != "bvh" and options.unit is not None, "--unit", "bvh", f"--to {options.to}")
-    _refuse(options.to != "rrd" and bool(options.rig), "--rig", "rrd", f"--to {options.to}")
+    to, this = options.to, f"--to {options.to}"
+    _refuse(to not in _MOTION and options.rate is not None, "--rate", "bvh and gltf", this)
+    _refuse(to not in _MOTION and options.up is not None, "--up", "bvh and gltf", this)
+    _refuse(to != "bvh" and options.unit is not None, "--unit", "bvh", this)
+    _refuse(to != "rrd" and bool(options.rig), "--rig", "rrd", this)
     # Imported here: what writes these formats takes a second to load, which no other command should wait for.
     from master.recording.export.bvh import Axes
     from master.recording.export.run import Wanted
@@ -91,20 +84,14 @@ def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
 
 
 class _Progress:
-    """Progress bar of an export, and the lines of what is done.
-
-    Holds when the bar was drawn last.
-    """
+    """Progress bar of an export, and the lines of what is done."""
 
     def __init__(self) -> None:
         self._line = ProgressLine(sys.stderr, "export")
         self._shown_ns = now_ns()
 
     def update(self, what: str, done: int, total: int) -> None:
-        """Redraw the progress bar.
-
-        Where no terminal shows the bar in place it is omitted: files are written in seconds.
-        """
+        """Redraw the bar, on a terminal only: files are written in seconds."""
         every_ns = 100_000_000
         if sys.stderr.isatty() and now_ns() - self._shown_ns > every_ns:
             self._shown_ns = now_ns()

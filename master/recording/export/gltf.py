@@ -1,20 +1,13 @@
 """glTF 2.0 holds a hand as an animated model with a skin mesh.
 
-Simple skin mesh for a skeleton.
+Blender, Unity, Unreal, Godot, three.js and model viewers read it. Its skeleton is 26 nodes named and turned
+like the joints of OpenXR, in metres; its bind pose is the rest pose of the hand profile. Each pose is a key
+at its own time, in seconds from the first; between keys a reader goes linearly in the frame of the parent,
+over a gap the hand stands still. A joint has keys of its place only where its bone is not rigid.
 
-Closed convex pieces lie over the bones, each the hull of a few spheres.
-
-Of a finger's bone these are the spheres of its two joints, a round cone; the palm is made of the hulls over
-the wrist and neighbouring metacarpals, the ball of the thumb of one between thumb and palm. The pieces overlap,
+The skin is closed convex pieces over the bones, each the hull of a few spheres: of a finger's bone those of
+its two joints; over the wrist and neighbouring metacarpals; and the ball of the thumb. The pieces overlap,
 and a sphere moves with one joint, so that nothing opens where a joint bends.
-
-glTF 2.0 export of a hand as an animated, skinned model.
-
-Blender, Unity, Unreal, Godot, three.js and model viewers read it.
-
-Its skeleton is 26 nodes named and turned like the joints of OpenXR, in metres; its bind pose is the rest pose of the
-hand profile. Each pose is a key at its own time, in seconds from the first; between keys a reader goes linearly in the
-frame of the parent, over a gap the hand stands still. A joint has keys of its place only where its bone is not rigid.
 """
 
 from dataclasses import dataclass, field
@@ -24,31 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from pygltflib import (
-    ARRAY_BUFFER,
-    ELEMENT_ARRAY_BUFFER,
-    FLOAT,
-    GLTF2,
-    UNSIGNED_BYTE,
-    UNSIGNED_INT,
-    Accessor,
-    Animation,
-    AnimationChannel,
-    AnimationChannelTarget,
-    AnimationSampler,
-    Asset,
-    Attributes,
-    Buffer,
-    BufferFormat,
-    BufferView,
-    Material,
-    Mesh,
-    Node,
-    PbrMetallicRoughness,
-    Primitive,
-    Scene,
-)
-from pygltflib import Skin as GltfSkin
+import pygltflib as gl
 from scipy.spatial import ConvexHull
 
 from common.arrays import Float, Int
@@ -74,27 +43,17 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """Triangles over a hand at rest.
+    """Triangles over a hand at rest."""
 
-    Attributes:
-        vertex_m: (V, 3) [m], palm frame.
-        normal: (V, 3) outward unit normals.
-        joint: (V,) the joint that a vertex moves with.
-        triangle: (F, 3) vertices, anticlockwise as seen from outside.
-    """
-
-    vertex_m: Float
-    normal: Float
-    joint: Int
-    triangle: Int
+    vertex_m: Float  # (V, 3) [m], palm frame
+    normal: Float  # (V, 3) outward unit normals
+    joint: Int  # (V,) the joint that a vertex moves with
+    triangle: Int  # (F, 3) vertices, anticlockwise as seen from outside
 
 
 @dataclass(frozen=True, slots=True)
 class _Ball:
-    """A sphere of skin.
-
-    It has a centre (3,) [m] in the palm frame, a radius [m], and the joint that it moves with.
-    """
+    """A sphere of skin in the palm frame, and the joint that it moves with."""
 
     centre_m: Float
     radius_m: float
@@ -114,10 +73,7 @@ def skin_of(skeleton: Skeleton) -> Skin:
 
 
 def _fingers(skeleton: Skeleton) -> list[list[_Ball]]:
-    """Return the spheres of the finger bones.
-
-    The thumb's metacarpal is among the bones; both ends of a bone move with the nearer joint.
-    """
+    """Spheres of finger bones and thumb metacarpal, both ends on the nearer joint."""
     bones = [
         bone
         for chain in FINGER_JOINTS
@@ -127,10 +83,7 @@ def _fingers(skeleton: Skeleton) -> list[list[_Ball]]:
 
 
 def _palm(skeleton: Skeleton) -> list[list[_Ball]]:
-    """Return the spheres of the palm.
-
-    They are what is rigid with the wrist, and the ball of the thumb, which is pulled between both.
-    """
+    """Spheres of what is rigid with the wrist, and of the ball of the thumb."""
     fingers = FINGER_JOINTS[1:]
     bones = [[_ball(skeleton, joint, WRIST) for joint in chain[:2]] for chain in fingers]
     wrist = _wrist(skeleton)
@@ -148,10 +101,7 @@ def _palm(skeleton: Skeleton) -> list[list[_Ball]]:
 
 
 def _wrist(skeleton: Skeleton) -> list[_Ball]:
-    """Return two spheres across the wrist.
-
-    They are as wide as the wrist's radius states, and flat.
-    """
+    """Two spheres across the wrist, as wide as its radius states, and flat."""
     radius = float(skeleton.radius_m[WRIST])
     flat = 0.62  # a wrist is flat: of its radius, two such spheres side by side
     aside = np.array([(1.0 - flat) * radius, 0.0, 0.0])
@@ -170,10 +120,7 @@ def _between(skeleton: Skeleton, a: int, b: int, joint: int) -> _Ball:
 
 
 def _hull(balls: list[_Ball]) -> Skin:
-    """Return the convex hull of spheres.
-
-    The normals are the spheres' own, so that the hull looks round.
-    """
+    """Convex hull of spheres, with the spheres' own normals, so that it looks round."""
     directions = _directions()
     points = np.concatenate([ball.centre_m + ball.radius_m * directions for ball in balls])
     normals = np.tile(directions, (len(balls), 1))
@@ -187,10 +134,7 @@ def _hull(balls: list[_Ball]) -> Skin:
 
 
 def _convex(points: Float) -> tuple[Int, Int]:
-    """Return the convex hull of points (N, 3).
-
-    The result is the indices (V,) of the points on the hull, and its triangles (F, 3) of those.
-    """
+    """Indices (V,) of points (N, 3) on their convex hull, and its triangles (F, 3)."""
     hull: Any = ConvexHull(points)  # scipy has no types
     used: Int = np.array(hull.vertices, np.int64)
     place = np.zeros(len(points), np.int64)
@@ -200,10 +144,7 @@ def _convex(points: Float) -> tuple[Int, Int]:
 
 
 def _directions() -> Float:
-    """Return unit vectors (_ROUND, 3) in all directions.
-
-    They lie on a spiral from pole to pole (Fibonacci's).
-    """
+    """Unit vectors (_ROUND, 3) on Fibonacci's spiral from pole to pole."""
     z = 1.0 - 2.0 * (np.arange(_ROUND) + 0.5) / _ROUND
     across, angle = np.sqrt(1.0 - z * z), _GOLDEN * np.arange(_ROUND)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
@@ -211,26 +152,26 @@ def _directions() -> Float:
 
 _COLOUR = [0.80, 0.62, 0.52, 1.0]
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_TYPES = {"f": FLOAT, "I": UNSIGNED_INT, "B": UNSIGNED_BYTE}
+_TYPES = {"f": gl.FLOAT, "I": gl.UNSIGNED_INT, "B": gl.UNSIGNED_BYTE}
 
 
 @dataclass(slots=True)
 class _Data:
     """The model's bytes so far, and what stands where in them."""
 
-    gltf: GLTF2
+    gltf: gl.GLTF2
     blob: bytearray = field(default_factory=bytearray)
 
     def add(self, array: npt.NDArray[np.generic], target: int | None = None, *, bounds: bool = False) -> int:
         """Append the rows of an array; return the number of its accessor."""
         self.gltf.bufferViews.append(
-            BufferView(buffer=0, byteOffset=len(self.blob), byteLength=array.nbytes, target=target)
+            gl.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=array.nbytes, target=target)
         )
         self.blob += array.tobytes()
         self.blob += b"\0" * (-len(self.blob) % 4)
         width = int(np.prod(array.shape[1:]))
         rows = array.reshape(len(array), width)
-        accessor = Accessor(
+        accessor = gl.Accessor(
             bufferView=len(self.gltf.bufferViews) - 1,
             componentType=_TYPES[array.dtype.char],
             count=len(array),
@@ -243,15 +184,9 @@ class _Data:
 
 
 def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[int, ...]:
-    """Write a motion as .glb or .gltf, by the name of the file.
+    """Write a motion, rig frame, as .glb or .gltf with all data, by the file's name.
 
-    A .gltf has all data inside.
-
-    Args:
-        path: The file; replaced only by a complete one.
-        motion: Rig frame, one time or more.
-        skeleton: The hand at rest.
-        up: See `bvh.Axes`; y is what glTF means.
+    `up`: see `bvh.Axes`; y is what glTF means.
 
     Returns:
         The joints, without the wrist, that have keys of their place because their bone is not rigid.
@@ -259,15 +194,17 @@ def write_gltf(path: Path, motion: Motion, skeleton: Skeleton, up: Up) -> tuple[
     Raises:
         OSError: It cannot be written; nothing half written is left.
     """
-    data = _Data(GLTF2(asset=Asset(version="2.0", generator="Phalanx", extras=_about(motion, skeleton, up))))
+    data = _Data(
+        gl.GLTF2(asset=gl.Asset(version="2.0", generator="Phalanx", extras=_about(motion, skeleton, up)))
+    )
     _nodes(data, skeleton)
     _skin(data, skeleton, skin_of(skeleton))
     free = _animation(data, local(with_holds(upright(motion, up))), skeleton)
-    data.gltf.buffers.append(Buffer(byteLength=len(data.blob)))
+    data.gltf.buffers.append(gl.Buffer(byteLength=len(data.blob)))
     data.gltf.set_binary_blob(bytes(data.blob))
     with replacing(path) as file:
         if path.suffix == ".gltf":
-            data.gltf.convert_buffers(BufferFormat.DATAURI)
+            data.gltf.convert_buffers(gl.BufferFormat.DATAURI)
             file.write(data.gltf.gltf_to_json().encode())
         else:
             file.writelines(cast(list[bytes], data.gltf.save_to_bytes()))
@@ -285,10 +222,7 @@ def _about(motion: Motion, skeleton: Skeleton, up: Up) -> dict[str, object]:
 
 
 def with_holds(motion: Motion) -> Motion:
-    """Return the motion with a hold key just before the end of every gap.
-
-    At that key the hand is still as it was at the beginning of the gap.
-    """
+    """Add a key just before the end of every gap: the hand as at its beginning."""
     gaps = np.flatnonzero(np.diff(motion.t_ns) > motion.gap_ns)
     rows = np.sort(np.concatenate([np.arange(len(motion)), gaps]))
     t_ns = motion.t_ns[rows].copy()
@@ -306,7 +240,7 @@ def _nodes(data: _Data, skeleton: Skeleton) -> None:
     at, q = _rest(skeleton)
     for joint in range(len(JOINTS)):
         data.gltf.nodes.append(
-            Node(
+            gl.Node(
                 name=name_of(joint),
                 translation=at[joint].tolist(),
                 rotation=_xyzw(q[joint]).tolist(),
@@ -314,17 +248,15 @@ def _nodes(data: _Data, skeleton: Skeleton) -> None:
             )
         )
     mesh, whole = len(JOINTS), len(JOINTS) + 1
-    data.gltf.nodes.append(Node(name=f"{skeleton.hand} skin", mesh=0, skin=0))
-    data.gltf.nodes.append(Node(name=skeleton.hand, children=[WRIST]))
-    data.gltf.scenes.append(Scene(nodes=[whole, mesh]))  # a skinned mesh goes by its joints, not by a parent
+    data.gltf.nodes.append(gl.Node(name=f"{skeleton.hand} skin", mesh=0, skin=0))
+    data.gltf.nodes.append(gl.Node(name=skeleton.hand, children=[WRIST]))
+    # a skinned mesh goes by its joints, not by a parent
+    data.gltf.scenes.append(gl.Scene(nodes=[whole, mesh]))
     data.gltf.scene = 0
 
 
 def _rest(skeleton: Skeleton) -> tuple[Float, Float]:
-    """Return the joints at rest in the frame of their parent: (26, 3) [m], (26, 4).
-
-    The wrist is in the palm's frame.
-    """
+    """Joints at rest to their parent, the wrist to the palm: (26, 3) [m], (26, 4)."""
     at, q = skeleton.position_m.copy(), skeleton.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         there = back(skeleton.orientation_wxyz[parent])
@@ -343,17 +275,20 @@ def _skin(data: _Data, skeleton: Skeleton, skin: Skin) -> None:
     joints[:, 0] = skin.joint
     weights = np.zeros((len(skin.joint), 4), "<f4")
     weights[:, 0] = 1.0
-    attributes = Attributes(
-        POSITION=data.add(skin.vertex_m.astype("<f4"), ARRAY_BUFFER, bounds=True),
-        NORMAL=data.add(skin.normal.astype("<f4"), ARRAY_BUFFER),
-        JOINTS_0=data.add(joints, ARRAY_BUFFER),
-        WEIGHTS_0=data.add(weights, ARRAY_BUFFER),
+    attributes = gl.Attributes(
+        POSITION=data.add(skin.vertex_m.astype("<f4"), gl.ARRAY_BUFFER, bounds=True),
+        NORMAL=data.add(skin.normal.astype("<f4"), gl.ARRAY_BUFFER),
+        JOINTS_0=data.add(joints, gl.ARRAY_BUFFER),
+        WEIGHTS_0=data.add(weights, gl.ARRAY_BUFFER),
     )
-    triangles = data.add(skin.triangle.astype("<u4").reshape(-1, 1), ELEMENT_ARRAY_BUFFER)
-    look = PbrMetallicRoughness(baseColorFactor=_COLOUR, metallicFactor=0.0, roughnessFactor=0.65)
-    data.gltf.materials.append(Material(name="skin", pbrMetallicRoughness=look))
+    triangles = data.add(skin.triangle.astype("<u4").reshape(-1, 1), gl.ELEMENT_ARRAY_BUFFER)
+    look = gl.PbrMetallicRoughness(baseColorFactor=_COLOUR, metallicFactor=0.0, roughnessFactor=0.65)
+    data.gltf.materials.append(gl.Material(name="skin", pbrMetallicRoughness=look))
     data.gltf.meshes.append(
-        Mesh(name=skeleton.hand, primitives=[Primitive(attributes=attributes, indices=triangles, material=0)])
+        gl.Mesh(
+            name=skeleton.hand,
+            primitives=[gl.Primitive(attributes=attributes, indices=triangles, material=0)],
+        )
     )
     bind = np.zeros((len(JOINTS), 4, 4))
     rotation = quaternion_to_matrix(skeleton.orientation_wxyz).swapaxes(1, 2)
@@ -361,7 +296,7 @@ def _skin(data: _Data, skeleton: Skeleton, skin: Skin) -> None:
     bind[:, :3, 3] = -(rotation @ skeleton.position_m[..., None])[..., 0]
     by_columns = np.ascontiguousarray(bind.swapaxes(1, 2)).astype("<f4").reshape(-1, 16)
     data.gltf.skins.append(
-        GltfSkin(
+        gl.Skin(
             name=skeleton.hand,
             skeleton=WRIST,
             joints=list(range(len(JOINTS))),
@@ -374,7 +309,7 @@ def _animation(data: _Data, own: Motion, skeleton: Skeleton) -> tuple[int, ...]:
     """Keys of all that moves; what stands still is set in its node."""
     at, q = _rest(skeleton)
     times_s = ((own.t_ns - own.t_ns[0]) * 1e-9).astype("<f4")
-    clip = Animation(name=skeleton.hand)
+    clip = gl.Animation(name=skeleton.hand)
     keys = data.add(times_s.reshape(-1, 1), bounds=True)
     free: list[int] = []
     for joint in range(len(JOINTS)):
@@ -391,7 +326,7 @@ def _animation(data: _Data, own: Motion, skeleton: Skeleton) -> tuple[int, ...]:
     return tuple(free)
 
 
-def _channel(data: _Data, clip: Animation, keys: int, joint: int, path: str, values: Float) -> None:
-    clip.samplers.append(AnimationSampler(input=keys, output=data.add(values.astype("<f4"))))
-    target = AnimationChannelTarget(node=joint, path=path)
-    clip.channels.append(AnimationChannel(sampler=len(clip.samplers) - 1, target=target))
+def _channel(data: _Data, clip: gl.Animation, keys: int, joint: int, path: str, values: Float) -> None:
+    clip.samplers.append(gl.AnimationSampler(input=keys, output=data.add(values.astype("<f4"))))
+    target = gl.AnimationChannelTarget(node=joint, path=path)
+    clip.channels.append(gl.AnimationChannel(sampler=len(clip.samplers) - 1, target=target))

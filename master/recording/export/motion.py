@@ -1,20 +1,14 @@
 """A motion moves the skeleton of one hand without gaps, at any frame rate.
 
-The 26 joints as one tree at rest, the basis of BVH files and glTF skeletons.
+The 26 joints are one tree, the basis of BVH and glTF: the wrist is the root, palm, thumb and the metacarpals
+hang on it, every further joint on the one before it. Formats of animation know no "not observed": a joint
+that a pose does not have (not valid, or NaN) stays as it last was *to its parent*, so that it goes along with
+what is seen of the hand; before it was first seen it is as then, one that never was is at rest, and the wrist
+stays where it last was.
 
-The wrist is the root. Palm, thumb and the metacarpals hang on it, every further joint on the one before it.
-
-Motion of one hand without gaps, which can be resampled to any frame rate.
-
-Missing poses are held and counted.
-
-Formats of animation know no "not observed", every joint of every frame must be somewhere. A joint that a pose does not
-have (not valid, or NaN) stays as it last was *to its parent*, so that it goes along with what is seen of the hand;
-before it was first seen it is as then, and one that never was is at rest. The wrist stays where it last was.
-
-Between two poses each joint is interpolated in the frame of its parent, its place linearly, its turn along the
-shortest arc: bones that are rigid in the poses stay rigid between them, which they would not between places in the rig
-frame. Over a gap in time nothing is interpolated: the hand stands still.
+Between two poses each joint is interpolated in the frame of its parent, its place linearly, its turn along
+the shortest arc: bones that are rigid in the poses stay rigid between them, which they would not between
+places in the rig frame. Over a gap in time nothing is interpolated: the hand stands still.
 """
 
 from collections.abc import Iterable
@@ -41,21 +35,13 @@ CHILDREN: dict[int, tuple[int, ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skeleton:
-    """A hand at rest, in its palm frame.
-
-    Attributes:
-        hand: Name of the hand profile.
-        side: right or left.
-        position_m: (26, 3) [m], palm frame.
-        orientation_wxyz: (26, 4) joint -> palm frame.
-        radius_m: (26,) [m].
-    """
+    """A hand at rest, in its palm frame."""
 
     hand: str
-    side: str
-    position_m: Float
-    orientation_wxyz: Float
-    radius_m: Float
+    side: str  # right or left
+    position_m: Float  # (26, 3) [m]
+    orientation_wxyz: Float  # (26, 4) joint -> palm frame
+    radius_m: Float  # (26,) [m]
 
     @classmethod
     def of(cls, model: HandModel) -> "Skeleton":
@@ -69,12 +55,8 @@ class Skeleton:
         )
 
     def ahead_m(self, joint: int) -> Float:
-        """Return the vector from a joint to the end of its flesh (3,) [m].
-
-        It is in the palm frame: the joint's radius along its -z.
-        """
-        rotated = rotate(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
-        return self.radius_m[joint] * rotated
+        """From a joint to the end of its flesh along its -z (3,) [m], palm frame."""
+        return self.radius_m[joint] * rotate(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
 
 
 def name_of(joint: int) -> str:
@@ -116,38 +98,26 @@ FREE_FRAMES, FRAMES_OF_POSE = 36_000, 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Motion of one hand at T epochs, with all joints at every epoch.
+    """Motion of one hand at T epochs, with all joints at every epoch."""
 
-    Attributes:
-        t_ns: (T,) [ns], rising.
-        position_m: (T, 26, 3) [m], rig frame; of `local` in the frame of the joint's parent, the wrist in the rig's.
-        orientation_wxyz: (T, 26, 4) unit quaternions, joint -> the same frame.
-        held: (T, 26) not observed at that time.
-        gap_ns: Two times that are farther apart have nothing between them.
-    """
-
-    t_ns: Int
+    t_ns: Int  # (T,) [ns], rising
+    # (T, 26, 3) [m], rig frame; of `local` in the frame of the joint's parent, the wrist in the rig's
     position_m: Float
-    orientation_wxyz: Float
-    held: Bool
-    gap_ns: int
+    orientation_wxyz: Float  # (T, 26, 4) unit quaternions, joint -> the same frame
+    held: Bool  # (T, 26) not observed at that time
+    gap_ns: int  # two times that are farther apart have nothing between them
 
     def __len__(self) -> int:
         return len(self.t_ns)
 
     @property
     def held_frames(self) -> int:
-        """Return the number of epochs at which some joint is held."""
+        """Number of epochs at which some joint is held."""
         return int(self.held.any(axis=1).sum())
 
     @property
     def rate_hz(self) -> float:
-        """Return the frame rate of the poses where they are densest.
-
-        A late pose thus makes no file coarser. The rate is rounded where it is nearly a whole number.
-
-        60 where there is one pose alone.
-        """
+        """Rate where the poses are densest: one late pose makes no file coarser."""
         if len(self) < 2:
             return 60.0
         dense, most_hz = 10.0, 1000.0  # per cent of the steps
@@ -156,13 +126,7 @@ class Motion:
 
 
 def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
-    """Return all poses of a hand as a motion, in order of time.
-
-    Of two poses at one epoch the later one is taken.
-
-    Raises:
-        RecordingError: No pose has a wrist that may be used.
-    """
+    """All poses of a hand, the later of two at one epoch; RecordingError: none valid."""
     t_ns, position, orientation, usable = _stacked(batches)
     if not usable[:, WRIST].any():
         raise RecordingError(f"hand {skeleton.hand!r}: none of its {len(t_ns)} poses is valid")
@@ -185,10 +149,7 @@ def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
 
 
 def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
-    """Return times, positions, rotations and their usable mask, in order of time.
-
-    Where a pose may not be used it is the identity.
-    """
+    """Times, positions, rotations, usable mask in time order; identity: not usable."""
     parts = [
         (poses.t_ns, poses.position_m, poses.orientation_wxyz, poses.valid) for poses in batches if len(poses)
     ]
@@ -207,10 +168,7 @@ def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
 
 
 def _last(good: Bool) -> Int:
-    """Return for each row the index of the last good row up to it (T,).
-
-    Where there is none yet, it is the first good one of all; at least one is good.
-    """
+    """Index (T,) of the last good row so far; before any, of the first good one."""
     rows = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))
     return np.where(rows < 0, np.argmax(good), rows)
 
@@ -218,10 +176,7 @@ def _last(good: Bool) -> Int:
 def _held(
     joint: int, usable: Bool, position: Float, orientation: Float, skeleton: Skeleton
 ) -> tuple[Float, Float]:
-    """Return the last pose of a joint relative to its parent, (T, 3) and (T, 4).
-
-    It is the last one at which both were seen, or the rest pose if they never were.
-    """
+    """Last seen pose (T, 3), (T, 4) of a joint to its parent; at rest if never."""
     parent = PARENT[joint]
     both = usable[:, joint] & usable[:, parent]
     if not both.any():
@@ -231,17 +186,11 @@ def _held(
         return np.tile(at, shape), np.tile(times(q, skeleton.orientation_wxyz[joint]), shape)
     row = _last(both)
     q = back(orientation[row, parent])
-    return (
-        rotate(q, position[row, joint] - position[row, parent]),
-        times(q, orientation[row, joint]),
-    )
+    return rotate(q, position[row, joint] - position[row, parent]), times(q, orientation[row, joint])
 
 
 def local(motion: Motion) -> Motion:
-    """Return each joint in the frame of its parent.
-
-    The wrist is in the rig frame; quaternions have no jumps of sign.
-    """
+    """Each joint in its parent's frame; quaternions have no jumps of sign."""
     position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         q = back(motion.orientation_wxyz[:, parent])
@@ -263,15 +212,9 @@ def world(motion: Motion) -> Motion:
 
 
 def resample(motion: Motion, rate_hz: float) -> Motion:
-    """Resample the motion at a constant rate from its first epoch on.
+    """Resample a motion in the rig frame at a constant rate from its first epoch on.
 
-    It ends at most at its last epoch.
-
-    A frame is held where one of the two poses beside it is, and in a gap.
-
-    Args:
-        motion: In the rig frame.
-        rate_hz: Positive.
+    It ends at most at its last epoch. A frame is held where one of the two poses beside it is, and in a gap.
 
     Raises:
         RecordingError: That would be more frames than fit in memory.
@@ -305,10 +248,7 @@ def _between(values: Float, before: Int, after: Int, share: Float) -> Float:
 
 
 def slerp(first: Float, second: Float, share: Float) -> Float:
-    """Interpolate unit quaternions (..., 4) on the shorter arcs.
-
-    Shares (...) are of the way between the two (Shoemake, 1985).
-    """
+    """Interpolate unit quaternions (..., 4) on the shorter arcs (Shoemake, 1985)."""
     cosine = np.vecdot(first, second)
     second = np.where(cosine[..., None] < 0.0, -second, second)
     angle = np.arccos(np.minimum(np.abs(cosine), 1.0))

@@ -42,44 +42,28 @@ _FRAME = "rig: that of the reference camera, x right, y down, z into the scene; 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is to be exported, and as what.
-
-    Attributes:
-        kind: The format.
-        out: File or folder; None: beside the source.
-        only: Hands; none: all.
-        profiles: Files of hands that go before those of the calibration.
-        calibration: Tree for what the source does not carry itself.
-        rigs: That the source was made with; none: those that it carries.
-        window: The part of time.
-        rate_hz: Of a motion; None: that of the poses.
-        axes: Of a motion.
-    """
+    """What is to be exported, and as what."""
 
     kind: Kind
-    out: Path | None = None
-    only: tuple[str, ...] = ()
-    profiles: tuple[Path, ...] = ()
-    calibration: Path = Path("calib_json")
-    rigs: tuple[str, ...] = ()
+    out: Path | None = None  # file or folder; None: beside the source
+    only: tuple[str, ...] = ()  # hands; none: all
+    profiles: tuple[Path, ...] = ()  # files of hands that go before those of the calibration
+    calibration: Path = Path("calib_json")  # tree for what the source does not carry itself
+    rigs: tuple[str, ...] = ()  # that the source was made with; none: those that it carries
     window: Window = field(default_factory=Window)
-    rate_hz: float | None = None
-    axes: Axes = field(default_factory=Axes)
+    rate_hz: float | None = None  # of a motion; None: that of the poses
+    axes: Axes = field(default_factory=Axes)  # of a motion
 
 
 def export(
     source: Path, wanted: Wanted, notify: Callable[[str], None], progress: ProgressCallback
 ) -> tuple[Path, ...]:
-    """Export a source.
+    """Export a source; return the files, in the order of writing.
 
     Args:
         source: poses.npz of a run, or an .mcap recording.
-        wanted: What of it, and how.
         notify: Called with each file that is there, and what is to be known of it.
         progress: Called with what is being done, and how much of how much.
-
-    Returns:
-        The files, in the order of writing.
 
     Raises:
         RecordingError: The source cannot be read, has nothing of the kind, or a file cannot be written.
@@ -104,11 +88,7 @@ def export(
 
 
 def _chosen(take: Take, only: tuple[str, ...], source: Path) -> tuple[str, ...]:
-    """The hands that are wanted.
-
-    Raises:
-        RecordingError: One is not there, or its name is none.
-    """
+    """The wanted hands; RecordingError: one is not there, or its name is none."""
     for hand in take.hands:
         _refuse_path(hand, source)
     for hand in only:
@@ -119,13 +99,7 @@ def _chosen(take: Take, only: tuple[str, ...], source: Path) -> tuple[str, ...]:
 
 
 def _refuse_path(name: str, source: Path) -> None:
-    """Refuse a name that is a path.
-
-    Names become part of file names: a foreign file must not control where other files are read and written.
-
-    Raises:
-        RecordingError: It is a path.
-    """
+    """A name of a foreign file must not control where files are read and written."""
     if not name or Path(name).name != name:
         raise RecordingError(
             f"{source}: {name!r} is no name of a hand or an object: it is not a file of ours"
@@ -133,12 +107,7 @@ def _refuse_path(name: str, source: Path) -> None:
 
 
 def _target(source: Path, wanted: Wanted) -> Path:
-    """The file of the first hand.
-
-    Raises:
-        PhalanxError: A name that does not fit the format.
-        RecordingError: There is no such folder and it cannot be made.
-    """
+    """The file of the first hand; errors as of `export`."""
     suffixes, out = SUFFIXES[wanted.kind], wanted.out
     if out is None:
         return source.with_suffix(suffixes[0])
@@ -171,10 +140,7 @@ def _tables(
     notify: Callable[[str], None],
     progress: ProgressCallback,
 ) -> tuple[Path, ...]:
-    """Write a table for each hand, object and pair of both.
-
-    One table of gestures is added where there are any.
-    """
+    """Write a table for each hand, object, pair of both, and for gestures if any."""
     begin, written = take.begin_t_ns, list[Path]()
 
     def write(path: Path, what: str, empty: list[Column], rows: Iterable[list[Column]]) -> None:
@@ -213,10 +179,7 @@ def _no_poses(hand: str) -> Poses:
 
 
 def _counted(take: Take, hand: str, progress: ProgressCallback) -> Iterator[Poses]:
-    """Yield the poses of a hand and report progress.
-
-    The progress is how many poses were read.
-    """
+    """Yield the poses of a hand and report how many were read."""
     done, total = 0, take.count(hand)
     for batch in take.batches(hand):
         yield batch
@@ -279,11 +242,7 @@ def _named(joints: tuple[int, ...]) -> str:
 
 
 def skeleton_of(hand: str, tree: Path, profiles: tuple[Path, ...]) -> Skeleton:
-    """The hand at rest, of a file that is given or else of the tree's hands/.
-
-    Raises:
-        CalibrationError: There is no profile of that hand, or it is broken.
-    """
+    """Hand at rest, of a given file or else the tree's hands/; CalibrationError."""
     given = {path: load(path, HandProfile) for path in profiles}
     for path, profile in given.items():
         if profile.name == hand:

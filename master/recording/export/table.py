@@ -1,17 +1,9 @@
 """Tables hold named columns with units and are written as CSV or Parquet.
 
-Columns of the exported tables: names, contents, units and frames.
-
-The tables are tidy: one row for each epoch.
-
-A name is what it is of, the quantity, and its unit: `index_finger_tip_x_m`. Joints are those of docs/frames.md with _
-for -. What was not observed is empty: NaN becomes no value at all.
-
-Writer of tables of columns as CSV or Parquet, batch by batch.
-
-This is the only file of the project that depends on pyarrow.
-
-A Parquet column carries its unit, frame and meaning as metadata, the file what it is of. A CSV has names alone.
+Tidy tables: one row for each epoch. A name is what it is of, the quantity, and its unit:
+`index_finger_tip_x_m`. Joints are those of docs/frames.md with _ for -. What was not observed is empty: NaN
+becomes no value at all. A Parquet column carries its unit, frame and meaning as metadata, the file what it is
+of; a CSV has names alone.
 """
 
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -44,21 +36,13 @@ _OBJECT_SOURCES = np.array([one.name.lower() for one in ObjectSource])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """One column of a table.
-
-    Attributes:
-        name: Its name.
-        values: (T,) numbers, truth values or texts; NaN: not observed.
-        unit: ns, s, m, rad or nothing.
-        frame: In which its numbers are, or nothing.
-        text: What it is.
-    """
+    """One column of a table."""
 
     name: str
-    values: npt.NDArray[Any]
-    unit: str = ""
-    frame: str = ""
-    text: str = ""
+    values: npt.NDArray[Any]  # (T,) numbers, truth values or texts; NaN: not observed
+    unit: str = ""  # ns, s, m, rad or nothing
+    frame: str = ""  # in which its numbers are, or nothing
+    text: str = ""  # what it is
 
 
 def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
@@ -68,16 +52,8 @@ def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
         out += _joint_columns(poses, joint, title)
     for finger, title in enumerate(FINGERS):
         names = _ANGLES if finger else _THUMB_ANGLES
-        out += [
-            Column(
-                f"{title}_{name}_rad",
-                poses.angles_rad[:, finger, k],
-                "rad",
-                "",
-                "angle, zero in the rest pose",
-            )
-            for k, name in enumerate(names)
-        ]
+        angles, text = poses.angles_rad[:, finger], "angle, zero in the rest pose"
+        out += [Column(f"{title}_{name}_rad", angles[:, k], "rad", "", text) for k, name in enumerate(names)]
     out += [
         Column(f"wrist_{name}_rad", poses.wrist_angles_rad[:, k], "rad", "forearm", "bend of the wrist")
         for k, name in enumerate(("flexion", "deviation"))
@@ -222,17 +198,12 @@ def write_table(
     batches: Iterable[Sequence[Column]],
     about: Mapping[str, str],
 ) -> int:
-    """Write a table.
+    """Write a table; return how many rows were written.
 
     Args:
-        path: The file; replaced only by a complete one.
-        kind: csv or parquet.
         empty: The columns, with no rows or any: what an empty table consists of.
         batches: The rows, each batch with the same columns.
         about: What the table is, for the metadata of a Parquet file.
-
-    Returns:
-        How many rows were written.
 
     Raises:
         OSError: It cannot be written; nothing half written is left.
@@ -250,9 +221,8 @@ def write_table(
 @contextmanager
 def _writer(kind: TableKind, file: object, schema: object) -> Generator[_Writer]:
     """The library's writer into an open file."""
-    writer: _Writer
     opens = {"csv": _csv.CSVWriter, "parquet": partial(_parquet.ParquetWriter, compression="zstd")}
-    writer = opens[kind](file, schema)
+    writer: _Writer = opens[kind](file, schema)
     try:
         yield writer
     finally:

@@ -1,16 +1,10 @@
 """A take is the source of an export, a run or a recording, in a window.
 
-Time window of a source that is exported.
-
-It goes from and to a time, in seconds after the source's beginning.
-
-Sources of an export: the files of a run, or a recording of messages.
-
-They are read in batches, so that an hour fits.
+Both are read in batches, so that an hour fits.
 """
 
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from math import isfinite
@@ -36,7 +30,6 @@ from master.outputs.result_files import (
     GESTURES,
     Contacts,
     ObjectPoses,
-    contact_record,
     load_contact,
     load_gesture_messages,
     load_object,
@@ -48,21 +41,14 @@ _Table = TypeVar("_Table", Poses, ObjectPoses, Contacts)
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A part of time.
+    """A part of time."""
 
-    Attributes:
-        from_s, to_s: Seconds after the source's beginning, both included; None: from there on, until its end.
-    """
-
+    # seconds after the source's beginning, both included; None: from there on, until its end
     from_s: float | None = None
     to_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what holds nothing.
-
-        Raises:
-            PhalanxError: Its end is before its beginning, or one of them is no number.
-        """
+        """Refuse what holds nothing; PhalanxError."""
         for option, value in (("--from", self.from_s), ("--until", self.to_s)):
             if value is not None and not isfinite(value):
                 raise PhalanxError(f"{option} {value}: give seconds, or leave it out")
@@ -134,11 +120,11 @@ class Take(Protocol):
         ...
 
     def contacts(self) -> list[Contacts]:
-        """Return the recorded contacts of hands and objects."""
+        """The contacts of hands and objects."""
         ...
 
     def gestures(self) -> list[Gesture]:
-        """Return the recorded gestures of the hands."""
+        """The gestures of the hands."""
         ...
 
     def detections(self) -> dict[str, list[Detections]]:
@@ -151,25 +137,17 @@ class Take(Protocol):
         ...
 
     def tree(self, given: Path) -> AbstractContextManager[Path]:
-        """Return the calibration tree with which the source was made.
-
-        It is the source's own, unpacked until the context ends, or else the tree that is given.
-        """
+        """Return the source's own calibration, unpacked for the context, or `given`."""
         ...
 
 
-class RunTake:
-    """Files of a run: its poses.npz and what lies beside it.
+class _RunTake:
+    """Files of a run: its poses.npz and what else the run wrote beside it."""
 
-    These are the poses of other hands, and everything else that the run wrote to the same folder.
-    """
+    remarks: tuple[str, ...] = ()
+    rigs: tuple[str, ...] = ()  # poses do not know
 
     def __init__(self, path: Path, window: Window) -> None:
-        """Read the poses.
-
-        Raises:
-            RecordingError: A file cannot be read, or is not ours.
-        """
         self._folder, self._window = path.parent, window
         first = load_poses(path)
         siblings = {
@@ -184,87 +162,51 @@ class RunTake:
 
     @property
     def hands(self) -> tuple[str, ...]:
-        """As of `Take`."""
         return tuple(self._poses)
 
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """None."""
-        return ()
-
     def count(self, hand: str) -> int:
-        """As of `Take`."""
         return len(self._poses[hand])
 
     def batches(self, hand: str) -> Iterator[Poses]:
-        """As of `Take`."""
         poses = self._poses[hand]
         for start in range(0, len(poses), _BATCH):
             yield poses.rows(start, min(start + _BATCH, len(poses)))
 
     def objects(self) -> list[ObjectPoses]:
-        """As of `Take`.
-
-        Raises:
-            RecordingError: A file is broken.
-        """
         found = [load_object(path) for path in sorted(self._folder.glob("object_*.npz"))]
         return [self._window.of(one, self.begin_t_ns) for one in found]
 
     def contacts(self) -> list[Contacts]:
-        """As of `Take`.
-
-        Raises:
-            RecordingError: A file is broken.
-        """
         found = [load_contact(path) for path in sorted(self._folder.glob("contact_*.npz"))]
         return [self._window.of(one, self.begin_t_ns) for one in found]
 
     def gestures(self) -> list[Gesture]:
-        """As of `Take`.
-
-        Raises:
-            RecordingError: The file is broken.
-        """
         path = self._folder / GESTURES
         found = load_gesture_messages(path) if path.exists() else []
-        return _inside(found, self._window, self.begin_t_ns)
+        good = self._window.inside(np.array([one.t_ns for one in found], np.int64), self.begin_t_ns)
+        return [one for one, yes in zip(found, good, strict=True) if yes]
 
     def detections(self) -> dict[str, list[Detections]]:
-        """None: a run keeps them nowhere."""
-        return {}
-
-    @property
-    def rigs(self) -> tuple[str, ...]:
-        """None: poses do not know."""
-        return ()
+        return {}  # a run keeps them nowhere
 
     def tree(self, given: Path) -> AbstractContextManager[Path]:
-        """The tree that is given."""
         return nullcontext(given)
 
 
-class MessageTake:
+class _MessageTake:
     """A recording of messages."""
 
     def __init__(self, path: Path, window: Window) -> None:
-        """Open it.
-
-        Raises:
-            RecordingError: It is no recording of ours.
-        """
         self._recording: MessageRecording = open_messages(path)
         self._window = window
         self.begin_t_ns = self._recording.begin_t_ns
 
     @property
     def hands(self) -> tuple[str, ...]:
-        """As of `Take`."""
         return tuple(self._recording.senders.get("hand", {}))
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Whether the file is whole."""
         lines: list[str] = []
         if self._recording.cut:
             lines.append("the recording has no end (it broke off); all up to there is exported")
@@ -273,11 +215,10 @@ class MessageTake:
         return tuple(lines)
 
     def count(self, hand: str) -> int:
-        """As of `Take`."""
         return self._recording.senders["hand"][hand]
 
     def batches(self, hand: str) -> Iterator[Poses]:
-        """As of `Take`; a new one begins where the number of markers changes."""
+        """A new one begins where the number of markers changes."""
         batch: list[HandPose] = []
         for pose in self._read("hand", HandPose):
             if pose.hand != hand:
@@ -290,21 +231,18 @@ class MessageTake:
             yield Poses.of(batch)
 
     def objects(self) -> list[ObjectPoses]:
-        """As of `Take`."""
         found: dict[str, list[ObjectPose]] = {}
         for one in self._read("object", ObjectPose):
             found.setdefault(one.object, []).append(one)
         return [ObjectPoses.of(name, rows) for name, rows in found.items()]
 
     def contacts(self) -> list[Contacts]:
-        """As of `Take`."""
         found: dict[tuple[str, str], list[Contact]] = {}
         for one in self._read("contact", Contact):
             found.setdefault((one.hand, one.object), []).append(one)
-        return [_contacts(hand, name, rows) for (hand, name), rows in found.items()]
+        return [Contacts.of(hand, name, rows) for (hand, name), rows in found.items()]
 
     def gestures(self) -> list[Gesture]:
-        """As of `Take`."""
         return list(self._read("gesture", Gesture))
 
     def detections(self) -> dict[str, list[Detections]]:
@@ -316,16 +254,10 @@ class MessageTake:
 
     @property
     def rigs(self) -> tuple[str, ...]:
-        """Return the names of the rigs, as the recording states them."""
         return recorded_rigs(self._recording)
 
     @contextmanager
     def tree(self, given: Path) -> Generator[Path]:
-        """The recording's own; where it has none the tree that is given.
-
-        Raises:
-            RecordingError: Its files cannot be unpacked.
-        """
         if not self._recording.files:
             yield given
             return
@@ -347,29 +279,10 @@ class MessageTake:
                 yield message
 
 
-def _contacts(hand: str, name: str, rows: Sequence[Contact]) -> Contacts:
-    dtype = contact_record()
-    arrays = {
-        key: np.array([getattr(one, key) for one in rows], dtype[key].base) for key in dtype.names or ()
-    }
-    return Contacts(hand=hand, object=name, **arrays)
-
-
-def _inside(gestures: Sequence[Gesture], window: Window, begin_t_ns: int) -> list[Gesture]:
-    good = window.inside(np.array([one.t_ns for one in gestures], np.int64), begin_t_ns)
-    return [one for one, yes in zip(gestures, good, strict=True) if yes]
-
-
 def open_take(path: Path, window: Window) -> Take:
-    """Open a source.
-
-    An .mcap is a recording of messages, anything else is poses.npz of a run.
-
-    Raises:
-        RecordingError: There is no such file, or it is not ours.
-    """
+    """Open an .mcap recording of messages, or the poses.npz of a run; RecordingError."""
     if path.is_dir():
         raise RecordingError(f"{path}: is a folder; give the poses.npz of a run, or an .mcap recording")
     if not path.exists():
         raise RecordingError(f"{path}: no such file; give the poses.npz of a run, or an .mcap recording")
-    return MessageTake(path, window) if path.suffix == ".mcap" else RunTake(path, window)
+    return _MessageTake(path, window) if path.suffix == ".mcap" else _RunTake(path, window)

@@ -1,10 +1,7 @@
-"""`phalanx export SOURCE --compare FILE`: poses against motion capture.
-
-The poses of a run are compared with a motion capture of the same hand.
-"""
+"""`phalanx export SOURCE --compare FILE`: poses against motion capture."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,38 +21,26 @@ _SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is stated
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is to be compared, and how.
+    """What is to be compared, and how."""
 
-    Attributes:
-        reading: How the motion capture is to be read.
-        hands: Name of the hand; none: the only one of the source.
-        window: The part of time of the source.
-        aligned: The file has the rig's frame, and the clock of the poses or seconds from their beginning.
-        calibration: Tree with rigs.
-        rigs: Name of the rig whose markers the poses have; none: the default six.
-    """
-
-    reading: Reading
-    hands: tuple[str, ...] = ()
+    reading: Reading  # how the motion capture is to be read
+    hands: tuple[str, ...] = ()  # name of the hand; none: the only one of the source
     window: Window = field(default_factory=Window)
+    # the file has the rig's frame, and the clock of the poses or seconds from their beginning
     aligned: bool = False
-    calibration: Path = Path("calib_json")
-    rigs: tuple[str, ...] = ()
+    calibration: Path = Path("calib_json")  # tree with rigs
+    rigs: tuple[str, ...] = ()  # name of the rig whose markers the poses have; none: the default six
 
 
 def compare_source(
     source: Path, truth: Path, wanted: Wanted, notify: Callable[[str], None]
 ) -> dict[str, object]:
-    """Compare a source with a motion capture.
+    """Compare a source with a motion capture; return all figures, for a program.
 
     Args:
         source: poses.npz of a run, or an .mcap recording.
         truth: The motion capture.
-        wanted: Of what, and how.
         notify: Called with a line at a time.
-
-    Returns:
-        All figures, for a program.
 
     Raises:
         RecordingError: The source or the motion capture cannot be read, or have no time or point in common.
@@ -92,11 +77,7 @@ def compare_source(
 
 
 def _poses(take: Take, hands: tuple[str, ...], source: Path) -> Poses:
-    """All poses of one hand.
-
-    Raises:
-        RecordingError: There are several hands and none is named, or none.
-    """
+    """All poses of one hand; RecordingError: several and none is named, or none."""
     there = ", ".join(take.hands) or "no hand"
     named = [hand for hand in take.hands if not hands or hand in hands]
     if len(named) != 1 or len(hands) > 1:
@@ -108,21 +89,11 @@ def _poses(take: Take, hands: tuple[str, ...], source: Path) -> Poses:
     count = batches[0].marker_count
     if any(batch.marker_count != count for batch in batches):
         raise RecordingError(f"{source}: its poses change their markers: compare a part, --from and --until")
-    arrays = {
-        one.name: np.concatenate([getattr(batch, one.name) for batch in batches])
-        for one in fields(Poses)
-        if one.name != "hand"
-    }
-    return Poses(hand=name, **arrays)
+    return Poses.joined(batches)
 
 
 def _marker_names(poses: Poses, wanted: Wanted) -> tuple[str, ...]:
-    """The markers of poses, in their order; none where it is not known.
-
-    Raises:
-        CalibrationError: The rig is missing or broken.
-        PhalanxError: Several rigs, or one with another number of markers.
-    """
+    """The markers of poses, in their order; none where it is not known."""
     if not wanted.rigs:
         return _SIX if poses.marker_count == len(_SIX) else ()
     rig, *others = wanted.rigs
@@ -135,13 +106,7 @@ def _marker_names(poses: Poses, wanted: Wanted) -> tuple[str, ...]:
 
 
 def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) -> tuple[Track, Track]:
-    """Return the points that both tracks have, in one order.
-
-    Of our poses the confident points are taken, where these are enough.
-
-    Raises:
-        RecordingError: None.
-    """
+    """The points that both have, in one order; tracked ones where they suffice."""
     valid = poses.valid & known(poses.position_m)
     sure = valid & poses.tracked
     enough = 0.1  # of the valid joints: if more are TRACKED, frame and clock are fitted by these alone
@@ -158,13 +123,7 @@ def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) ->
 
 
 def _own_clock(begin_t_ns: int, poses: Poses, motion: JointMotion) -> tuple[Alignment, str]:
-    """Align the clocks only; the frame is used as it is.
-
-    The clock is that of the poses, or seconds from the source's beginning, whichever shares more time.
-
-    Raises:
-        RecordingError: They have no time in common either way.
-    """
+    """Align clocks only: the poses', or seconds from their begin; most overlap wins."""
     first, last = (int(motion.t_ns[k]) for k in (0, -1))
     shared = {
         offset_ns: min(last + offset_ns, int(poses.t_ns[-1])) - max(first + offset_ns, int(poses.t_ns[0]))

@@ -36,7 +36,7 @@ from master.console.setup.files import (
     write_rig,
 )
 from master.console.setup.panel_colours import keep_colours, pixel_of, ranges_of
-from master.console.setup.session import Done, steps_of, usable
+from master.console.setup.session import Done, steps_of
 
 LENS = Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=320.0, cy_px=240.0)
 RANGE = HsvRange(hsv_low=(10, 60, 60), hsv_high=(20, 255, 255))
@@ -96,11 +96,9 @@ def test_from_an_empty_folder_each_step_is_done_by_its_files_alone(tmp_path: Pat
     HandModel.of(load(tree / "hands" / "desk-right.json", HandProfile))
     measured(tree)
     assert states(tree, settings) == {**dict.fromkeys(to_do, Done.DONE), "colours": Done.TO_DO}
-    assert not usable(tree, settings)
     for name in ("left", "right"):
         keep_colours(tree, name, dict.fromkeys(load(tree / "rigs/desk.json", RigCalibration).markers, RANGE))
     assert set(states(tree, settings).values()) == {Done.DONE}
-    assert usable(tree, settings)
 
 
 def test_what_contradicts_is_stale_and_says_what_to_do(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from bench.hands.certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry.transforms import rigid
 from common.hand.model import CHAINS, PALM, TIPS, HandModel
-from common.kernels import boxed
+from common.records import boxed
 from common.sim.motion import HandMotion, ScriptedMotion, StudyPoses
 from master.estimator.covariance import CovarianceScratch
 from tests.hand_helpers import RIGHT, natural_angles, palm

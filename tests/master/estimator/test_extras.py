@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.problem import EpochPrior
 from master.estimator.sensors import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from master.estimator.settings import DEFAULT

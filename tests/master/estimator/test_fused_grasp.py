@@ -6,8 +6,7 @@ Frames are rendered and both slaves look at them: what the object does to tips a
 import pytest
 
 from bench.both.fusion import Outcome
-from bench.both.scene import Both
-from bench.both.watched import watched
+from bench.both.scene import Both, watched
 
 SECONDS, SEED = 6.0, 44
 

@@ -5,9 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bench.both.scene import Both, Observed
-from bench.both.shown import shown
-from bench.both.solved import Solved, solve
+from bench.both.scene import Both, Observed, Solved, shown, solve
 from bench.played import START_NS
 from common.arrays import Bool
 from common.hand.model import CHAINS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.parameters import HandTables
 from master.estimator.sensors import NO_EXTRAS
 from master.estimator.settings import DEFAULT

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.kinematics import BodyPoints, Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.problem import Observations

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
-from common.kernels import boxed
+from common.records import boxed
 from common.messages import Source
 from master.estimator.epoch import Fitted, MarkerPositions
 from master.estimator.estimator import pose_of

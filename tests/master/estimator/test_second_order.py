@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import CHAINS, TIPS, WRIST, HandModel
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.covariance import CovarianceScratch
 from master.estimator.epoch import FittedHand
 from master.estimator.kinematics import BodyPoints, Scratch

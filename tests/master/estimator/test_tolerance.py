@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bench.hands.point_hand import PointHand
+from bench.hands.draws import PointHand
 from common.arrays import Float
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.stats import truncnorm
 
 from common.arrays import Float
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.parameters import Cut, HandTables
 from tests.hand_helpers import RIGHT
 from tests.master.estimator.fitted import FREE, PARAMETERS

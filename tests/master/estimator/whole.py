@@ -10,7 +10,8 @@ from common.calibration import Couplings
 from common.geometry.transforms import rigid, rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile, preset_couplings
-from common.kernels import boxed, constant
+from common.kernels import constant
+from common.records import boxed
 from master.estimator.parameters import HandParameters, HandTables, Mounts
 from master.estimator.posterior import Model
 from master.estimator.priors import posture_prior_of

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench.study.people import participant
+from bench.study.trials import participant
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration, load
 from common.calibration.gesture_settings import GestureSettings, HoldSettings, default_gestures

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.objects.tag_images import Look, tag_picture
-from bench.objects.tags import clutter
+from bench.objects.tags import Look, clutter, tag_picture
 from common.calibration import CameraCalibration, load
 from common.calibration.object_profile import ObjectProfile, Tag, TagFamily, Tags
 from common.errors import CalibrationError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.objects.tag_images import Look, tag_picture
+from bench.objects.tags import Look, tag_picture
 from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile, Tag, Tags

@@ -74,7 +74,7 @@ def test_the_command_writes_the_true_extrinsics_into_a_tree(
 
     # The line of the markers has tests of its own; without noise fewer steps are enough.
     monkeypatch.setattr(command, "marker_poses", as_seen)
-    monkeypatch.setattr(extrinsics, "calibrate_extrinsics", noted)
+    monkeypatch.setattr(command, "calibrate_extrinsics", noted)
     monkeypatch.setattr(problem, "_COARSE_ROUNDS", (3,))
     monkeypatch.setattr(problem, "_ROUNDS", (4, 3))
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "extrinsics.png"

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from bench.report import CALIBRATION
-from bench.wrist.wearers import Person, knuckles
+from bench.wrist.calibration import Person, knuckles
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
