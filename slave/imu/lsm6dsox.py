@@ -1,26 +1,18 @@
 """Drive the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
 
-Registers, rates and FIFO format of an ST LSM6DSOX.
-
-Pure: bytes in, measurements out.
-
-Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO's state the same, and what
-is used here is the same in it. A word of the FIFO is a tag and six bytes, little endian:
+Source: data sheet DS12814 and application note AN5272 of the LSM6DSOX; the LSM6DSO's state the same. A word of the
+FIFO is a tag and six bytes, little endian:
 
     tag   7..3  what: 1 gyroscope, 2 accelerometer, 4 time stamp    2..1  number of the time slot, modulo 4    0  parity
 
-All words of one time slot were measured together; the time stamp is among them, so that none is torn and each has its
-own time. One part's clock is up to some percent off: `INTERNAL_FREQ_FINE` reports by how much, in steps of 0.15 %, for
-the time stamps and the rates alike.
-
-Driver of the ST LSM6DSOX (or LSM6DSO) on an I2C bus.
-
-It reads the FIFO: every sample is whole and has its own time stamp.
+All words of one time slot were measured together; the time stamp is among them, so that no sample is torn. One part's
+clock is up to some percent off: `INTERNAL_FREQ_FINE` reports by how much, in steps of 0.15 %, for stamps and rates
+alike.
 
 Opened, it is asked who it is, reset, given its settings, and every register is read back and compared. It measures at
-the lowest of its rates that is not below the rig's, 16 g and 2000 deg/s, and puts each measurement with a stamp into
-its FIFO; whatever is there is fetched some hundred times a second. A process that is late loses nothing for 0.8 s at
-208 Hz (512 words). It has no magnetometer. Its stamps become times by `DeviceClock`.
+the lowest of its rates that is not below the rig's, 16 g and 2000 deg/s. The FIFO is fetched some hundred times a
+second; a late process loses nothing for 0.8 s at 208 Hz (512 words). It has no magnetometer. `DeviceClock` makes its
+stamps times.
 """
 
 import struct
@@ -93,10 +85,7 @@ M_S2_PER_LSB = 0.488e-3 * FIFO.standard_gravity  # at 16 g
 
 
 class Rate(NamedTuple):
-    """An output data rate.
-
-    Its code in CTRL1_XL, CTRL2_G and FIFO_CTRL3, and its nominal value [Hz].
-    """
+    """An output data rate [Hz, nominal]; its code in CTRL1_XL, CTRL2_G, FIFO_CTRL3."""
 
     code: int
     rate_hz: float
@@ -106,10 +95,7 @@ RATES = [Rate(code, 6667.0 / (1 << (10 - code))) for code in range(1, 7)]  # 13 
 
 
 def settings(rate: Rate) -> dict[Register, int]:
-    """Return the register values written at the start, with the FIFO still off.
-
-    16 g, 2000 deg/s, blocks that do not tear, time stamps.
-    """
+    """Registers written at the start, FIFO off: 16 g, 2000 deg/s, no torn blocks."""
     fifo_off = 0x40  # FIFO_CTRL4: a time stamp in every slot
     return {
         Register.CTRL9_XL: 0xE2,  # I3C off
@@ -131,24 +117,15 @@ def temperature_c(data: bytes) -> float:
 
 
 class Measured(NamedTuple):
-    """Measurements of one time slot.
+    """Measurements of one time slot."""
 
-    Its stamp [25 us nominally] since the start, rate (3,) [rad/s], force (3,) [m/s^2].
-    """
-
-    ticks: int
-    gyro_rad_s: Float
-    accel_m_s2: Float
+    ticks: int  # stamp [25 us nominally] since the start
+    gyro_rad_s: Float  # (3,)
+    accel_m_s2: Float  # (3,)
 
 
 class Slots:
-    """Push machine that assembles FIFO words into time slots.
-
-    Holds the words of the slot that is not complete, and how often the stamps have wrapped.
-
-    Attributes:
-        counts: `broken.parity` of a tag, `broken.incomplete` slots, `clipped` axes, which are NaN.
-    """
+    """Assembles FIFO words into time slots; counts broken ones, clipped axes (NaN)."""
 
     def __init__(self) -> None:
         """Begin between two slots."""
@@ -188,7 +165,6 @@ class Slots:
 
     def _vector(self, word: bytes, scale: float) -> Float:
         raw = np.array(struct.unpack("<3h", word), float)
-        # clipped
         clipped = np.abs(raw) >= 32767
         self.counts["clipped"] += int(clipped.sum())
         return np.where(clipped, np.nan, raw * scale)
@@ -226,11 +202,7 @@ class I2cPlace:
 
     @classmethod
     def of(cls, text: str) -> "I2cPlace":
-        """BUS or BUS:ADDRESS, numbers; the address in C's notation.
-
-        Raises:
-            ImuError: Neither, or no address of a part.
-        """
+        """BUS or BUS:ADDRESS in C's notation; ImuError: neither, or no part's address."""
         bus, _, address = text.partition(":")
         try:
             place = cls(int(bus), int(address, 0) if address else ADDRESS)
@@ -248,11 +220,7 @@ class I2cPlace:
 
 
 def rate_of(rate_hz: float) -> Rate:
-    """The lowest of its rates that is no less than `rate_hz`.
-
-    Raises:
-        ImuError: It has none.
-    """
+    """The lowest of its rates that is no less than `rate_hz`; ImuError: none."""
     for rate in RATES:
         if rate.rate_hz >= rate_hz:
             return rate
@@ -266,10 +234,7 @@ def buses(where: Path = Path("/dev")) -> list[str]:
 
 
 class Lsm6dsoxImu:
-    """An `ImuSource` of the ST LSM6DSOX.
-
-    Holds the bus, the samples that are not handed over yet, and the number of the last sample.
-    """
+    """An `ImuSource` of the ST LSM6DSOX."""
 
     def __init__(
         self,
@@ -282,16 +247,8 @@ class Lsm6dsoxImu:
     ) -> None:
         """Open the bus, ask who is there, write and compare the settings, start.
 
-        Args:
-            name: The rig's IMU.
-            place: Where it is.
-            rate_hz: Samples per second that are needed.
-            clock: The slave's clock.
-            stop: Ends the stream, also while a sample is waited for.
-            opener: Opens the bus.
-
-        Raises:
-            ImuError: There is no such bus, nobody answers, it is another part, or a setting did not stick.
+        `rate_hz`: samples per second that are needed. `stop` ends the stream, also while a sample is waited for.
+        Raises ImuError: no such bus, nobody answers, it is another part, or a setting did not stick.
         """
         self._name, self._place, self._clock, self._stop = name, place, clock, stop
         rate = rate_of(rate_hz)
@@ -411,7 +368,6 @@ class Lsm6dsoxImu:
             self._bus.write_byte_data(self._place.address, register, value)
 
     def _get(self, register: Register, count: int = 1) -> bytes:
-        """Read registers, or the FIFO, in one transfer."""
         answer = i2c_msg.read(self._place.address, count)
         with self._errors():
             self._bus.i2c_rdwr(i2c_msg.write(self._place.address, [register]), answer)

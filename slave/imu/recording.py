@@ -1,12 +1,6 @@
 """Record an IMU beside the camera, or import the table of a foreign one.
 
-Recorder of a real IMU beside the camera that is recorded.
-
-Its samples go to imu.csv, row by row, on a thread of their own.
-
-`phalanx-slave record --imu-csv FILE`: import of a foreign IMU table.
-
-The table becomes an imu.csv, and its content is reported.
+Samples go to imu.csv, row by row, on a thread of their own; `record --imu-csv FILE` makes one of a foreign table.
 """
 
 import csv
@@ -29,21 +23,12 @@ from slave.sources import ImuSource
 
 
 class ImuRecorder:
-    """Reader of an IMU that writes its samples once there is a recording.
-
-    Holds the thread, the file, and in `failure` what has ended it before its time.
-    """
+    """Writes an IMU once there is a recording; `failure`: what has ended it early."""
 
     def __init__(
         self, source: ImuSource, orientation: OrientationFilter | None, stop: threading.Event
     ) -> None:
-        """Start to read: nothing grows old in a buffer while the camera is opened.
-
-        Args:
-            source: The open IMU; given back by `close`.
-            orientation: Makes the orientation of the samples; None: the sensor's own.
-            stop: Ends the stream of the source; set by `close`.
-        """
+        """Start to read: nothing grows old in a buffer while the camera is opened."""
         self._source, self._orientation, self._stop = source, orientation, stop
         self._counters = imu_counters(source, orientation)
         self._file: TextIO | None = None
@@ -53,16 +38,11 @@ class ImuRecorder:
         self._thread.start()
 
     def start(self, folder: Path) -> None:
-        """Write from now on, into a recording.
-
-        Raises:
-            RecordingError: The file cannot be written.
-        """
+        """Write from now on, into a recording; RecordingError: it cannot be written."""
         path = folder / IMU
         try:
-            file = path.open(
-                "x", buffering=1, newline="", encoding="ascii"
-            )  # each row is with the system at once
+            # line by line: each row is with the system at once
+            file = path.open("x", buffering=1, newline="", encoding="ascii")
             csv.writer(file, lineterminator="\n").writerow(HEADERS[-1])
         except OSError as error:
             raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
@@ -73,10 +53,7 @@ class ImuRecorder:
         self._kept = True
 
     def close(self) -> dict[str, int]:
-        """Stop, delete an unwanted file and return the counts.
-
-        Safe to call twice.
-        """
+        """Stop, delete an unwanted file and return the counts. Safe to call twice."""
         self._stop.set()
         self._thread.join()
         self._source.close()
@@ -107,18 +84,10 @@ _NO_QUATERNION = np.full(4, np.nan)
 
 
 def import_table(table: Table, source: str, folder: Path | None, notify: Callable[[str], None]) -> None:
-    """Compute the orientation of every sample and write imu.csv.
+    """Compute the orientation of every sample, write imu.csv, report what it has.
 
-    What the recording has is reported.
-
-    Args:
-        table: The recording.
-        source: What the IMU is called.
-        folder: Where imu.csv goes; None: it is only looked at.
-        notify: Called with line by line.
-
-    Raises:
-        RecordingError: There is an imu.csv already, or it cannot be written.
+    `source`: what the IMU is called; `folder`: where imu.csv goes, None: it is only looked at.
+    Raises RecordingError: there is an imu.csv already, or it cannot be written.
     """
     if folder is not None and (folder / IMU).exists():
         raise RecordingError(f"{folder / IMU}: is there already: give another folder to --out")
@@ -167,10 +136,7 @@ def import_table(table: Table, source: str, folder: Path | None, notify: Callabl
 def _send_orientation(
     found: Float, sigma_rad: Float, fusion: OrientationFilter, table: Table, notify: Callable[[str], None]
 ) -> None:
-    """Report the final orientation and its uncertainty.
-
-    Where there is a truth, the error of the tilt is reported, too.
-    """
+    """Report the final orientation, its uncertainty, and its error against a truth."""
     known = np.isfinite(found).all(axis=1)
     if not known.any():
         notify("orientation: never known: too short, or forces are missing")

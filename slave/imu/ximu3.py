@@ -1,9 +1,5 @@
 """Drive the x-io x-IMU3 on a serial port, and decode its byte stream.
 
-Byte stream of an x-io x-IMU3.
-
-Bytes in, messages out, no input or output of its own.
-
 Source: x-IMU3 User Manual v1.11, section "Communication protocol". Every message ends with LF (0x0A), which stands
 nowhere else:
 
@@ -13,24 +9,18 @@ nowhere else:
 
     stuffed: 0x0A -> 0xDB 0xDC, 0xDB -> 0xDB 0xDD
 
-A binary message carries no checksum: its length, its escapes and its letter are all that shows a broken one. What
-counts as broken, and by which name, is what the vendor's own library reports for the same bytes (ximu3 1.9; the tests
-compare): text behind the last number is ignored, a message longer than its buffer of 4096 bytes is broken.
+A binary message has no checksum. What counts as broken, and by which name, is what the vendor's own library reports
+for the same bytes (ximu3 1.9; the tests compare).
 
-The x-io x-IMU3 on a serial port: over USB, or a UART at a baud rate.
-
-Opened, it is asked who it is, given its settings, and each answer is compared with what was written: binary messages;
-inertial ones at the lowest rate that is not below the rig's; magnetometer, temperature and battery at their own;
-no orientation of its own and no high-g, which nobody reads; no correction of its own for the gyroscope's offset, which
-would shift the rates while they are measured. The settings are applied, not saved: it keeps them itself when it is
-switched off (User Manual v1.11, section "Save command").
+Opened, over USB or a UART, it is asked who it is, given its settings, and each answer is compared. No correction of
+its own for the gyroscope's offset, which would shift the rates while they are measured. The settings are applied, not
+saved: it keeps them itself when it is switched off (section "Save command").
 
     gyroscope deg/s -> rad/s    accelerometer g -> m/s^2    magnetometer a.u. -> uT, 1 a.u. about 50 uT
 
 The magnetometer gives 20 values a second: a sample that none has come with since the last one has NaN. An inertial
-message is the mean of as many samples as the rate is divided by, stamped with the last (section "Sample averaging"):
-the end of the period that its rates are the mean of, which is what the filter takes a sample for. Its stamps become
-times by `DeviceClock`.
+message is the mean of as many samples as the rate is divided by, stamped with the last (section "Sample averaging"),
+which is what the filter takes a sample for. `DeviceClock` makes its stamps times.
 """
 
 import logging
@@ -67,10 +57,7 @@ _TEXT = re.compile(rf"{_STAMP}{_COMMA}([^\n]+)\n")
 
 
 class Kind(Enum):
-    """A kind of data message.
-
-    Its letter, and how many numbers it carries; 0 is a text.
-    """
+    """A kind of data message: its letter, and how many numbers; 0 is a text."""
 
     INERTIAL = ("I", 6)  # gyroscope x y z [deg/s], accelerometer x y z [g]
     MAGNETOMETER = ("M", 3)  # [a.u.]
@@ -116,24 +103,19 @@ class Fault(Enum):
 
 
 class Data(NamedTuple):
-    """A data message.
-
-    Its kind, its time by the device's clock [us], and its numbers, or its text as bytes.
-    """
+    """A data message: numbers, or a text as bytes."""
 
     kind: Kind
-    t_us: int
+    t_us: int  # by the device's clock [us]
     values: tuple[float, ...]
     text: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer of the device to a command.
+    """Answer of the device to a command; a refusal is a value of one part, `error`.
 
     The key has small letters and figures only, as the device compares keys itself.
-
-    A refusal is a value of one part, `error`.
     """
 
     key: str
@@ -141,10 +123,7 @@ class Answer:
 
     @property
     def fields(self) -> dict[str, object]:
-        """Return the fields of a value of several parts.
-
-        A plain value has none.
-        """
+        """Return the fields of a value of several parts; a plain value has none."""
         return cast(dict[str, object], self.value) if isinstance(self.value, dict) else {}
 
 
@@ -182,13 +161,7 @@ def plain(key: str) -> str:
     return "".join(one for one in key.lower() if one.isalnum())
 
 
-def stuff(message: bytes) -> bytes:
-    """A binary data message, without its end, as it is sent."""
-    return message.replace(ESC, ESC_ESC).replace(END, ESC_END) + END
-
-
 def _message(line: bytes) -> Data | Answer | Fault | None:
-    """One message with its end."""
     if line.startswith(b"{"):
         return _answer(line)
     if line.startswith(b"^"):  # of another device behind this one
@@ -279,11 +252,7 @@ class SerialPlace:
 
     @classmethod
     def of(cls, text: str) -> "SerialPlace":
-        """PORT or PORT@BAUD.
-
-        Raises:
-            ImuError: Neither.
-        """
+        """PORT or PORT@BAUD; ImuError: neither."""
         path, at, baud = text.rpartition("@")
         if not at:
             return cls(text)
@@ -295,11 +264,7 @@ class SerialPlace:
 
 
 def open_port(place: SerialPlace) -> Port:
-    """Open the port for this program alone.
-
-    Raises:
-        OSError: It cannot be opened.
-    """
+    """Open the port for this program alone; raises OSError."""
     baud = 115200
     read_s = 0.1  # a read waits so long, and looks whether it is to stop
     return serial.Serial(place.path, place.baud or baud, timeout=read_s, write_timeout=1.0, exclusive=True)
@@ -318,10 +283,7 @@ def ports() -> list[str]:
 
 
 class Ximu3Imu:
-    """An `ImuSource` of the x-IMU3.
-
-    Holds the port, the samples that are not handed over yet, and the newest of each slow value.
-    """
+    """An `ImuSource` of the x-IMU3."""
 
     def __init__(
         self,
@@ -334,16 +296,9 @@ class Ximu3Imu:
     ) -> None:
         """Open it, ask who it is, write its settings.
 
-        Args:
-            name: The rig's IMU.
-            place: Where it is.
-            rate_hz: Samples per second that are needed; it gives as many or a few more.
-            clock: The slave's clock.
-            stop: Ends the stream, also while a sample is waited for.
-            opener: Opens the port.
-
-        Raises:
-            ImuError: There is no such port, it may not be opened, nobody answers, or a setting was refused.
+        `rate_hz`: samples per second that are needed; it gives as many or a few more. `stop` ends the stream, also
+        while a sample is waited for. Raises ImuError: no such port, it may not be opened, nobody answers, or a
+        setting was refused.
         """
         self._name, self._place, self._clock, self._stop = name, place, clock, stop
         self._divisor = divisor(rate_hz)
@@ -440,7 +395,6 @@ class Ximu3Imu:
         return None
 
     def _receive(self) -> None:
-        """Read what has come, and wait a little for it."""
         with self._errors("is lost"):
             data = self._port.read(max(1, self._port.in_waiting))
         arrival_ns = self._clock.now_ns()
@@ -458,7 +412,6 @@ class Ximu3Imu:
                 self._counts[f"broken.{message.name.lower()}"] += 1
 
     def _dated(self, message: Data, arrival_ns: int) -> bool:
-        """Return whether the time stamp of a message is possible."""
         try:
             possible = self._device_clock.observe(message.t_us * 1000, arrival_ns)
         except ClockSteppedError:
@@ -522,10 +475,7 @@ NEEDED += ("inertial_message_rate_divisor",)
 
 
 def settings(over: str, inertial_divisor: int) -> Iterator[tuple[str, bool | int]]:
-    """Yield the settings of the x-IMU3.
-
-    The names are those of User Manual v1.11, section "Individual settings"; `over` is usb or serial.
-    """
+    """Settings over usb or serial, User Manual v1.11, section "Individual settings"."""
     yield "binary_mode_enabled", True
     yield f"{over}_data_messages_enabled", True
     yield "inertial_message_rate_divisor", inertial_divisor
@@ -538,11 +488,7 @@ def settings(over: str, inertial_divisor: int) -> Iterator[tuple[str, bool | int
 
 
 def divisor(rate_hz: float) -> int:
-    """By what its 400 Hz are divided so that no less than `rate_hz` remains.
-
-    Raises:
-        ImuError: It has no such rate.
-    """
+    """What divides its 400 Hz so that no less than `rate_hz` remains, or ImuError."""
     if not 0.0 < rate_hz <= SAMPLE_RATE_HZ:
         raise ImuError(f"imu.rate_hz: {rate_hz:g} Hz: an x-IMU3 gives at most {SAMPLE_RATE_HZ:g} Hz")
     return int(SAMPLE_RATE_HZ / rate_hz)

@@ -1,27 +1,13 @@
 """Find the marker colours of a moving hand without clicks, and name them.
 
-Colour ranges of one camera, found without clicks.
+Some seconds of frames of one camera in; HSV ranges out. A marker colour keeps one hue, moves with the hand, and has
+skin beside it; the M strongest such hues are the marker colours. Their pixels of all frames make the ranges
+(`colours`).
 
-They come from a few seconds of a moving, painted hand.
-
-A marker colour keeps one hue, moves with the hand, and has skin beside it. The M strongest hues of that kind are
-the M marker colours; their pixels of all frames, lit and shadow side, in every place the hand went, make the ranges
-by the rules of `colours`. Where the frames do not determine M colours for certain, a FitError states what is missing:
-nothing here is guessed.
-
-Assignment of marker colours to markers.
-
-It is by the shape of the hand, by an older calibration, or by clicks.
-
-By the hand: an open hand seen from its back is a turned, scaled picture of the profile's flat hand. In every frame
-that shows all marker colours, or all but one, all orders of names are fitted (a similarity without reflection,
-least squares in the complex plane); a frame where one order fits well, and clearly better than every other, votes
-for it. A frame that fits the mirrored hand better votes against the side of the profile.
-
-By a camera file: another lamp shifts all hues, but it does not change their order on the circle; of the M cyclic
-orders the one is taken that fits clearly best.
-
-No answer is a guess: votes that disagree, or two orders that fit alike, are a FitError.
+Names come from the shape of the open hand seen from its back: each frame fits all orders of names by a similarity
+without reflection (least squares in the complex plane) and votes for an order that fits clearly best. Or they come
+from the hues of an older camera file (another lamp keeps their order on the circle), or from clicks. Nothing is
+guessed: what the frames do not determine is a FitError that states what is missing.
 """
 
 from collections import Counter
@@ -73,10 +59,7 @@ Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerColour:
-    """One marker colour found in the frames.
-
-    Its hue and its largest thing in every frame where it was seen.
-    """
+    """A marker colour: its hue, and its largest thing in every frame that shows it."""
 
     hue: float
     things: tuple[Thing, ...]
@@ -105,15 +88,11 @@ def calibrate_moving(
 ) -> list[ColourRow]:
     """Ranges and collisions of all markers, in the order of `names`.
 
-    Args:
-        images: (H, W, 3) BGR each, of one resting camera, over a few seconds; 30 to 60 are plenty.
-        names: Markers of the rig.
-        namer: Assigns the marker colours to the markers.
-        notify: Receives lines about what was found.
+    `images`: (H, W, 3) BGR each, of one resting camera, over a few seconds; 30 to 60 are plenty.
 
     Raises:
-        FitError: Too few frames, no motion, no skin, too few or too many marker colours, two too alike, or the
-            names are not certain; the message states what to do.
+        FitError: Too few frames, no motion, no skin, too few or too many marker colours, two too alike, or names
+            that are not certain; the message states what to do.
     """
     if len(images) < FRAMES_LEAST:
         raise FitError(
@@ -121,8 +100,11 @@ def calibrate_moving(
         )
     background = background_of(images)
     around = surroundings_of(images, background, skin_of(images, background))
-    notify(f"skin: hue {around.skin.hue:.0f}, saturation {around.skin.saturation[0]:.0f}.."
-        f"{around.skin.saturation[1]:.0f}; {len(around.clutter)} coloured things stand still")  # fmt: skip
+    low, high = around.skin.saturation
+    notify(
+        f"skin: hue {around.skin.hue:.0f}, saturation {low:.0f}..{high:.0f}; "
+        f"{len(around.clutter)} coloured things stand still"
+    )
     things = [things_of(image, k, around) for k, image in enumerate(images)]
     colours = find_colours(things, len(names), around)
     for colour in colours:
@@ -137,21 +119,14 @@ def calibrate_moving(
 
 
 def frames_for(pixels: int) -> int:
-    """Return how many frames of so many pixels are held at once.
-
-    They are limited, though more of them would give more information.
-    """
+    """Return how many frames of so many pixels are held at once."""
     frames_most = 60
     pixels_most = 60_000_000  # of all frames together: 180 MB
     return int(np.clip(pixels_most // pixels, FRAMES_LEAST, frames_most))
 
 
 def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surroundings) -> list[MarkerColour]:
-    """Find the `count` marker colours among the things of every frame, by hue.
-
-    Raises:
-        FitError: They cannot be distinguished.
-    """
+    """Find the `count` marker colours among all things by hue, or raise FitError."""
     frames = len(things)
     seen_share = 0.1  # of the frames in which a marker colour must be seen,
     seen_least = 4  # and at least so many
@@ -190,10 +165,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
 
 
 def places(colours: Sequence[MarkerColour], frames: int) -> Float:
-    """Return the centroids (F, M, 2) [px] of the marker colours.
-
-    NaN where one was not seen.
-    """
+    """Return the centroids (F, M, 2) [px] of the marker colours; NaN: not seen."""
     uv = np.full((frames, len(colours), 2), np.nan)
     for m, colour in enumerate(colours):
         for thing in colour.things:
@@ -202,10 +174,7 @@ def places(colours: Sequence[MarkerColour], frames: int) -> Float:
 
 
 def pixels_of(colour: MarkerColour) -> Image:
-    """Return the pixels (N, 3) HSV of a marker colour in all frames.
-
-    Mixed rims and highlights are excluded.
-    """
+    """Return a colour's pixels (N, 3) HSV in all frames, less rims and highlights."""
     chosen: list[Image] = []
     for thing in colour.things:
         saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
@@ -216,10 +185,7 @@ def pixels_of(colour: MarkerColour) -> Image:
 
 
 def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
-    """Group all things by the peaks of their smoothed hues.
-
-    Of each peak the largest thing per frame is kept.
-    """
+    """Group things by the peaks of their smoothed hues, the largest of each frame."""
     flat = [thing for row in things for thing in row]
     if not flat:
         return []
@@ -241,9 +207,10 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
     colours: list[MarkerColour] = []
     for n, peak in enumerate(peaks):
         mine = [
-            thing for thing, k in zip(flat, nearest, strict=True)
+            thing
+            for thing, k in zip(flat, nearest, strict=True)
             if k == n and hue_separation(thing.hue, peak) <= HUE_GROW
-        ]  # fmt: skip
+        ]
         best: dict[int, Thing] = {}
         for thing in mine:
             if thing.frame not in best or thing.area > best[thing.frame].area:
@@ -261,10 +228,12 @@ def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[Marke
         ambiguous_size, ambiguous_share = 0.3, 0.4
         for largest in colour.things:
             others = [
-                t for t in things[largest.frame]
-                if t is not largest and t.area > ambiguous_size * largest.area
+                t
+                for t in things[largest.frame]
+                if t is not largest
+                and t.area > ambiguous_size * largest.area
                 and hue_separation(t.hue, colour.hue) < HUE_SEPARATION
-            ]  # fmt: skip
+            ]
             double += bool(others)
         if double > ambiguous_share * len(colour.things):
             raise FitError(
@@ -274,10 +243,7 @@ def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[Marke
 
 
 def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
-    """Describe which other things might have been a marker colour.
-
-    The text is for the error message.
-    """
+    """Describe, for the error message, what else might have been a marker colour."""
     reasons = ""
     if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SETTINGS.skin_around]:
         reasons += f"; hue {', '.join(bare)} has no skin beside it"
@@ -297,10 +263,7 @@ def _others(
     colours: Sequence[MarkerColour],
     around: Surroundings,
 ) -> tuple[Image, Image, int]:
-    """Return HSV pixels of skin near the marker colours and of the background.
-
-    Also returns from how many frames they are.
-    """
+    """HSV pixels of skin near the marker colours, of background; number of frames."""
     skins: list[Image] = []
     grounds: list[Image] = []
     background_frames = 12  # from which the background's share is counted
@@ -322,10 +285,7 @@ def _others(
 
 
 def _scraps(hsv: Image, around: Surroundings, largest: int) -> Image:
-    """Find small coloured pieces that touch skin.
-
-    They are marker colour nearly hidden, which is no background.
-    """
+    """Small coloured pieces that touch skin: marker colour nearly hidden."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         coloured(hsv, around).astype(np.uint8), connectivity=8
     )
@@ -349,12 +309,7 @@ _OPEN = (
 
 
 def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambda _text: None) -> Namer:
-    """Names from the picture of an open hand, its back to the camera.
-
-    Raises:
-        CalibrationError: The profile has no such marker.
-        FitError: When called: too few or too many markers, or the frames do not determine the names.
-    """
+    """Names by the picture of an open hand's back; CalibrationError: no such marker."""
     if len(names) == 1:
         return lambda colours, uv: names
     pattern = pattern_of(profile, names)
@@ -394,10 +349,7 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambd
 def pattern_of(profile: HandProfile, names: tuple[str, ...]) -> Float:
     """Return the markers (M, 2) of the flat hand as a camera sees its back.
 
-    u to the right, v down, fingers up [m].
-
-    Raises:
-        CalibrationError: The profile has no such marker.
+    u to the right, v down, fingers up [m]. Raises CalibrationError where the profile lacks a marker.
     """
     model = HandModel.of(profile)
     points = model.marker_points(model.forward(np.eye(4), np.zeros((5, 4))), names)
@@ -408,13 +360,9 @@ def pattern_of(profile: HandProfile, names: tuple[str, ...]) -> Float:
 def votes_of(uv: Float, pattern: Float, orders: Int) -> tuple[list[int], int]:
     """Count the votes of the frames that show all marker colours, or all but one.
 
-    Args:
-        uv: (F, M, 2) centroids [px]; NaN where not seen.
-        pattern: (M, 2) the flat hand.
-        orders: (P, M) row of the pattern of each marker colour.
-
-    Returns:
-        The order each voting frame is for, and how many frames see the mirrored hand better.
+    `uv` (F, M, 2): centroids [px], NaN where not seen; `pattern` (M, 2): the flat hand; `orders` (P, M): row of
+    the pattern of each marker colour. Returns the order that each voting frame is for, and how many frames see the
+    mirrored hand better.
     """
     votes: list[int] = []
     mirrored = 0
@@ -450,13 +398,7 @@ def by_hues(
     where: str,
     notify: Notify = lambda _text: None,
 ) -> Namer:
-    """Return a namer that uses the hues of a camera file.
-
-    The file is of another camera or from before the lamp was changed.
-
-    Raises:
-        CalibrationError: The file has no range for a marker.
-    """
+    """Names by a camera file of another camera or lamp; CalibrationError: no range."""
     missing = [name for name in names if name not in (markers or {})]
     if missing or markers is None:
         raise CalibrationError(
@@ -488,11 +430,7 @@ def by_hues(
 
 
 def checked(namer: Namer, shape: Namer, notify: Notify = lambda _text: None) -> Namer:
-    """Names of `namer`, refused where the shape of the hand is certain of others.
-
-    Raises:
-        FitError: When called: they disagree.
-    """
+    """Names of `namer`; FitError where the shape of the hand is certain of others."""
 
     def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
         named = namer(colours, uv)
@@ -517,13 +455,7 @@ def checked(namer: Namer, shape: Namer, notify: Notify = lambda _text: None) -> 
 
 
 def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...], width: int) -> Namer:
-    """Names from one click on each marker in the first frame.
-
-    Args:
-        clicks: Marker -> (u, v) [px].
-        names: Markers of the rig.
-        width: Of the image [px].
-    """
+    """Names from one click (u, v) [px] on each marker in the first frame."""
 
     def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
         del uv

@@ -1,12 +1,6 @@
-"""Find the coloured things of a frame, and what all frames share.
+"""Find the coloured things of a frame, and what all frames of a hand share.
 
-Coloured things in one frame.
-
-Connected pixels of one hue, more saturated than the desk and not of the skin's hue.
-
-What all frames of a moving hand share.
-
-Its skin, the desk, and the coloured things that stand on it.
+A thing is a set of connected pixels of one hue, more saturated than the desk and not of the skin's hue.
 
 background   median over the frames: what stands still for most of the time
 skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
@@ -49,24 +43,15 @@ class Skin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thing:
-    """A connected thing of one hue in one frame.
+    """A connected thing of one hue in one frame, with its centroid (u, v) [px]."""
 
-    Attributes:
-        frame: Index of the frame.
-        u, v: Centroid [px].
-        hue: Median hue.
-        pixels: (N,) flat indices of its pixels.
-        hsv: (N, 3) their colours.
-        skin: Share of skin just around it.
-    """
-
-    frame: int
+    frame: int  # index
     u: float
     v: float
-    hue: float
-    pixels: Int
-    hsv: Image
-    skin: float
+    hue: float  # median
+    pixels: Int  # (N,) flat indices
+    hsv: Image  # (N, 3) their colours
+    skin: float  # share of skin just around it
 
     @property
     def area(self) -> int:
@@ -81,26 +66,16 @@ class Thing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What all frames share.
-
-    Attributes:
-        skin: Its colour.
-        floor: (180,) saturation above which a pixel of that hue is coloured; 256: none is.
-        clutter: Coloured things that stand on the desk.
-        wooden: The desk has the colour of skin, so that skin beside a thing proves nothing.
-    """
+    """What all frames share."""
 
     skin: Skin
-    floor: Float
-    clutter: tuple[Thing, ...]
-    wooden: bool = False
+    floor: Float  # (180,) saturation above which a pixel of that hue is coloured; 256: none is
+    clutter: tuple[Thing, ...]  # coloured things that stand on the desk
+    wooden: bool = False  # the desk has the colour of skin: skin beside a thing proves nothing
 
 
 def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = False) -> list[Thing]:
-    """Return the coloured things of one frame, without clutter.
-
-    `border`: those cut by the image's border, too.
-    """
+    """Coloured things of a frame, no clutter; `border`: also those cut by the border."""
     hsv = hsv_of(image)
     skin = around.skin.mask(hsv)
     mask = coloured(hsv, around).astype(np.uint8)
@@ -122,10 +97,7 @@ def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = 
 
 
 def coloured(hsv: Image, around: Surroundings) -> Bool:
-    """Return the mask (H, W) of pixels that may be marker colour.
-
-    They are more saturated than the desk, not dark, and not of the skin's hue.
-    """
+    """Return the mask (H, W) of pixels that may be marker colour."""
     return (hsv[..., 1] >= around.floor[hsv[..., 0]]) & (hsv[..., 2] >= DARK)
 
 
@@ -144,10 +116,7 @@ def hsv_of(image: Image) -> Image:
 
 
 def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
-    """Split a piece into connected parts of one hue each.
-
-    The most frequent hue comes first: marker colours that touch are separated.
-    """
+    """Split a piece into connected parts of one hue each, the most frequent first."""
     parts: list[Bool] = []
     rest = piece.copy()
     hues_of_one = 3  # pieces into which a thing of several hues is cut at most
@@ -194,9 +163,8 @@ class SurroundingsSettings(NamedTuple):
     shift_share: float = 0.05
     whole: float = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
     moved_frames: int = 3
-    skin_around: float = (
-        0.08  # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
-    )
+    # share of skin around a marker colour in a typical frame; painted caps have 0.12 and more
+    skin_around: float = 0.08
     resting_skin: float = (
         0.5  # share of skin around a thing that never moved, from which it is painted on the hand
     )
@@ -208,26 +176,19 @@ SKIN_SATURATION = 30, 210
 
 
 def background_of(images: Sequence[Image]) -> Image:
-    """Median over at most `MEDIAN_FRAMES` frames, evenly taken; (H, W, 3)."""
+    """Median over at most `median_frames` frames, evenly taken; (H, W, 3)."""
     chosen = [images[k] for k in spread(len(images), SETTINGS.median_frames)]
     rows = [np.median([image[v] for image in chosen], axis=0) for v in range(chosen[0].shape[0])]
     return np.stack(rows).astype(np.uint8)
 
 
 def spread(count: int, most: int) -> list[int]:
-    """Return at most `most` of the indices below `count`, evenly spread.
-
-    First and last are among them.
-    """
+    """Return at most `most` indices below `count`, evenly spread, with both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 def skin_of(images: Sequence[Image], background: Image) -> Skin:
-    """Skin, from what differs from the background and has a skin's hue.
-
-    Raises:
-        FitError: Nothing moves, or no skin moves.
-    """
+    """Skin: what moves and has a skin's hue; FitError: nothing moves, or no skin."""
     samples: list[Image] = []
     moving = 0.0
     chosen = spread(len(images), SETTINGS.median_frames)
@@ -272,10 +233,7 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
 
 
 def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
-    """Return the saturation (180,) above which a pixel of that hue is coloured.
-
-    It is more than what the whole desk shows of the hue.
-    """
+    """Return the saturation (180,) above which a pixel of that hue is coloured."""
     height, width = background.shape[:2]
     samples: list[Image] = []
     tiles = np.zeros((HUES, SETTINGS.tiles * SETTINGS.tiles))
@@ -311,12 +269,7 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
 
 
 def _moved(thing: Thing, images: Sequence[Image]) -> bool:
-    """Return whether a thing of the background is a marker colour of a resting hand.
-
-    It is one if it is seen whole, but elsewhere.
-
-    Clutter only gets covered, and then it is smaller.
-    """
+    """Whether a thing is seen whole elsewhere; clutter only gets covered."""
     height, width = images[0].shape[:2]
     rows, columns = np.divmod(thing.pixels, width)
     reach = round(2.0 * thing.size) + 8  # it is searched for where it could still touch its place
@@ -350,12 +303,7 @@ def _moved(thing: Thing, images: Sequence[Image]) -> bool:
 
 
 def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
-    """Return whether the desk appeared in the place of a background thing.
-
-    The thing was then a finger tip that was flexed away.
-
-    The desk is what lies around the thing in the background and is not skin.
-    """
+    """Whether the desk around it appeared in its place: a finger tip flexed away."""
     height, width = background.shape[:2]
     place = np.zeros(height * width, np.uint8)
     place[thing.pixels] = 1

@@ -1,34 +1,21 @@
 """Measure sub-pixel centroids from the share of marker colour in each pixel.
 
-Share of marker colour in every pixel of a stack of windows.
-
-In linear light.
-
-1. A linear discriminant between core and ring, w = (S_ring + q m m' + N)^-1 (m - m_ring), m the mean of the core, is
-   the colour direction along which the surroundings vary least: skin on one side and table on the other both become
-   0. The term q m m' allows for marker pixels lighter and darker than their mean (after Fisher 1936).
-2. Coordinate along w, 0 at the ring's mean and 1 at the core's, is share times shading. The shading is a plane
-   fitted to the pixels whose four neighbours are all in the mask, so coordinate / shading is the share.
-
-The sums over the pixels of all windows are products of matrices: one call for all markers. Their order differs from
-processor to processor; so light and places are small whole numbers, whose sums are exact in any order, and what is
-no whole number is added up in double precision.
-
-Sub-pixel centroids of the visible area of every marker.
-
-They are measured in small windows of the full-resolution image.
-
-A threshold knows whole pixels only. At the rim a pixel holds marker and surroundings in proportion to the covered
-area, and light adds linearly, so in linear light the amount of marker colour is measurable:
+At the rim a pixel holds marker and surroundings in proportion to the covered area, and light adds linearly, so in
+linear light the share of marker colour is measurable. In a small full-resolution window of each marker:
 
 1. The colour table gives the mask. How full of it the 7 x 7 neighbourhood of a pixel is separates core (surely marker)
    from rim (unsure) and ring (surely not marker).
-2. In linear light the share of marker colour in every pixel is found (`shares`): along the direction that separates it
-   from its surroundings, divided by the shading of the marker.
-3. Deep inside the share is 1, whatever a highlight does there; beyond the rim it is 0.
-4. Centroid, area and extent are the moments of the shares.
+2. A linear discriminant w = (S_ring + q m m' + N)^-1 (m - m_ring), m the core's mean, is the colour direction along
+   which the surroundings vary least: skin and table both become 0. q m m' allows for marker pixels lighter and darker
+   than their mean (after Fisher 1936).
+3. The coordinate along w, 0 at the ring's mean and 1 at the core's, is share times shading. The shading is a plane
+   fitted to pixels whose four neighbours are in the mask; their quotient is the share.
+4. Deep inside the share is 1, whatever a highlight does there; beyond the rim it is 0. Centroid, area and extent are
+   the moments of the shares.
 
-All windows lie in one stack of tiles, so that a step costs one call, not one per marker.
+All windows lie in one stack, so that a step costs one call. The order of sums in products of matrices differs between
+processors: light and places are small whole numbers, whose sums are exact in any order; the rest is added up in
+double precision.
 """
 
 from collections.abc import Sequence
@@ -59,27 +46,17 @@ TILT = np.diag([1e-6, STIFF_PX2, STIFF_PX2])  # the first: a window without a co
 PRODUCT_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-def _linear_light() -> Float32:
-    """Byte -> linear light 0..`WHITE`, whole numbers (IEC 61966-2-1)."""
-    return np.round(WHITE * to_linear(np.arange(256) / 255.0)).astype(np.float32)
-
-
-LIGHT = _linear_light()
+# Byte -> linear light 0..`WHITE`, whole numbers (IEC 61966-2-1).
+LIGHT: Float32 = np.round(WHITE * to_linear(np.arange(256) / 255.0)).astype(np.float32)
 
 
 class Grid(NamedTuple):
-    """The pixels of a window from its middle, in whole pixels.
+    """The pixels of a window from its middle, in whole pixels."""
 
-    Attributes:
-        sums: (P, 6) 1, x, y, xx, xy, yy, double precision.
-        x, y: (P,) single precision.
-        middle: x, y of the middle in the window [px].
-    """
-
-    sums: Float
-    x: Float32
+    sums: Float  # (P, 6) 1, x, y, xx, xy, yy, double precision
+    x: Float32  # (P,) single precision, as y
     y: Float32
-    middle: tuple[int, int]
+    middle: tuple[int, int]  # x, y of the middle in the window [px]
 
 
 @lru_cache(maxsize=32)
@@ -93,7 +70,7 @@ def grid_of(height: int, width: int) -> Grid:
 
 
 def light_of(tall: Image) -> Float32:
-    """Linear light 0..`WHITE` of an image (H, W, 4), channel by channel: (3, H, W)."""
+    """Linear light 0..`WHITE` of an image (H, W, 4), by channel: (3, H, W)."""
     light = np.empty((3, *tall.shape[:2]), np.float32)
     for channel, plane in enumerate(cv2.split(tall)[:3]):
         cv2.LUT(plane, LIGHT, cast(Image, light[channel]))
@@ -103,17 +80,11 @@ def light_of(tall: Image) -> Float32:
 def shares(
     light: Float32, ring: Bool, weights: Float32, place: Float, grid: Grid
 ) -> tuple[Float32, Float, Float]:
-    """Coordinate along the discriminant over shading of every pixel, unclipped.
+    """Return shares (M, P), contrasts (M,), and mean colours of the core (M, 3).
 
-    Args:
-        light: (3, M, P) of `light_of`.
-        ring: (M, P) the surroundings.
-        weights: (2, M, P) 0 or 1: the core, and where the shading is followed.
-        place: (2, M, 6) sums of both over the grid.
-        grid: Of the windows.
-
-    Returns:
-        Shares (M, P), contrasts (M,), and mean colours of the core (M, 3).
+    Shares are the coordinate along the discriminant over shading, unclipped. `light`: (3, M, P) of `light_of`;
+    `ring`: (M, P) the surroundings; `weights`: (2, M, P) 0 or 1: the core, and where the shading is followed;
+    `place`: (2, M, 6) sums of both over the grid.
     """
     count = len(ring)
     around = light[:, :, ::EVERY].astype(np.float64)  # columns, as windows are a multiple of it wide
@@ -163,50 +134,31 @@ FIRST, SECOND = np.array([0, 0, 1]), np.array([0, 1, 1])  # x x, x y, y y
 
 
 class Measured(NamedTuple):
-    """One marker, measured.
+    """One marker, measured by its colour."""
 
-    Attributes:
-        u, v: Centroid of the visible marker colour [px], distorted image.
-        area: Visible area [px^2].
-        contrast: Level of the core in standard deviations of what the filter leaves of the ring.
-        colour: Mean of the core in linear light 0..1: blue, green, red.
-        cut: The mask touches the border of the image.
-        thin: Hardly a pixel of the mask is surrounded by mask: a sliver, or a colour fringe.
-        foreign: Share of the mask's neighbour pixels that have another marker's colour; 0 unless thin.
-        xx, xy, yy: Second central moments of the shares [px^2].
-        window: (H, W) shares 0..1 of the pixels around; left, top: its first pixel [px].
-    """
-
-    u: float
+    u: float  # centroid of the visible marker colour, u, v [px], distorted image
     v: float
-    area: float
-    contrast: float
-    colour: list[float]
-    cut: bool
-    thin: bool
-    foreign: float
-    xx: float
+    area: float  # visible [px^2]
+    contrast: float  # level of the core in standard deviations of what the filter leaves of the ring
+    colour: list[float]  # mean of the core in linear light 0..1: blue, green, red
+    cut: bool  # the mask touches the border of the image
+    thin: bool  # hardly a pixel of the mask is surrounded by mask: a sliver, or a colour fringe
+    foreign: float  # share of the mask's neighbour pixels with another marker's colour; 0 unless thin
+    xx: float  # second central moments of the shares, xx, xy, yy [px^2]
     xy: float
     yy: float
-    window: Float32
-    left: int
+    window: Float32  # (H, W) shares 0..1 of the pixels around
+    left: int  # left, top: first pixel of the window [px]
     top: int
 
 
 def measure(
     image: Image, table: ColourTable, bits: Sequence[int], blobs: Sequence[Blob], alone: Sequence[bool]
 ) -> list[Measured | None]:
-    """Measure the markers at `blobs`.
+    """Measure the markers at `blobs`; None: fewer than `MIN_PIXELS` in the window.
 
-    Args:
-        image: (H, W, 3) BGR, full resolution.
-        table: Colour table of the camera.
-        bits: Bit in the table of each blob's marker.
-        blobs: Where the scan saw them.
-        alone: Whether the colour has no other blob; where it has, only pixels inside the blob's box are the marker's.
-
-    Returns:
-        One measurement per blob; None where the window holds no blob of at least `MIN_PIXELS`.
+    `bits`: bit in the table of each blob's marker. `alone`: whether the colour has no other blob; else only pixels
+    inside the blob's box are the marker's.
     """
     if not blobs:
         return []
@@ -236,10 +188,7 @@ def _measure_stack(
     alone: Sequence[bool],
     gap: int = 0,
 ) -> list[Measured | None]:
-    """Measure the blobs in windows of one size.
-
-    `gap` empty rows and columns keep the windows apart where marker pixels meet their border.
-    """
+    """Measure blobs in windows of one size, `gap` px apart where borders are met."""
     count = len(blobs)
     height = max([b.bottom - b.top for b in blobs]) + 2 * PAD + gap
     width = -(-(max([b.right - b.left for b in blobs]) + 2 * PAD + gap) // EVERY) * EVERY
@@ -254,8 +203,7 @@ def _measure_stack(
         _only_the_blob(own.reshape(count, height, width), blobs, alone)
     mask = own.reshape(tall.shape[:2])
     full = cast(
-        Image,
-        cv2.boxFilter(mask.view(np.uint8), -1, SIDE, normalize=False, borderType=cv2.BORDER_CONSTANT),
+        Image, cv2.boxFilter(mask.view(np.uint8), -1, SIDE, normalize=False, borderType=cv2.BORDER_CONSTANT)
     ).reshape(flat)
     outside = ~own
     within = packed >= WITHIN
@@ -306,7 +254,9 @@ def _measure_stack(
         spread.tolist(),
         strict=True,
     )
-    for i, (b, ((u, v), area, contrast, sliver, bgr, shape)) in enumerate(zip(blobs, rows, strict=True)):
+    for i, (b, ((u, v), area, contrast, sliver, bgr, (xx, xy, yy))) in enumerate(
+        zip(blobs, rows, strict=True)
+    ):
         foreign = 0.0
         if sliver:
             if np.count_nonzero(own[i]) < MIN_PIXELS or area < 1.0:
@@ -315,34 +265,17 @@ def _measure_stack(
             tile = own[i].reshape(height, width).view(np.uint8)
             rim = cv2.dilate(tile, SQUARE).reshape(-1) > tile.reshape(-1)
             foreign = np.count_nonzero(rim & others[i]) / max(np.count_nonzero(rim), 1)
-        cut = _hangs_over(b, image) and _is_cut(own[i].reshape(height, width), b, image.shape)
+        cut = _is_cut(own[i].reshape(height, width), b, image.shape)
         left, top = b.left - PAD, b.top - PAD
+        u, v = left + u, top + v
         found.append(
-            Measured(
-                left + u,
-                top + v,
-                area,
-                contrast,
-                bgr,
-                cut,
-                sliver,
-                foreign,
-                shape[0],
-                shape[1],
-                shape[2],
-                windows[i],
-                left,
-                top,
-            )
+            Measured(u, v, area, contrast, bgr, cut, sliver, foreign, xx, xy, yy, windows[i], left, top)
         )
     return found
 
 
 def _cut_tiles(image: Image, blobs: Sequence[Blob], height: int, width: int) -> Image:
-    """Cut the windows of the blobs, one below the other.
-
-    (M * height, width, 4) BGRA; all 0 outside a window or the image.
-    """
+    """Cut the blobs' windows, one below the other: (M * height, width, 4) BGRA."""
     tall = np.zeros((len(blobs) * height, width, 4), np.uint8)
     base = 0
     for b in blobs:
@@ -357,16 +290,12 @@ def _cut_tiles(image: Image, blobs: Sequence[Blob], height: int, width: int) -> 
 
 
 def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> None:
-    """Clear the parts of the tiles (M, H, W) that are not the blob's.
-
-    It is done where the blob's colour has other blobs.
-    """
+    """Clear what is not the blob's in tiles (M, H, W) with other blobs of the colour."""
     for tile, b, lonely in zip(own, blobs, alone, strict=True):
         if lonely:
             continue
         parts = cast(
-            tuple[int, Image],
-            cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U),
+            tuple[int, Image], cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U)
         )
         count, labels = parts
         # The blob's points of the grid lie inside its box by the width of the grid.
@@ -378,19 +307,13 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
 
 
 def _meets_border(own: Bool) -> bool:
-    """Return whether marker colour lies near the border of a tile (M, H, W).
-
-    Near means that a neighbourhood would reach over the border.
-    """
+    """Return whether a neighbourhood in a tile (M, H, W) would reach over its border."""
     reach = SIDE[0] // 2
     return bool(own[:, :reach].any() or own[:, -reach:].any() or own[:, :, 0].any() or own[:, :, -1].any())
 
 
 def _eroded(own: Bool, width: int) -> Bool:
-    """Return the mask pixels whose four neighbours are all in the mask as well.
-
-    The windows of `width` lie one below the other, flattened.
-    """
+    """Return the mask pixels whose four neighbours are in the mask, flattened."""
     inner = own.copy()
     inner[1:] &= own[:-1]  # over the ends of the rows as well: nothing is in the mask there
     inner[:-1] &= own[1:]
@@ -399,11 +322,9 @@ def _eroded(own: Bool, width: int) -> Bool:
     return inner
 
 
-def _hangs_over(b: Blob, image: Image) -> bool:
-    return b.left <= 0 or b.top <= 0 or b.right >= image.shape[1] or b.bottom >= image.shape[0]
-
-
 def _is_cut(own: Bool, b: Blob, size: tuple[int, ...]) -> bool:
+    if b.left > 0 and b.top > 0 and b.right < size[1] and b.bottom < size[0]:
+        return False
     rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
     if rows.size == 0:
         return False

@@ -1,29 +1,14 @@
 """Classify every pixel by colour, and find the connected blobs of each colour.
 
-Classification of every pixel by the marker colours it may belong to.
+The table has one entry per 24-bit pixel and one bit per marker. It is built from the HSV ranges of the camera file by
+OpenCV's own conversion of all 2^24 colours, so a look-up equals `cvtColor` + `inRange` exactly, and costs the same
+for one colour and for eight (CMVision, Bruce, Balch, Veloso 2000, has one table per axis; a packed one also carries
+ranges that are no boxes). Under another light it is read at other colours (`ColourTable.white_balanced`).
 
-One table look-up serves all colours.
-
-The table holds one entry per possible 24-bit pixel and one bit per marker. It is *built from* the HSV ranges of
-the camera file by running OpenCV's own conversion over all 2^24 colours, so a look-up equals `cvtColor` +
-`inRange` exactly and the thresholds stay the user's HSV thresholds; no frame is ever converted to HSV. One look-up
-costs the same for one colour and for eight (Bruce, Balch, Veloso, CMVision, 2000, do the same with one table
-per axis; a packed table also carries ranges that are no boxes).
-
-Under another light the same table is read at other colours (`ColourTable.white_balanced`): a slave has one as long as
-its colours are the same, whatever the light does.
-
-Detection of the connected blobs of every colour in the scanned frame.
-
-They are the candidates among which the markers are.
-
-The scan looks at every fourth pixel of every fourth row, which any round marker from 6 px on cannot slip through;
-smaller ones and slivers do now and then, so a colour that no point of the grid shows is sought on further grids.
-
-Labels are made per colour, never on the union of all colours: the hue runs through other markers' ranges on the
-rim between marker and skin, and such a fringe would split the blob. Points of a colour that fill their box are one
-blob without further looking; only scattered ones are labelled, in the box around them, so the cost follows the
-number of coloured points, not of markers.
+The scan looks at every fourth pixel of every fourth row, which a round marker from 6 px on cannot slip through; a
+colour that no point of the grid shows is sought on further grids. Labels are made per colour, never on the union: on
+the rim between marker and skin the hue runs through other markers' ranges, and such a fringe would split the blob.
+Points that fill their box are one blob; only scattered ones are labelled.
 """
 
 import math
@@ -53,21 +38,12 @@ SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 class ColourTable:
     """Look-up table from a colour to the markers it may belong to.
 
-    Bit m of an entry belongs to marker m, the bit after the last marker to skin.
-
-    Holds the table (2^24 entries of 1, 2, 4 or 8 bytes), which it shares with those made of it for another light, the
-    bytes to look up for those of a picture, and the work buffers of the scan.
+    Bit m of an entry belongs to marker m, the bit after the last marker to skin. Holds 2^24 entries of 1, 2, 4 or 8
+    bytes, shared with the tables made of it for another light, the map of bytes, and work buffers of the scan.
     """
 
     def __init__(self, ranges: Sequence[HsvRange]) -> None:
-        """Build the table, about 0.1 s however many markers there are.
-
-        Args:
-            ranges: HSV range of each marker, in marker order, at most 63.
-
-        Raises:
-            ValueError: No range, or more than 63.
-        """
+        """Build the table of 1 to 63 HSV ranges in marker order (0.1 s); else ValueError."""
         if not 1 <= len(ranges) <= 63:
             raise ValueError(f"{len(ranges)} colour ranges, from 1 to 63 are possible")
         self.count = len(ranges)
@@ -82,29 +58,18 @@ class ColourTable:
 
     @property
     def entries(self) -> Codes:
-        """Return the table itself, codes (2^24,).
-
-        The index is the sum of the `places` of a pixel's blue, green and red.
-        """
+        """Return the codes (2^24,), at the sum of the `places` of blue, green and red."""
         return self._table
 
     @property
     def places(self) -> Places:
-        """Return the index contribution (3, 256) of each byte of blue, green and red.
-
-        The contributions of a pixel add up to its index in `entries`.
-        """
+        """Return the index contribution (3, 256) of each byte of blue, green and red."""
         return self._places
 
     def white_balanced(self, tables: Image) -> "ColourTable":
-        """Return the table for images whose bytes must be mapped before lookup.
+        """Return the table for images whose bytes are mapped first by `tables` (3, 256).
 
-        The ranges hold only for the mapped bytes. Takes about 1 ms; shares the entries.
-
-        Colours that belong to one marker before belong to one marker after: no ranges can come to overlap.
-
-        Args:
-            tables: (3, 256) byte -> byte of blue, green and red.
+        Takes about 1 ms; shares the entries, so that ranges cannot come to overlap.
         """
         other = copy(self)
         other._bytes = tables if self._bytes is None else np.take_along_axis(self._bytes, tables, axis=1)
@@ -113,21 +78,11 @@ class ColourTable:
         return other
 
     def codes(self, image: Image) -> Codes:
-        """Class codes of every pixel of a window.
-
-        Args:
-            image: (H, W, 3) BGR, any strides.
-
-        Returns:
-            (H, W) codes; bit m is set where the pixel is in the range of marker m.
-        """
+        """Class codes (H, W) of a BGR window (H, W, 3) of any strides; bit m: marker m."""
         return self.packed_codes(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA).view(np.uint32)[..., 0])
 
     def packed_codes(self, packed: npt.NDArray[np.uint32]) -> Codes:
-        """Return the class codes of pixels packed into words.
-
-        Blue, green and red lie from the lowest byte on; the highest byte is ignored.
-        """
+        """Class codes of pixels in words, blue in the lowest byte, the highest ignored."""
         if self._bytes is not None:
             mapped = np.zeros((1, 256, 4), np.uint8)
             mapped[0, :, :3] = self._bytes.T
@@ -138,19 +93,16 @@ class ColourTable:
     def scan(
         self, image: Image, step: int, dx: int = 0, dy: int = 0, size: tuple[int, int] | None = None
     ) -> Codes:
-        """Class codes on a grid: every `step`-th pixel of every `step`-th row.
+        """Class codes on a grid: every `step`-th pixel of every `step`-th row, from 2 on.
 
         Decimated, not averaged: an averaged pixel on the rim of a marker has a hue that no marker has.
 
         Args:
             image: (H, W, 3) BGR, C-contiguous.
-            step: Distance of the grid's lines [px], at least 2.
             dx, dy: Where the grid begins [px]; less than `step` for the whole image.
-            size: Rows and columns of the grid; None: those of the whole image.
+            size: Rows and columns of the grid; None: (H // step, W // step).
 
-        Returns:
-            Codes of that size, (H // step, W // step) of the whole image, of the pixels (dy + step v, dx + step u).
-            Reused by the next call.
+        Returns codes of that size of the pixels (dy + step v, dx + step u), reused by the next call.
         """
         height, width = (image.shape[0] // step, image.shape[1] // step) if size is None else size
         row = image.shape[1] * 3
@@ -177,11 +129,7 @@ class ColourTable:
 
 
 def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, where: str) -> ColourTable:
-    """The table of a camera's markers, in the order of the rig.
-
-    Raises:
-        CalibrationError: A marker has no range; the message states where and which, and how to make it.
-    """
+    """Table of markers in the rig's order; CalibrationError tells what range lacks."""
     missing = [name for name in markers if name not in (ranges or {})]
     if missing or ranges is None:
         raise CalibrationError(
@@ -192,13 +140,7 @@ def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, wher
 
 
 def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
-    """Return the mask of pixels inside an HSV range.
-
-    The hue wraps through 0 where the low hue is above the high one.
-
-    Args:
-        hsv: (..., 3) OpenCV HSV, H 0-179.
-    """
+    """Mask of pixels (..., 3) OpenCV HSV inside a range; the hue wraps through 0."""
     h, s, v = hsv[..., 0], hsv[..., 1], hsv[..., 2]
     low, high = colour.hsv_low, colour.hsv_high
     hue = (h >= low[0]) & (h <= high[0]) if low[0] <= high[0] else (h >= low[0]) | (h <= high[0])
@@ -206,10 +148,7 @@ def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
 
 
 def _build(ranges: Sequence[HsvRange]) -> Codes:
-    """Build the table from the colour ranges.
-
-    A range is a box: a colour has the bits that its hue, its saturation and its value all have.
-    """
+    """Build the table: a colour has the bits that its H, S and V all have."""
     kind = next(
         t for t, n in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32), (np.uint64, 64)) if len(ranges) <= n
     )
@@ -235,14 +174,7 @@ def _places(levels: Image) -> Places:
 
 
 def _coarse(table: Codes, levels: Image) -> Codes:
-    """Return the coarse table (2^21,) that the scan looks up.
-
-    It holds the entries of colours whose lowest three bits are 0, at packed pixels >> 3.
-
-    Args:
-        table: (2^24,) entries.
-        levels: (3, 256) bytes of blue, green and red to look up for those of a picture.
-    """
+    """The scan's table (2^21,) at packed pixels >> 3, for bytes `levels` (3, 256)."""
     blue, green, red = levels[:, ::8]
     coarse = np.empty((32, 256, 256), table.dtype)  # the rest is never asked, and never becomes memory
     coarse[:, :32, :32] = table.reshape(256, 256, 256)[np.ix_(red, green, blue)]
@@ -250,10 +182,7 @@ def _coarse(table: Codes, levels: Image) -> Codes:
 
 
 def _bits(ranges: Sequence[HsvRange], channel: int, kind: type[np.unsignedinteger]) -> Codes:
-    """Return the codes (256,) of the levels of one channel of HSV.
-
-    Bit m is set where the level is in range m. Hue wraps through 0.
-    """
+    """Return the codes (256,) of the levels of one channel of HSV; hue wraps."""
     level = np.arange(256)
     codes: Codes = np.zeros(256, kind)
     for m, colour in enumerate(ranges):
@@ -293,16 +222,7 @@ class Blob(NamedTuple):
 def find_blobs(
     codes: Codes, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
 ) -> list[list[Blob]]:
-    """Blobs of each colour, largest first, at most `MAX_CANDIDATES` of a colour.
-
-    Args:
-        codes: (H, W) codes of the scan, contiguous (`ColourTable.scan`).
-        bits: Bit mask of each marker.
-        step, dx, dy: The grid of the scan.
-
-    Returns:
-        One list per marker, empty where its colour is not in the image.
-    """
+    """Blobs of each colour in a scan's codes (H, W), the largest first, not too many."""
     found: list[list[Blob]] = [[] for _ in bits]
     mine = np.array(bits, codes.dtype)
     flat = codes.reshape(-1)
@@ -355,18 +275,14 @@ def find_blobs(
 def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: float) -> tuple[Blob, float]:
     """Return `blob` joined with the pieces that an occluder split from it.
 
-    The occluder is something in front of the marker. Also returns how far joining may mislead.
-
     Args:
-        blob: The marker's largest piece.
         options: All blobs of its colour.
         extent: Largest width or height of the whole marker [px], as far as known, else inf.
-        whole: Its whole area [px^2], as far as known, else nan: then only small pieces are joined, since a large one
-            may as well be a thing beside it.
+        whole: Its area [px^2], as far as known, else nan: then only small pieces are joined, since a large one may
+            be a thing beside it.
 
-    Returns:
-        The blob, its box widened over all pieces. And the way [px] of the centroid that joining makes, where it is
-        not known that so much is missing: if the pieces are something else, the centroid is off by that.
+    Returns the blob, its box widened over all pieces; and the shift [px] of the centroid by joining, by which it is
+    off if the pieces are something else; 0 where it is known that so much is missing.
     """
     left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
     reach = FRAGMENT_GAP * math.sqrt(blob.area)
@@ -401,10 +317,7 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
 def _label(
     mask: npt.NDArray[np.uint8], left: int, top: int
 ) -> list[tuple[int, int, int, int, int, float, float]]:
-    """Label the connected parts of a mask, largest first.
-
-    Each is left, top, width, height, points, mean x, mean y on the grid.
-    """
+    """Connected parts, largest first: left, top, width, height, points, mean x, y."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     rows = [
         (left + x, top + y, w, h, area, left + u, top + v)

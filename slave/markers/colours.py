@@ -1,20 +1,14 @@
 """Calibrate the HSV range of every marker from clicks on an image.
 
-HSV range of every marker from one click on each, with collision report.
+A tight range fails under the next lamp, so each range is as broad as its neighbours allow: in hue half-way to the
+next marker or to the skin, at most `hue_margin`; in saturation down to `saturation_share` of the marker's, where a
+rim pixel is about half marker, but above what the background shows in that hue; in value from the shadow side to a
+highlight.
 
-A tight range around the clicked colour fails under the next lamp ("a broader range at calibration worked better"), so
-each range is as broad as its neighbours allow: in hue half-way to the next marker or to the skin, at most
-`HUE_MARGIN`; in saturation down to `SATURATION_SHARE` of the marker's, where a rim pixel is about half marker, but
-above what the background shows in that hue; in value down to the shadow side of a cap and up to a highlight.
-
-Colour of a marker from one click on the image of a running camera.
-
-The colours that other markers have are taken into account.
-
-The colour under the click is grown as for `phalanx-slave colours`; the ranges of all markers picked so far are made
-anew together, since how far each may reach depends on its neighbours: six picks give what six clicks in one picture
-give. Ranges that came from the camera file stay, but for hues that a picked one needs. Where colours follow the light
-the picture is seen as under the light of their calibration, so that old and new colours agree.
+`calibrate` takes all clicks in one picture. `SampledColours` takes one click at a time on a running camera and makes
+the ranges of all picked markers anew together, so that six picks give what six clicks in one picture give. Ranges of
+the camera file stay, but for hues that a picked one needs. Where colours follow the light, the picture is seen as
+under the light of calibration, so that old and new colours agree.
 """
 
 from collections.abc import Mapping
@@ -44,38 +38,23 @@ SMALLEST = 6  # px of marker colour
 
 @dataclass(frozen=True, slots=True)
 class ColourRow:
-    """What the range of one marker catches.
-
-    Attributes:
-        name: Marker.
-        range: Its HSV range.
-        pixels: Pixels of the marker colour grown from the click.
-        own: Share of them inside the range.
-        others: Other markers -> share of their pixels inside the range; only those above zero.
-        skin: Share of the skin pixels inside the range.
-        background: Share of the background pixels inside the range.
-        background_px: How many that is in one frame.
-    """
+    """What the range of one marker catches; shares are 0..1."""
 
     name: str
     range: HsvRange
-    pixels: int
-    own: float
-    others: dict[str, float]
-    skin: float
-    background: float
-    background_px: float = 0.0
+    pixels: int  # of the marker colour grown from the click
+    own: float  # share of them inside the range
+    others: dict[str, float]  # other markers -> share of their pixels inside the range, if above 0
+    skin: float  # share of the skin pixels inside the range
+    background: float  # share of the background pixels inside the range
+    background_px: float = 0.0  # how many that is in one frame
 
 
 def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[ColourRow]:
     """Ranges and collisions of the clicked markers, in the order of `clicks`.
 
-    Args:
-        image: (H, W, 3) BGR.
-        clicks: Marker -> (u, v) [px], a pixel on its colour.
-
-    Raises:
-        FitError: A click is outside the image or not on a marker colour, or two colours have the same hue.
+    `image`: (H, W, 3) BGR. `clicks`: Marker -> (u, v) [px], a pixel on its colour. Raises FitError: A click is
+    outside the image or not on a marker colour, or two colours have the same hue.
     """
     hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
@@ -84,18 +63,11 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
 
 
 def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: int = 1) -> list[ColourRow]:
-    """Return the ranges and collisions of marker colours whose pixels are known.
+    """Return ranges and collisions of known marker pixels, in the order of `paint`.
 
-    In the order of `paint`.
-
-    Args:
-        paint: Marker -> (N, 3) HSV of its pixels, of one frame or of many.
-        skin: (K, 3) HSV of skin pixels; may be empty.
-        background: (B, 3) HSV of all that is neither marker colour nor its rim.
-        frames: How many frames `background` was taken from.
-
-    Raises:
-        FitError: Two marker colours have the same hue.
+    `paint`: marker -> (N, 3) HSV of its pixels; `skin`: (K, 3) HSV, may be empty; `background`: (B, 3) HSV of all
+    that is neither marker colour nor its rim, from so many `frames`. Raises FitError: two marker colours have the
+    same hue.
     """
     hue = {name: circular_median(pixels[:, 0]) for name, pixels in paint.items()}
     _refuse_ambiguous(hue)
@@ -143,13 +115,7 @@ def report(rows: list[ColourRow]) -> str:
 
 
 def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
-    """Grow the marker-coloured region (H, W) around a click.
-
-    It consists of connected pixels of the hue at the click.
-
-    Raises:
-        FitError: The click is outside the image, on something pale, or on a spot too small.
-    """
+    """Region (H, W) of the hue at a click; FitError: outside, pale, or too small."""
     u, v = round(click[0]), round(click[1])
     height, width = hsv.shape[:2]
     if not (0 <= u < width and 0 <= v < height):
@@ -203,10 +169,7 @@ def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
 
 
 def surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
-    """Return the masks of skin near the markers and of the background.
-
-    The background is everything that is neither marker colour nor its rim.
-    """
+    """Masks of skin near the markers, and of all but marker colour and its rim."""
     union = np.any(list(paint.values()), axis=0).astype(np.uint8)
     rim = cv2.dilate(union, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) != 0
     near = cv2.dilate(union, np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)) != 0
@@ -246,10 +209,7 @@ def _range(paint: Image, hue: float, limits: tuple[int, int], background: Image,
 
 
 def _mean_light(paint: Image) -> tuple[float, float, float]:
-    """Return the mean colour of (N, 3) HSV pixels in linear light, blue first.
-
-    Light adds linearly, bytes do not.
-    """
+    """Return the mean of (N, 3) HSV pixels in linear light, blue first."""
     bgr = np.asarray(cv2.cvtColor(paint[None], cv2.COLOR_HSV2BGR))[0]
     blue, green, red = np.maximum(to_linear(bgr / 255.0).mean(axis=0), 1e-5).round(5).tolist()
     return blue, green, red
@@ -261,12 +221,7 @@ def _share(pixels: Image, colour: HsvRange) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ColourSample:
-    """What came of one click.
-
-    Attributes:
-        ranges: The ranges of all markers that have one now.
-        row: What the new range catches, in the picture that was clicked on.
-    """
+    """What came of one click: all ranges now, and what the new one catches."""
 
     ranges: dict[str, HsvRange]
     row: ColourRow
@@ -275,7 +230,7 @@ class ColourSample:
 class SampledColours:
     """Pixels of the marker colours picked since the start, and the ranges made.
 
-    The pixels are as under the light of calibration. A range that was changed since counts as one of the file.
+    As under the light of calibration. A range that was changed since counts as one of the file.
     """
 
     def __init__(self) -> None:
@@ -291,18 +246,11 @@ class SampledColours:
         uv: tuple[float, float],
         ranges: Mapping[str, HsvRange],
     ) -> ColourSample:
-        """Make the range of a marker.
+        """Make the range of a marker from a pixel (u, v) on or near it [px].
 
-        Args:
-            image: (H, W, 3) BGR.
-            log_gains: (3,) of the light against calibration, blue first.
-            marker: Whose colour it is.
-            uv: A pixel on or near it [px].
-            ranges: Of the markers that have one.
-
-        Raises:
-            FitError: There is no area of one colour, or one like skin, like another marker's, or as large as no
-                marker; the message states what to do.
+        `image`: (H, W, 3) BGR; `log_gains`: (3,) of the light against calibration, blue first; `ranges`: of the
+        markers that have one. Raises FitError: no area of one colour, or one like skin, like another marker's, or too
+        large for a marker; the message states what to do.
         """
         hsv = undone(image, log_gains)
         mask = colour_region(hsv, marker, uv)
@@ -337,11 +285,7 @@ def undone(image: Image, log_gains: Float) -> Image:
 
 
 def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
-    """Return the marker-coloured region (H, W) at or near a pixel (u, v) [px].
-
-    Raises:
-        FitError: As `SampledColours.sample`.
-    """
+    """Region (H, W) of marker colour at or near (u, v) [px]; FitError as `sample`."""
     where = f"pick {marker}: ({uv[0]:.0f}, {uv[1]:.0f})"
     height, width = hsv.shape[:2]
     if not (0 <= round(uv[0]) < width and 0 <= round(uv[1]) < height):
@@ -383,10 +327,7 @@ def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
 
 
 def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
-    """Return the pixel deepest inside the coloured region at a click or beside it.
-
-    None: there is no coloured region.
-    """
+    """Return the pixel deepest inside the coloured region at or beside a click."""
     width = hsv.shape[1]
     near_share = 0.02  # of the image width: a click as far beside a marker is meant for it
     near = near_share * width
@@ -394,9 +335,8 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
     u0, v0 = max(round(uv[0]) - reach, 0), max(round(uv[1]) - reach, 0)
     window = hsv[v0 : round(uv[1]) + reach + 1, u0 : round(uv[0]) + reach + 1]
     coloured = (window[..., 1] >= PALE) & (window[..., 2] >= VALUE_LEAST) & ~in_range(window, SKIN)
-    inside = (
-        np.asarray(cv2.erode(coloured.astype(np.uint8), np.ones((2, 2), np.uint8))) != 0
-    )  # no single pixels
+    # no single pixels
+    inside = np.asarray(cv2.erode(coloured.astype(np.uint8), np.ones((2, 2), np.uint8))) != 0
     v, u = np.indices(coloured.shape)
     away = np.hypot(u + u0 - uv[0], v + v0 - uv[1])
     nearest = float(np.min(away, where=inside, initial=np.inf))
@@ -447,10 +387,7 @@ def _refuse_poor(row: ColourRow) -> None:
 
 
 def _apart(colour: HsvRange, hue: float, made: Mapping[str, HsvRange]) -> HsvRange:
-    """Return a range without the hues of the picked colours.
-
-    It keeps the part about its own hue.
-    """
+    """Return a range without the hues of the picked colours, about its own hue."""
     low, high = colour.hsv_low[0], colour.hsv_high[0]
     middle = round(hue) % HUES
     below, above = (middle - low) % HUES, (high - middle) % HUES

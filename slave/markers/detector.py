@@ -1,16 +1,13 @@
 """Marker detector: frame in, marker centroids out.
 
-It scans the frame, decides which blob is which marker and measures that blob.
+A push machine. It holds one track per marker; a new recording gets a new detector (`fresh`).
 
-A push machine. It holds one track per marker, and counts what is beside them; a new recording gets a new
-detector (`fresh`).
-
-    scan     one table look-up, all colours at once; the whole frame or windows   scan, classify
-    blobs    connected blobs per colour                                          blobs
-    decide   by prediction where a track answers; else by what belongs together  roi, group
-    measure  sub-pixel centroid of the visible marker colour, full resolution    centroid
-    outline  where the colour fills a part of a round marker only: its circle    outlines, outline
-    judge    how probable it is a marker; how far it may be off                  quality, sigma
+    scan     one table look-up, all colours at once; the whole frame or windows    scan, classify
+    blobs    connected blobs per colour                                            classify
+    decide   by prediction where a track answers; else by what belongs together    track, group
+    measure  sub-pixel centroid of the visible marker colour, full resolution      centroid
+    outline  where the colour fills only a part of a round marker: its circle      outline
+    judge    how probable it is a marker; how far it may be off                    quality, track
 """
 
 import math
@@ -62,8 +59,8 @@ class Detections:
         quality: (M,) 0..1, the probability that it is a marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, uncertainty of occlusion, size, motion.
-        alt_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
-            many only as the scan saw it, to a pixel or so; NaN: none.
+        alt_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px], NaN: none; in a
+            frame with many only as the scan saw it, to a pixel or so.
         clarity: (M,) 0..1, how far `colour` is that of the marker alone: 1 is a whole, clear marker.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
@@ -105,7 +102,7 @@ class MarkerDetector:
         Args:
             camera: Camera file with `markers` filled.
             markers: Marker names in the order of the rig.
-            seeds: Marker -> (u, v) [px], a pixel on that marker in the first frame, where known.
+            initial_uv: Marker -> (u, v) [px], a pixel on that marker in the first frame, where known.
             table: Table built before from the same ranges.
             engine: What scans and measures.
             free: Those of the markers that sit on no hand: neither skin nor neighbours are expected about them.
@@ -138,24 +135,16 @@ class MarkerDetector:
         self.evidence: dict[int, Evidence] = {}
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
-        """Return a detector of the same camera without any tracks.
-
-        It has seen nothing yet and shares the colour table.
-        """
+        """Return a detector of the same camera and colour table without any tracks."""
         free = [self._names[m] for m in self._free]
         other = MarkerDetector(self._camera, self._names, initial_uv, self._table, self._engine, free)
         other.windows_only, other._gains = self.windows_only, self._gains
         return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
-        """Detect in one frame.
+        """Detect in one frame (H, W, 3) BGR; only differences of its rising time matter.
 
-        Args:
-            image: (H, W, 3) BGR of the camera's size.
-            t_ns: Time of the frame [ns], rising; only differences matter.
-
-        Raises:
-            ValueError: The image is not of the camera's size, or not 8-bit colour.
+        Raises ValueError: the image is not of the camera's size, or not 8-bit colour.
         """
         size = (self._camera.height_px, self._camera.width_px, 3)
         if image.shape != size or image.dtype != np.uint8:
@@ -180,8 +169,7 @@ class MarkerDetector:
                 alternative = self._alternative(m, chosen[m], blobs, windows[m])
                 if alternative is not None:
                     alternatives[m] = alternative
-        # An alternative costs as much as a marker, so a frame full of them is not measured through.
-        # that are measured in one frame
+        # An alternative costs as much as a marker, so only two are measured in one frame.
         closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:2]
         asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
@@ -244,21 +232,11 @@ class MarkerDetector:
         self._tracks = [tracks.get(name) for name in self._names]
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Apply a changed exposure or margin of the camera file.
-
-        Motion smears over the exposure. From any thread.
-        """
+        """Apply a changed exposure (motion smears) or margin. From any thread."""
         self._exposure_s, self._margin = camera.exposure_us * 1e-6, camera.roi_margin
 
     def recolour(self, table: ColourTable, gains: tuple[float, float, float]) -> None:
-        """Continue with another colour table of the same markers.
-
-        The table is prepared for the engine; the tracks are kept.
-
-        Args:
-            table: Of the light that `gains` (blue, green, red) of that of calibration make.
-            gains: They, in linear light.
-        """
+        """Go on with another prepared table, of a light with `gains` against calibration."""
         self._table, self._gains = table, gains
 
     def _report(
@@ -272,10 +250,7 @@ class MarkerDetector:
         t_ns: int,
         shift_px: float,
     ) -> tuple[float, ...]:
-        """Return the report of one marker and continue its track.
-
-        `before` is its track if it was alive.
-        """
+        """Report one marker and continue its track; `before`: the track, if alive."""
         other = (math.nan, math.nan) if alternative is None else (alternative.u, alternative.v)
         support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
         # sides of the marker: an alternative so near may be taken for it in the next frame
@@ -313,13 +288,13 @@ class MarkerDetector:
         return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
 
     def _alternative(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
-        """Return the largest other blob of the colour that may be the marker.
-
-        Its size and motion must allow it; a blob that is the rim of another one is excluded.
-        """
+        """Return the largest other blob that may be the marker by size and motion."""
         alternative = 0.3  # of the marker's area: a smaller blob is no alternative, nor one as much larger
         least, most = alternative * blob.area, blob.area / alternative
-        others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
+        others = [b for b in blobs[m] if least < b.area < most]
+        others = [
+            b for b in others if not (blob.left <= b.u <= blob.right and blob.top <= b.v <= blob.bottom)
+        ]
         if window is not None:
             others = [b for b in others if math.isfinite(window.cost(b))]
         foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
@@ -349,20 +324,14 @@ class MarkerDetector:
         return self._scanner.around(image, self._table, places, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:
-        """Return the largest side [px] and the area [px^2] of the whole marker.
-
-        As far as its track knows, else inf and nan.
-        """
+        """Largest side [px] and area [px^2] of the whole marker, else inf and nan."""
         track = self._tracks[m]
         if track is None or not track.alive(t_ns):
             return math.inf, math.nan
         return 1.3 * max(track.width, track.height) + 2.0, track.whole
 
     def _decide(self, scanned: Scanned, windows: list[Window | None]) -> dict[int, Blob]:
-        """Assign blobs to markers: marker row -> blob.
-
-        By prediction alone where that answers for every colour that was seen.
-        """
+        """Marker row -> blob; by prediction alone where that answers for all seen."""
         blobs = scanned.blobs
         tracked: dict[int, Blob] = {}
         certain = not self._initial_uv
@@ -412,10 +381,7 @@ class MarkerDetector:
 
 
 def _alone(blob: Blob, options: list[Blob]) -> bool:
-    """Return whether no other blob of the colour is in the window of `blob`.
-
-    The window is the one in which `blob` is measured.
-    """
+    """Return whether no other blob of the colour is in the window of `blob`."""
     return not any(
         b.left < blob.right + PAD
         and blob.left - PAD < b.right
@@ -426,7 +392,3 @@ def _alone(blob: Blob, options: list[Blob]) -> bool:
             b.left >= blob.left and b.right <= blob.right and b.top >= blob.top and b.bottom <= blob.bottom
         )
     )
-
-
-def _within(piece: Blob, blob: Blob) -> bool:
-    return blob.left <= piece.u <= blob.right and blob.top <= piece.v <= blob.bottom

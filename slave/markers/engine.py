@@ -1,7 +1,4 @@
-"""Choice of the code that scans and measures, by name alone.
-
-The options are OpenCV and numpy, or machine code that does the same.
-"""
+"""Choice of the code that scans and measures, by name alone."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,8 +10,7 @@ from slave.markers.centroid import Measured, measure
 from slave.markers.classify import SCALE, Blob, Codes, ColourTable, find_blobs
 
 ScanBlobs: TypeAlias = Callable[
-    [Image, ColourTable, Sequence[int], int, int, int, tuple[int, int] | None],
-    tuple[Codes, list[list[Blob]]],
+    [Image, ColourTable, Sequence[int], int, int, int, tuple[int, int] | None], tuple[Codes, list[list[Blob]]]
 ]
 Measure: TypeAlias = Callable[
     [Image, ColourTable, Sequence[int], Sequence[Blob], Sequence[bool]], list[Measured | None]
@@ -27,7 +23,7 @@ class Engine:
 
     Attributes:
         scan_blobs: Image, table, bits, step, dx, dy, size of the grid as of `ColourTable.scan` -> codes of the scan
-            (may be reused by the next call), and the blobs of each colour (`blobs.find_blobs`).
+            (may be reused by the next call), and the blobs of each colour (`classify.find_blobs`).
         measure: As `centroid.measure`.
         prepare: Makes ready for a table what would else be made in the first frame: machine code, brief tables.
     """

@@ -1,30 +1,10 @@
 """Scan and measure markers in machine code, several times faster.
 
-Coarse colour table with one entry per cell of 8 x 8 x 8 colours.
-
-It summarises the colour table for each cell and is small enough for the fastest caches.
-
-The whole table (16 MiB and more) lies in slow memory; nearly all cells belong to the same markers throughout, so that
-only one pixel in sixty has to be looked up there.
-
-Machine code that measures markers as `centroid.measure` does.
-
-One window after the other, with a few passes over each.
-
-The formulas are those of `centroid` and `shares`; here they are written pixel by pixel. In place of stacks and
-masks, each window has its own size, sums are taken only where the marker is, and pixels outside count as nothing.
-
-Machine code that scans a frame and finds its blobs in one pass.
-
-It does what `ColourTable.scan` and `blobs.find_blobs` do.
-
-The scan asks the table only for colours whose lowest three bits are 0, so the cells of the
-table answer it (`fast_cells`). Points of a colour are counted while the frame is read; only scattered ones are
-labelled.
-
-Engine of machine code for scanning and measuring.
-
-It has the same arguments and results and is several times faster; needs the `fast` extra (numba).
+The engine of the `fast` extra (numba), with the arguments and results of `engine.scan_blobs` and `centroid.measure`.
+The colour table (16 MiB and more) lies in slow memory; nearly all cells of 8 x 8 x 8 colours belong to the same
+markers throughout, so a table of cells in the fastest caches answers all but one pixel in sixty, and the whole scan,
+which asks only for colours whose lowest three bits are 0. Points of a colour are counted while the frame is read;
+only scattered ones are labelled. Windows are measured one after the other (`fast_window`).
 """
 
 from collections.abc import Sequence
@@ -46,27 +26,18 @@ CELLS = 32  # of each channel
 
 
 class Cells(NamedTuple):
-    """Codes (32^3,) of cells at (blue >> 3) | (green >> 3) << 5 | (red >> 3) << 10.
+    """Codes (32^3,) of cells at (blue >> 3) | (green >> 3) << 5 | (red >> 3) << 10."""
 
-    Attributes:
-        first: Of the cell's first colour, whose lowest three bits are 0: what a scan asks for.
-        markers: Of all its colours, markers alone; the bit of skin indicates that they differ.
-        skin: (1,) that bit.
-    """
-
-    first: Codes
-    markers: Codes
-    skin: Codes
+    first: Codes  # of the cell's first colour, whose lowest three bits are 0: what a scan asks for
+    markers: Codes  # of all its colours, markers alone; the bit of skin: they differ
+    skin: Codes  # (1,) that bit
 
 
 _KNOWN: WeakKeyDictionary[ColourTable, Cells] = WeakKeyDictionary()  # a table never changes
 
 
 def cells_of(table: ColourTable) -> Cells:
-    """Return the cells of a table.
-
-    Takes 15 ms at the first call; then they are cached as long as the table lives.
-    """
+    """Return the cells of a table: 15 ms at the first call, then cached."""
     known = _KNOWN.get(table)
     if known is None:
         kind = table.entries.dtype
@@ -122,10 +93,7 @@ RULES = Rules(
 def measure(
     image: Image, table: ColourTable, bits: Sequence[int], blobs: Sequence[Blob], alone: Sequence[bool]
 ) -> list[Measured | None]:
-    """Measure the markers at `blobs`.
-
-    Arguments and result are those of `centroid.measure`.
-    """
+    """Measure the markers at `blobs`, as `centroid.measure`."""
     if not blobs:
         return []
     pad = centroid.PAD
@@ -139,17 +107,9 @@ def measure(
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
     _, cells, skin = cells_of(table)
+    boxes = np.array(asked, np.int64)
     measure_windows(
-        pixels,
-        table.entries,
-        table.places,
-        cells,
-        skin,
-        centroid.LIGHT,
-        np.array(asked, np.int64),
-        RULES,
-        answers,
-        windows,
+        pixels, table.entries, table.places, cells, skin, centroid.LIGHT, boxes, RULES, answers, windows
     )
     found: list[Measured | None] = []
     for (left, top, right, bottom, _, _, start), answer in zip(asked, answers.tolist(), strict=True):
@@ -159,43 +119,22 @@ def measure(
             continue
         height, width = bottom - top + 2 * pad, right - left + 2 * pad
         window = windows[start : start + height * width].reshape(height, width)
+        bgr, x, y = [blue, green, red], left - pad, top - pad
         found.append(
-            Measured(
-                u,
-                v,
-                area,
-                contrast,
-                [blue, green, red],
-                cut != 0.0,
-                thin != 0.0,
-                foreign,
-                xx,
-                xy,
-                yy,
-                window,
-                left - pad,
-                top - pad,
-            )
+            Measured(u, v, area, contrast, bgr, cut != 0.0, thin != 0.0, foreign, xx, xy, yy, window, x, y)
         )
     return found
 
 
 class Grid(NamedTuple):
-    """Grid of the scan and constants of `blobs`, as arguments of machine code.
+    """Grid of the scan and constants of `classify`, as arguments of machine code."""
 
-    Attributes:
-        step, dx, dy: Distance of its lines, and where it begins [px].
-        slack: How far a blob's box reaches beyond its points [px].
-        most: Blobs of one colour, at most.
-        full: Share of its box that one compact blob fills at least.
-    """
-
-    step: int
-    dx: int
+    step: int  # distance of its lines [px]
+    dx: int  # dx, dy: where it begins [px]
     dy: int
-    slack: int
-    most: int
-    full: float
+    slack: int  # how far a blob's box reaches beyond its points [px]
+    most: int  # blobs of one colour, at most
+    full: float  # share of its box that one compact blob fills at least
 
 
 def scan_blobs(
@@ -207,17 +146,7 @@ def scan_blobs(
     dy: int = 0,
     size: tuple[int, int] | None = None,
 ) -> tuple[Codes, list[list[Blob]]]:
-    """Codes of the scan, and the blobs of each colour, largest first.
-
-    Args:
-        image: (H, W, 3) BGR.
-        table: Colour table of the camera.
-        bits: Bit mask of each marker that is sought.
-        step, dx, dy, size: The grid, as for `ColourTable.scan`.
-
-    Returns:
-        Codes of that size, and one list per marker, empty where its colour is not in the image.
-    """
+    """Codes of the scan and blobs of each colour, as `engine.scan_blobs`."""
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
     cells = cells_of(table).first
@@ -238,13 +167,7 @@ def scan_blobs(
 def _scan_blobs(
     image: Image, cells: Codes, bits: Int, grid: Grid, codes: Codes, places: Float, boxes: Int
 ) -> int:
-    """Fill in the codes (H, W) and one row for each blob.
-
-    A row holds u, v, area and marker, left, top, right, bottom [px].
-
-    Returns:
-        The number of rows.
-    """
+    """Fill in codes (H, W), a row per blob (u, v, area; m, box); number of rows."""
     hits = np.empty(codes.size, np.int64)
     wanted = 0
     for bit in bits:
@@ -292,10 +215,7 @@ def _scan_blobs(
 
 @compiled
 def _read(image: Image, cells: Codes, wanted: int, grid: Grid, codes: Codes, hits: Int) -> int:
-    """Read the codes of the grid points and collect those with a wanted bit.
-
-    Fills in the codes and the places of these points; returns their number.
-    """
+    """Read the codes of the grid points; collect and count those with a wanted bit."""
     count = 0
     height, width = codes.shape
     five, ten = np.uint64(5), np.uint64(10)
@@ -335,10 +255,7 @@ def _put(
     place: Float,
     box: Int,
 ) -> None:
-    """Convert a blob from grid points to image pixels.
-
-    The box reaches to where the next points would be.
-    """
+    """Convert a blob to image pixels; its box reaches to where the next points are."""
     step = grid.step
     place[0], place[1], place[2] = grid.dx + step * x, grid.dy + step * y, step * step * points
     box[0] = m
@@ -350,9 +267,8 @@ def _put(
 def _label(codes: Codes, bit: int, left: int, top: int, right: int, bottom: int, most: int) -> Int:
     """Connected parts (8 neighbours) of a colour in its box, largest first.
 
-    Returns:
-        (N, 8) points, rank, sum of x, sum of y, left, top, right, bottom (inclusive). Of parts of one size the first
-        is the one whose first block of 2 x 2 points comes first, as OpenCV numbers them.
+    (N, 8): points, rank, sum of x, sum of y, left, top, right, bottom (inclusive). Of parts of one size the first is
+    the one whose first block of 2 x 2 points comes first, as OpenCV numbers them.
     """
     width, height = right - left + 1, bottom - top + 1
     stride = width + 2

@@ -1,10 +1,8 @@
-"""Window of one marker in machine code.
+"""Window of one marker in machine code: masks, shares and their moments.
 
-Its masks, the share of marker colour in every pixel, and their moments.
-
-The masks of a window lie in flat arrays of rows of `stride`, `EDGE` of nothing around them, so that no neighbourhood
-leaves them: pixel (x, y) of the window is at (y + EDGE) * stride + EDGE + x. `classes` holds what the colour table
-makes of a pixel, `kinds` what its neighbourhood does. The formulas stand in `centroid` and `shares`.
+The formulas are those of `centroid`, pixel by pixel. The masks of a window lie in flat arrays of rows of `stride`,
+`EDGE` of nothing around them, so that no neighbourhood leaves them: pixel (x, y) is at (y + EDGE) * stride + EDGE +
+x. `classes` holds what the colour table makes of a pixel, `kinds` what its neighbourhood does.
 
 All in one file: the cache of compiled code looks for changes only in the file of the function that is called, so code
 taken in from another file could be old.
@@ -34,7 +32,7 @@ FOUND, U, V, AREA, CONTRAST, BLUE, GREEN, RED, CUT, THIN, FOREIGN, XX, XY, YY = 
 
 
 class Rules(NamedTuple):
-    """The constants of `centroid` and `shares`, as arguments of machine code."""
+    """The constants of `centroid`, as arguments of machine code."""
 
     pad: int
     reach: int
@@ -53,22 +51,14 @@ class Rules(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Part of a window [px], with the memory layout and coordinates of its pixels.
-
-    x1 and y1 are exclusive.
-
-    Attributes:
-        x0, y0, x1, y1: The part.
-        stride: Length of a row.
-        x_middle, y_middle: The pixel from which coordinates are counted.
-    """
+    """Part of a window [px], with the memory layout and coordinates of its pixels."""
 
     x0: int
     y0: int
-    x1: int
+    x1: int  # x1, y1: exclusive
     y1: int
-    stride: int
-    x_middle: int
+    stride: int  # length of a row
+    x_middle: int  # x_middle, y_middle: the pixel from which coordinates are counted
     y_middle: int
 
 
@@ -104,10 +94,7 @@ def measure_windows(
 
 @compiled
 def _ask_ahead(image: Image, asked: Int, pad: int) -> int:
-    """Prefetch every cache line that the windows need.
-
-    Memory is slow, but it answers many requests at once.
-    """
+    """Prefetch the windows' cache lines: memory is slow, but answers many at once."""
     touched = 0
     for k in range(len(asked)):
         x0, x1 = max(asked[k, LEFT] - pad, 0), min(asked[k, RIGHT] + pad, image.shape[1])
@@ -138,17 +125,14 @@ def _measure_window(
     """Measure one marker.
 
     Args:
-        image: (H, W, 3) BGR.
         table: (2^24,) codes.
         places: (3, 256) what each byte of blue, green and red adds to the place in the table.
-        cells: (32^3,) codes of cells; skin: (1,) the bit that indicates that a cell has none (`fast_cells`).
+        cells: (32^3,) codes of cells; skin: (1,) the bit that indicates that a cell has none (`fast.Cells`).
         curve: (256,) byte -> linear light.
         ask: (7,) box, bit, whether alone, where its window starts in `windows`.
-        rules: Constants.
         answer: (14,) zeros; stays so where nothing is found.
         windows: Shares of all windows, flat, zeros.
         room, levels: For the masks and the light of the largest window, (6 N,) and (3 N,).
-        ramp: 0, 1, 2 ...
     """
     left, top = ask[LEFT] - rules.pad, ask[TOP] - rules.pad
     width, height = ask[RIGHT] + rules.pad - left, ask[BOTTOM] + rules.pad - top
@@ -253,10 +237,7 @@ def _classify(
 
 @compiled
 def _keep_parts_inside(inset: int, width: int, height: int, stride: int, classes: Image) -> None:
-    """Assign mask parts that do not reach inside the window to another marker.
-
-    A part stays if it is connected (8 neighbours) to a pixel of the mask that lies `inset` inside the window.
-    """
+    """Give mask parts without a pixel `inset` inside the window to another marker."""
     kept = 4  # a class of its own while it grows
     stack = np.empty(width * height, np.int64)
     for y in range(inset, max(height - inset, inset + 1)):
@@ -349,10 +330,7 @@ def _add(a: Image, into: Image, step: int, begin: int, end: int) -> None:
 
 @compiled
 def _add_around(threes: Image, a: Image, into: Image, step: int, begin: int, end: int) -> None:
-    """Add each pixel and the sums of three at `step` before and behind it.
-
-    This is the sum of seven pixels.
-    """
+    """Add a pixel and the sums of three at `step` before and behind: seven pixels."""
     n = end - begin
     before, here, after, out = threes[begin - step :], a[begin:], threes[begin + step :], into[begin:]
     for p in range(n):
@@ -363,10 +341,7 @@ def _add_around(threes: Image, a: Image, into: Image, step: int, begin: int, end
 def _sums_of_ring(
     whole: Frame, every: int, classes: Image, kinds: Image, light: Float32
 ) -> tuple[float, ...]:
-    """Return number, sums and sums of products of the light of the ring's pixels.
-
-    Only one of `every` columns is used.
-    """
+    """Number, sums, sums of products of the ring's light, one of `every` columns."""
     n, b, g, r, bb, bg, br, gg, gr, rr = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     first = -(-whole.x0 // every) * every
     for y in range(whole.y0, whole.y1):
@@ -391,10 +366,7 @@ def _sums_of_ring(
 
 @compiled
 def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -> None:
-    """Clear the near mark in thick regions of other markers.
-
-    Other markers' pixels are not near where a square of 3 x 3 of them fits: a colour fringe is thinner.
-    """
+    """Clear the near mark where 3 x 3 pixels of others fit: a fringe is thinner."""
     stride = part.stride
     begin, end = (part.y0 + EDGE) * stride, (part.y1 + EDGE) * stride
     a, b = room[0], room[1]
@@ -417,10 +389,7 @@ def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -
 
 @compiled
 def _sums_over(mask: Image, bit: int, part: Frame, light: Float32, ramp: Float32) -> tuple[float, ...]:
-    """Return the sums over the pixels with `bit`.
-
-    They are: number, x, y, xx, xy, yy, light of 3 channels, that times x, that times y.
-    """
+    """Sums where `bit`: number, x, y, xx, xy, yy, light (3), that times x, times y."""
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     b, g, r, bx, gx, rx, by, gy, ry = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     count, middle = part.x1 - part.x0, np.float64(part.x_middle - part.x0)
@@ -469,10 +438,7 @@ def _light_over(mask: Image, bit: int, part: Frame, light: Float32) -> tuple[flo
 
 @compiled
 def _discriminant(ring: tuple[float, ...], mean: Three, rules: Rules) -> tuple[Three, float, float]:
-    """Return the discriminant direction of the marker colour in light.
-
-    Also its coordinate at the ring's mean, and the power of the step from there.
-    """
+    """Direction of the marker colour in light, its ring's coordinate, step's power."""
     n = max(ring[0], 1.0)
     b, g, r = ring[1] / n, ring[2] / n, ring[3] / n
     q = rules.shaded
@@ -493,10 +459,7 @@ def _discriminant(ring: tuple[float, ...], mean: Three, rules: Rules) -> tuple[T
 
 @compiled
 def _shading(sums: tuple[float, ...], w: Three, zero: float, rules: Rules) -> Three:
-    """Fit the plane a + b x + c y of the marker colour's brightness.
-
-    Coordinates along `w` are sums of light, so their sums are as well.
-    """
+    """Fit the plane a + b x + c y of the marker colour's brightness along `w`."""
     n, x, y, xx, xy, yy, b, g, r, bx, gx, rx, by, gy, ry = sums
     stiff = max(n, 1.0)
     right = (
@@ -535,10 +498,7 @@ def _share_out(
     into: Float32,
     ramp: Float32,
 ) -> tuple[float, ...]:
-    """Fill in the shares and return their moments.
-
-    The moments are 1, x, y, xx, xy, yy in pixels of the window.
-    """
+    """Fill in the shares; return moments 1, x, y, xx, xy, yy in window pixels."""
     w0, w1, w2, at_zero = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(zero)
     slope, darkest = np.float32(level[1]), np.float32(rules.darkest)
     nothing, all_inside = np.float32(0.0), np.float32(1.0)
@@ -577,10 +537,7 @@ def _share_out(
 
 @compiled
 def _foreign(x0: int, y0: int, x1: int, y1: int, stride: int, classes: Image) -> float:
-    """Return the share of the mask's neighbours that have another marker's colour.
-
-    Only neighbours in the given part of the window count.
-    """
+    """Share of the mask's neighbours in a part that have another marker's colour."""
     rim, others = 0, 0
     for y in range(y0, y1):
         for x in range(x0, x1):

@@ -1,24 +1,13 @@
 """Select the blobs that are markers, and count what else has their colour.
 
-Selection of the blobs that are markers among all blobs.
+Used when the past does not answer: at the start, when a marker comes back, or when something in a marker's colour
+competes with it. Markers of one hand are close together for their size, skin touches them, and tracked ones have a
+place. Two blobs are linked when their distance is at most `REACH` times the geometric mean of their sizes, more where
+skin touches both; the linked set with the best sum of evidence is the hand. On rendered hands neighbouring tips are
+2-4 sizes apart, the little finger and the thumb 12, back and middle finger 7, clutter 10 and more.
 
-Those are chosen that belong together, as markers of one hand do.
-
-Used when the past does not answer: at the start, when a marker comes back, or when something in the marker's
-colour (a green mug, a blue pen) competes with it. Three facts separate markers from clutter, none of which knows the
-hand: markers are close together for their size, skin touches them, and those of the past have a place.
-
-Two blobs are linked when their distance is at most `REACH` times the geometric mean of their sizes, more where skin
-touches both; the linked set with the best sum of evidence is the hand. Measured on rendered hands: neighbouring
-tips are 2-4 sizes apart, the little finger and the thumb 12, back and middle finger 7, clutter 10 and more.
-
-Counts of things beside the hand that have the colour of a marker.
-
-They are counted so that somebody removes them.
-
-The detector finds the hand among them while it can; each is one more way to be wrong, above all when the hand comes
-back. What counts has at least `LEAST` px^2 and a share of the marker's own area, does not touch the marker, and is no
-rim between two other colours.
+What is counted beside the hand, so that somebody removes it, has at least `LEAST` px^2 and a share of the marker's
+own area, does not touch the marker, and is no rim between two other colours.
 """
 
 import math
@@ -38,45 +27,26 @@ SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
 
 
 class Candidate(NamedTuple):
-    """Blob that may be marker `marker`, with the evidence for it.
-
-    Made by `candidate`.
-
-    Attributes:
-        marker: Row of the marker.
-        blob: The blob.
-        skin: Share of its surroundings that is skin, 0..1.
-        fringe: It touches a much larger blob of another colour: perhaps only the rim of that one.
-        bonus: What click or track add to its score.
-        size: Side of a square of the same area [px].
-        score: Sum of evidence; 1 for being there at all.
-    """
+    """Blob that may be marker `marker`, with the evidence for it (`candidate`)."""
 
     marker: int
     blob: Blob
-    skin: float
-    fringe: bool
-    bonus: float
-    size: float
-    score: float
+    skin: float  # share of its surroundings that is skin, 0..1
+    fringe: bool  # it touches a much larger blob of another colour: perhaps only its rim
+    bonus: float  # what click or track add to its score
+    size: float  # side of a square of the same area [px]
+    score: float  # sum of evidence; 1 for being there at all
 
 
 def candidate(marker: int, blob: Blob, skin: float, fringe: bool, bonus: float) -> Candidate:
     """A candidate with its size and its score."""
-    # what a fringe counts
     there = min(1.0, blob.area / SPECK) ** 2 * (0.3 if fringe else 1.0)
     score = there * (1.0 + min(1.0, 3.0 * skin)) + bonus
     return Candidate(marker, blob, skin, fringe, bonus, math.sqrt(blob.area), score)
 
 
 def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
-    """Share of the points around a blob that are skin, 0..1.
-
-    Args:
-        codes: (H, W) codes of the scan at every `SCALE`-th pixel.
-        skin: Bit mask of skin.
-        blob: The blob; its box reaches to the next points around it.
-    """
+    """Share 0..1 of the points around a blob in a scan's codes (H, W) that are skin."""
     # The box is as wide as the grid leaves open: its border lies one pixel before the points around the blob.
     top, left = max((blob.top - 1) // SCALE, 0), max((blob.left - 1) // SCALE, 0)
     window = codes[top : blob.bottom // SCALE + 1, left : blob.right // SCALE + 1]
@@ -87,10 +57,8 @@ def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
     """Return whether `blob` may be the rim of a blob of another colour.
 
-    At such a rim the hue runs through the colour of `blob`.
-
-    It touches one that is much larger, or its middle lies in or next to the box of one that is as large: motion
-    blur makes rims wide.
+    At a rim the hue runs through other colours. It touches one that is much larger, or its middle lies in or next to
+    the box of one that is as large: motion blur makes rims wide.
     """
     same = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
     fringe_ratio = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
@@ -110,10 +78,7 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
 
 
 def connected(blobs: Sequence[Blob]) -> bool:
-    """Return whether every blob is linked to another one.
-
-    Skin around both is taken as given, since their past supports it.
-    """
+    """Whether every blob is linked to another one; skin around both is presumed."""
     reach = (REACH * (1.0 + SKIN_REACH)) ** 2
     places = [(blob.u, blob.v, math.sqrt(blob.area)) for blob in blobs]
     for i, (u, v, size) in enumerate(places):
@@ -128,10 +93,8 @@ def connected(blobs: Sequence[Blob]) -> bool:
 def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     """Choose the markers among the candidates: marker row -> candidate.
 
-    A marker without a plausible blob is absent.
-
-    The best group is a hand. Markers that it has not may be on a second hand: a group of at least `SECOND_HAND`
-    markers with skin. Less than that is clutter that happens to lie together.
+    A marker without a plausible blob is absent. The best group is a hand; markers that it lacks may be on a second
+    hand, a group of at least `second_hand` markers with skin. Less than that is clutter that happens to lie together.
     """
     links = _links(candidates)
     rest = set(range(len(candidates)))
@@ -191,10 +154,7 @@ def _best_group(candidates: Sequence[Candidate], links: Sequence[set[int]], amon
 
 
 def _components(links: Sequence[set[int]], among: set[int]) -> list[list[int]]:
-    """Return the connected components of the candidates in a fixed order.
-
-    A component is a set of candidates that are linked directly or through others.
-    """
+    """Return the connected components of the candidates in a fixed order."""
     rest = set(among)
     groups: list[list[int]] = []
     while rest:
@@ -209,10 +169,7 @@ def _components(links: Sequence[set[int]], among: set[int]) -> list[list[int]]:
 
 
 def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
-    """Score how well a candidate suits the rest of its group.
-
-    It serves to choose among alternatives of one marker.
-    """
+    """Score how well one of a marker's alternatives suits the rest of its group."""
     others = [c for c in members if c.marker != candidate.marker and c.blob.area >= SPECK]
     if not others:
         return candidate.score + 1e-4 * candidate.blob.area
@@ -223,11 +180,7 @@ def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
 
 
 def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
-    """Return whether a blob lies like clutter beside a hand.
-
-    No skin touches it, and it is as large as the largest marker, or thin like a pen. A cap seen from its tip has no
-    skin around it either, but it is small and round.
-    """
+    """Whether a blob lies like clutter beside a hand: no skin, and large or thin."""
     others = [c for c in others if c.blob.area >= SPECK]
     if not others or candidate.bonus >= TRACKED or candidate.skin >= SKINLESS:
         return False
@@ -255,13 +208,9 @@ LEAST = 40.0  # px^2: specks come and go in every picture
 
 
 class ColourAmbiguityMonitor:
-    """Push machine that counts things in the colour of a marker.
+    """Push machine that counts things in the colour of a marker beside it.
 
-    Holds in how many frames each marker had such things beside it, and where they were last.
-
-    Attributes:
-        frames: Marker -> how many frames.
-        places: Marker -> (u, v) [px] of the largest thing in the last such frame.
+    `frames`: marker -> in how many; `places`: marker -> (u, v) [px] of the largest thing in the last such frame.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -271,12 +220,7 @@ class ColourAmbiguityMonitor:
         self.places: dict[str, tuple[float, float]] = {}
 
     def push(self, blobs: Sequence[Sequence[Blob]], chosen: Mapping[int, Blob]) -> None:
-        """Look at one frame.
-
-        Args:
-            blobs: Of each marker's colour, the largest first.
-            chosen: Row of a marker -> the blob that it is taken for.
-        """
+        """Look at a frame: blobs of each colour, largest first; row -> the marker's blob."""
         if not chosen:
             return  # no hand to be beside of
         for m, options in enumerate(blobs):
@@ -309,10 +253,7 @@ def _far(blob: Blob, own: Blob) -> bool:
 
 
 def _whole(blob: Blob, others: Sequence[Blob]) -> bool:
-    """Return whether a blob is a thing of its own.
-
-    It is neither around nor within a marker of another colour.
-    """
+    """Return whether a blob is neither around nor within a marker of another colour."""
     return not any(
         blob.left - SCALE <= other.u <= blob.right + SCALE
         and blob.top - SCALE <= other.v <= blob.bottom + SCALE
@@ -327,20 +268,14 @@ class MarkerSource(Protocol):
 
 
 def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
-    """Return the ambiguity counts of `Health`.
-
-    ambiguous.<marker>, frames with something else in its colour.
-    """
+    """Counts of `Health`: ambiguous.<marker>, frames with other things of its colour."""
     return (
         {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
     )
 
 
 def ambiguity_metrics(detector: MarkerSource | None) -> dict[str, float]:
-    """Return the ambiguity metrics of `Health`.
-
-    ambiguous.<marker>.u and .v, where the other thing was last [px].
-    """
+    """Metrics of `Health`: ambiguous.<marker>.u and .v, its last place [px]."""
     if detector is None:
         return {}
     places = list(detector.ambiguity.places.items())  # the loop may add one

@@ -1,40 +1,21 @@
 """Estimate the light from the markers' colours, or from a whole image.
 
-Estimate of the change of the light since calibration.
-
-It is made from the colours of the markers themselves.
-
-Another light multiplies each channel in linear light by one gain that all surfaces share (von Kries). A marker shows,
-against its colour at calibration, the product of these gains and of its own shading s, which is the same in all three
-channels (a cap turned from the lamp):
+Another light multiplies each channel in linear light by one gain that all surfaces share (von Kries). Against its
+colour at calibration a marker shows these gains x and its own shading s, the same in all channels:
 
     log colour[m, k] - log reference[m, k] = x[k] + s[m] + e[m, k]
 
-x, the log gains, are solved from all markers of a frame together by weighted least squares. A channel weighs by
-what it can measure: a marker is nearly black in one or two channels; what is seen there is sheen and flare, which
-come and go with the pose (`OUTLIER`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
-worse it fits (Cauchy weights, Holland and Welsch 1977). The estimate follows the solution slowly, and never leaves
-its bounds.
+x is solved from all markers of a frame by weighted least squares. A channel weighs by what it can measure: where a
+marker is nearly black, sheen and flare are seen (`outlier`); a marker that fits badly weighs less (Cauchy weights,
+Holland and Welsch 1977). The estimate follows slowly within bounds. What a few markers cannot constrain stays near an
+anchor, the light that many markers last agreed on, since else one marker a little off would carry the light away with
+it.
 
-What a few markers cannot constrain stays near an anchor: the light that many markers last agreed on. Without it, one
-marker whose colour differs a little from its reference would, look by look, carry the light away with it.
-
-Initial estimate of the light of an image from all its colours at once.
-
-Nothing else is known of the image.
-
-Under a light much warmer or cooler than that of calibration every hue has moved, and one marker looks like another one
-at calibration. What none of them can imitate is the whole set: only under the right light do all markers seen
-fit all references. So lights are tried: for each, its picture is undone to the light of calibration, blobs are
-found as ever, and the better their colours fit the references together, the more the light explains.
-
-The lights tried lie on the line of black bodies. In the logarithms of red/green and blue/green it is straight: by
-Wien's law a channel at wavelength l gains -c2/l (1/T' - 1/T) (Finlayson and Hordley 2001, J. Opt. Soc. Am. A 18, 253).
-The fit to the blobs then leaves the line as far as they ask for it.
-
-Where little but skin is seen, a light far warmer than any lamp explains it best: skin is the colour of a thumb there,
-its shadow that of a finger. So a light beyond what is followed proves nothing, and one that nobody expects needs
-more markers than the one that is expected.
+At a start one marker looks like another one at calibration; only under the right light do all fit all references. So
+lights on the line of black bodies are tried: by Wien's law a channel at wavelength l gains -c2/l (1/T' - 1/T),
+straight in log red/green and blue/green (Finlayson and Hordley 2001, J. Opt. Soc. Am. A 18, 253); the fit then leaves
+the line. Where little but skin is seen, a light far warmer than any lamp explains it best: a light beyond the bounds
+proves nothing, and one that is not expected needs more markers.
 """
 
 import math
@@ -62,25 +43,18 @@ EYE = np.eye(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GainFit:
-    """Gains of one look at the markers.
+    """Gains of one look at the markers."""
 
-    Attributes:
-        log_gains: (3,) natural logarithms, blue, green, red.
-        residual: (M,) distance of each marker from them, in standard deviations; NaN: not seen.
-    """
-
-    log_gains: Float
-    residual: Float
+    log_gains: Float  # (3,) natural logarithms, blue, green, red
+    residual: Float  # (M,) distance of each marker from them, in standard deviations; NaN: not seen
 
 
 def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> GainFit:
     """Gains that best explain the colours of the markers.
 
-    Args:
-        colour: (M, 3) linear light of each marker's core, blue first; NaN or 0: not seen.
-        reference: (M, 3) the same at calibration, positive.
-        weight: (M,) 0..1, how far each observation is trusted.
-        known: (3,) log gains known before; where the markers constrain nothing, they stay.
+    `colour`: (M, 3) linear light of each core, blue first, NaN or 0: not seen; `reference`: (M, 3) the same at
+    calibration; `weight`: (M,) 0..1, trust in each; `known`: (3,) log gains that stay where the markers constrain
+    nothing.
     """
     residual = np.full(len(colour), np.nan)
     seen = np.flatnonzero((np.nan_to_num(colour) > 0.0).all(axis=1) & (np.nan_to_num(weight) > 0.0))
@@ -119,10 +93,7 @@ def _distance(away: Float, information: Float) -> Float:
 
 
 def bounded(log_gains: Float) -> Float:
-    """Clip log gains (3,) to their bounds.
-
-    Green first, then red and blue against it.
-    """
+    """Clip log gains (3,): green first, then red and blue against it."""
     blue, green, red = log_gains.tolist()
     b = min(max(blue - green, -LOG_LIMITS[0]), LOG_LIMITS[0])
     r = min(max(red - green, -LOG_LIMITS[2]), LOG_LIMITS[2])
@@ -138,20 +109,10 @@ def at_bound(log_gains: Float) -> bool:
 
 
 class ColourDrift:
-    """Tracker of the light of one camera.
-
-    Holds the log gains, their anchor, and the time of the last look.
-    """
+    """Tracker of the light of one camera: log gains, anchor, time of the last look."""
 
     def __init__(self, reference: Float) -> None:
-        """Begin at the light of calibration.
-
-        Args:
-            reference: (M, 3) linear light of each marker's core at calibration, blue first.
-
-        Raises:
-            ValueError: A reference is not three positive numbers.
-        """
+        """Begin at calibration; `reference`: (M, 3) linear light, positive or ValueError."""
         if reference.ndim != 2 or reference.shape[1] != 3 or not (reference > 0.0).all():
             raise ValueError(f"reference must be (M, 3) positive, got {reference.shape}")
         self._reference = reference
@@ -168,19 +129,13 @@ class ColourDrift:
         self._x = self._anchor = bounded(log_gains)
 
     def shift(self, change: Float) -> None:
-        """Add a change of the light (3,), in log gains, that was measured elsewhere.
-
-        It was measured on what stands still.
-        """
+        """Add a change of the light (3,), in log gains, measured on what stands still."""
         self._x, self._anchor = bounded(self._x + change), bounded(self._anchor + change)
 
     def push(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
         """Learn from the markers of one frame; None where the last look is too recent.
 
-        Args:
-            colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
-            clarity: (M,) 0..1; NaN: not seen.
-            t_ns: Time of the frame [ns], rising.
+        `colour`: (M, 3) linear light of each core, blue first, NaN: not seen; `clarity`: (M,) 0..1.
         """
         every_ns = 100_000_000  # colours are looked at so often; light has no need of more
         if self._t_ns is not None and 0 <= t_ns - self._t_ns < every_ns:
@@ -213,36 +168,22 @@ LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What speaks for one light.
+    """What speaks for one light."""
 
-    Attributes:
-        log_gains: (3,) of the light, blue, green, red, after the fit to its blobs.
-        score: Markers that fit, each 0..1.
-        matched: How many of them.
-        residual: (M,) of each marker in standard deviations; NaN: none found.
-        proven: At least `PROOF` markers fit, `PROOF_ELSEWHERE` where it is clearly not the expected light, and no
-            clearly different light comes near.
-        excluded: `PROOF` markers fit a light that leaves the expected one far behind.
-        beyond: The fit would leave the bounds of red or blue against green.
-    """
-
-    log_gains: Float
-    score: float
-    matched: int
-    residual: Float
-    proven: bool = False
-    excluded: bool = False
-    beyond: bool = False
+    log_gains: Float  # (3,) of the light, blue, green, red, after the fit to its blobs
+    score: float  # markers that fit, each 0..1
+    matched: int  # how many of them
+    residual: Float  # (M,) of each marker in standard deviations; NaN: none found
+    proven: bool = False  # enough markers fit, and no clearly different light comes near
+    excluded: bool = False  # `PROOF` markers fit a light that leaves the expected one far behind
+    beyond: bool = False  # the fit would leave the bounds of red or blue against green
 
 
 def initial_white_balance(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
     """The light that explains most of a picture, and whether the picture proves it.
 
-    Args:
-        image: (H, W, 3) BGR.
-        table: Colour table of the calibration.
-        reference: (M, 3) linear light of each marker's core at calibration, blue first.
-        expected: (3,) log gains of the light that is expected, blue, green, red; 0 at a start.
+    `reference`: (M, 3) linear light of each marker's core at calibration, blue first; `expected`: (3,) log gains of
+    the light that is expected, blue, green, red; 0 at a start.
     """
 
     def score_of(item: Evidence) -> float:
@@ -281,24 +222,14 @@ def lights() -> Float:
 
 
 def off_line(log_gains: Float) -> float:
-    """Return the distance of red against green from the line of black bodies.
-
-    Given blue against green.
-    """
+    """Return the distance of red/green from the line of black bodies at blue/green."""
     blue, green, red = log_gains
     line = lights()[-1]
     return float(abs((red - green) - line[2] / line[0] * (blue - green)))
 
 
 def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float) -> Evidence:
-    """Return the evidence of an image for a light.
-
-    Args:
-        half: (h, w, 3) BGR, every second pixel of every second row, C-contiguous.
-        table: Colour table of the calibration.
-        reference: (M, 3) linear light of each marker's core at calibration, blue first.
-        log_gains: (3,) of the light, blue, green, red.
-    """
+    """Evidence of every second pixel (h, w, 3), C-contiguous, for log gains (3,)."""
     undone = np.asarray(cv2.LUT(half, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
     codes = table.codes(undone)
     colour = np.full(reference.shape, np.nan)
@@ -328,10 +259,7 @@ def _separated_hues(a: Float, b: Float) -> float:
 
 
 def _colours(half: Image, mask: Image) -> list[Float]:
-    """Return the mean linear light (3,) of the largest blobs of a mask.
-
-    Over the inner pixels of each blob; at most `BLOBS_EACH` blobs.
-    """
+    """Return the mean linear light (3,) within the largest blobs of a mask."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
     rows = cast(list[list[int]], stats.tolist())  # left, top, width, height, area
     speck = 6  # of these pixels; smaller blobs prove nothing

@@ -1,11 +1,7 @@
 """Fit the outline of a marker whose colour fills only a part of it.
 
-Find the outline of a round marker whose colour fills only a part of it.
-
-A lit ball or bead is no flat colour: its top turns pale, its dark side loses the hue, a finger lies in front of it.
-The mask of its colour is then a part of it, of any form, and what surrounds the mask is again the marker. Its outline
-is still there as an edge of the picture. A circle is sought on which the picture has edges in as many directions as
-possible, whatever the colours on both sides:
+A lit ball is no flat colour: its top turns pale, its dark side loses the hue, a finger lies in front of it. Its
+outline is still an edge of the picture. A circle is sought with edges in as many directions as possible:
 
 1. About the convex hull of the mask the picture is sampled in polar coordinates. The radial gradient of its three
    channels is the strength of an edge, limited, so that one strong edge does not outvote a faint outline.
@@ -13,15 +9,9 @@ possible, whatever the colours on both sides:
    1972, read along each circle).
 3. The strongest edge near the circle on each ray, with Cauchy weights, gives it by iterated least squares.
 
-A circle that holds too little of the mask, or that has edges in too few directions, is no answer.
-
-Choice of the markers whose outline is sought in a frame.
-
-An outline costs as much as a frame of clear markers.
-
-Where the contrast is low, the surroundings may be the marker as well. Where it is clear, only an outline decides:
-a large marker is looked at when it is found, from time to time, and as long as it has one that holds more than its
-colour.
+A circle that holds too little of the mask, or has edges in too few directions, is no answer. An outline costs as much
+as a frame of clear markers, so it is sought where the contrast is low, and of large clear markers when they are
+found, from time to time, and as long as the outline holds more than the colour.
 """
 
 import math
@@ -52,20 +42,13 @@ _COS, _SIN = np.cos(_RAY * (2.0 * math.pi / RAYS)), np.sin(_RAY * (2.0 * math.pi
 
 
 class Outline(NamedTuple):
-    """A circle about a marker.
+    """A circle about a marker."""
 
-    Attributes:
-        u, v: Centre [px], distorted image.
-        radius: Radius [px].
-        support: Share of the directions in which the picture has an edge there, 0..1.
-        sigma: Standard deviation of the centre per axis [px].
-    """
-
-    u: float
+    u: float  # centre u, v [px], distorted image
     v: float
-    radius: float
-    support: float
-    sigma: float
+    radius: float  # [px]
+    support: float  # share of the directions in which the picture has an edge there, 0..1
+    sigma: float  # standard deviation of the centre per axis [px]
 
     def measured(self, seen: Measured) -> Measured:
         """What was measured, with the place and the moments of the whole disc."""
@@ -75,12 +58,7 @@ class Outline(NamedTuple):
 
 
 def outline_of(image: Image, seen: Measured) -> Outline | None:
-    """The circle about what was measured, or None where the picture shows none.
-
-    Args:
-        image: (H, W, 3) BGR, full resolution.
-        seen: The measurement; its shares show where the colour is.
-    """
+    """Circle about what was measured in (H, W, 3) BGR; None: the picture has none."""
     mask = (seen.window >= 0.5).astype(np.uint8)
     borders, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not borders:
@@ -101,20 +79,12 @@ def outline_of(image: Image, seen: Measured) -> Outline | None:
     if support < supported or inside < held * len(u) or inside < filled * math.pi * radius * radius:
         return None
     unseen = 0.1  # of the radius: standard deviation of the centre where no direction had one
-    return Outline(
-        seen.left + x,
-        seen.top + y,
-        radius,
-        support,
-        math.hypot(size * sigma, unseen * (1.0 - support) * radius),
-    )
+    sigma = math.hypot(size * sigma, unseen * (1.0 - support) * radius)
+    return Outline(seen.left + x, seen.top + y, radius, support, sigma)
 
 
 def _edges(image: Image, u: float, v: float, size: float) -> Float32:
-    """Return the strength (RAYS, RADII) of the edges about (u, v) [px].
-
-    On rays `_RAY` at `_AT` radii of `size` [px].
-    """
+    """Strength (RAYS, RADII) of the edges about (u, v) at `_AT` radii of `size` [px]."""
     reach = math.ceil(FARTHEST * size) + 2
     left, top = max(math.floor(u) - reach, 0), max(math.floor(v) - reach, 0)
     part = image[top : math.floor(v) + reach + 1, left : math.floor(u) + reach + 1]
@@ -136,20 +106,14 @@ def _grid(*axes: Sequence[float] | Float) -> Float:
 
 
 def _distance(circles: Float) -> Float:
-    """Return where the rays meet circles (N, 3), as distances (N, RAYS).
-
-    From the hull's centre; all in the hull's radii.
-    """
+    """Return where the rays meet circles (N, 3): distances (N, RAYS) in hull radii."""
     du, dv, radius = circles[:, 0:1], circles[:, 1:2], circles[:, 2:3]
     across = du * _SIN - dv * _COS
     return du * _COS + dv * _SIN + np.sqrt(np.maximum(radius * radius - across * across, 0.0))
 
 
 def _samples(circles: Float) -> Whole:
-    """Return the samples (N, RAYS) on circles (N, 3).
-
-    As indices of the flat strength; the ends have no strength.
-    """
+    """Samples (N, RAYS) on circles (N, 3): indices of the strength, 0 at the ends."""
     place = np.rint((_distance(circles) - NEAREST) / _STEP).astype(np.intp)
     return np.clip(place, 0, RADII - 1) + RADII * _RAY
 
@@ -160,10 +124,7 @@ _FINER = tuple(_grid(*[np.linspace(-half, half, 5)] * 3) for half in FINER)
 
 
 def _best(strength: Float32) -> Float:
-    """Return the circle (3,) along which the edges are strongest on average.
-
-    As du, dv, radius in radii of the hull.
-    """
+    """Return the circle (du, dv, radius) with the strongest edges, in hull radii."""
     limit = 1.5  # edges: what a stronger one counts
     limited = np.minimum(strength, limit)
     circle: Float = _COARSE[int(np.argmax(limited.take(_COARSE_SAMPLES).sum(axis=1)))]
@@ -174,10 +135,7 @@ def _best(strength: Float32) -> Float:
 
 
 def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, float, float]:
-    """Fit a circle to the edges by least squares.
-
-    Returns centre, radius, support and standard deviation of the centre, in radii of the hull.
-    """
+    """Least squares: centre, radius, support, sigma of the centre, in hull radii."""
     covariance: Float = np.eye(3)
     own: Bool = np.zeros(RAYS, np.bool_)
     rounds = 4
@@ -220,13 +178,8 @@ class Outlines:
     ) -> dict[int, Outline]:
         """Seek the outlines of one frame, those of the largest first.
 
-        Args:
-            image: (H, W, 3) BGR.
-            seen_as: Marker row -> its measurement by colour.
-            anew: Rows of those that were not tracked.
-
-        Returns:
-            Marker row -> its outline, where it has one that is to be used rather than its colour.
+        `seen_as`: marker row -> its measurement by colour; `reset`: rows of those that were not tracked. Returns
+        marker row -> its outline, where that is to be used rather than its colour.
         """
         self._frame += 1
         sought: list[tuple[float, int]] = []
@@ -252,10 +205,7 @@ class Outlines:
 
 
 def _holds_more(outline: Outline, seen: Measured) -> bool:
-    """Return whether the outline is to be used.
-
-    Beside a clear contrast it is used only if it is sure, and larger than the colour.
-    """
+    """Return whether the outline is used: at clear contrast if sure and larger."""
     if seen.contrast < CLEAR_CONTRAST:
         return True
     sure = 0.8  # and taken with an edge in this share of the directions,

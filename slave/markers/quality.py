@@ -1,14 +1,13 @@
 """Probability that a detection is a marker, from its appearance.
 
-A field, a window frame or a face holds pixels of every colour, and what a colour table finds there has an area and a
-centroid like a marker. But a marker is of one colour against its surroundings, near the middle of its range, and a cap
-or bead is compact. A logistic regression weighs that:
+A field, a window frame or a face holds pixels of every colour. But a marker is of one colour against its
+surroundings, near the middle of its range, and compact. A logistic regression weighs that:
 
     P(marker) = 1 / (1 + exp(-(w0 + w . evidence)))
 
-`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, markers drawn into photographs)
-and to what is found in photographs without markers, half and half: where things in the colours of the markers are more
-frequent than markers, less of what is found is right than it reports.
+`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, markers drawn into
+photographs) and to what is found in photographs without markers, half and half: where things in the colours of the
+markers are more frequent than markers, less of what is found is right than it reports.
 """
 
 import math
@@ -19,35 +18,21 @@ from common.calibration import HsvRange
 from slave.markers.centroid import Measured
 from slave.markers.classify import HUES
 
-CLEAR_CONTRAST = (
-    6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
-)
+CLEAR_CONTRAST = 6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought
 
 
 class Evidence(NamedTuple):
-    """What speaks for a marker; every entry is free of the camera's resolution.
+    """What speaks for a marker; every entry is free of the camera's resolution."""
 
-    Attributes:
-        contrast: Logarithm of the contrast between marker and surroundings, at most that of `LARGEST_CONTRAST`.
-        unclear: 1: the contrast is below `CLEAR_CONTRAST`.
-        outlined: Then the share of directions in which a round outline was found, else 0.
-        fullness: Area over that of the ellipse with the same second moments: 1 is an ellipse, less has gaps or arms.
-        slender: Logarithm of the ratio of the axes of that ellipse.
-        hue: Distance of the hue from the middle of the range in half ranges, squared.
-        alternative: 1: a second blob of the colour may be the marker.
-        ragged: 1: hardly a pixel has four neighbours of the colour.
-        cut: 1: it touches the border of the image.
-    """
-
-    contrast: float
-    unclear: float
-    outlined: float
-    fullness: float
-    slender: float
-    hue: float
-    alternative: float
-    ragged: float
-    cut: float
+    contrast: float  # logarithm of the contrast between marker and surroundings, limited
+    unclear: float  # 1: the contrast is below `CLEAR_CONTRAST`
+    outlined: float  # then the share of directions in which a round outline was found, else 0
+    fullness: float  # area over that of the ellipse of the same moments: less than 1 has gaps or arms
+    slender: float  # logarithm of the ratio of the axes of that ellipse
+    hue: float  # distance of the hue from the middle of the range in half ranges, squared
+    alternative: float  # 1: a second blob of the colour may be the marker
+    ragged: float  # 1: hardly a pixel has four neighbours of the colour
+    cut: float  # 1: it touches the border of the image
 
 
 WEIGHTS = Evidence(
@@ -66,14 +51,10 @@ WEIGHTS = Evidence(
 def evidence_of(
     seen: Measured, gains: tuple[float, float, float], colour: HsvRange, support: float, alternative: bool
 ) -> Evidence:
-    """What speaks for one measurement.
+    """What speaks for one measurement by the colour's mask.
 
-    Args:
-        seen: The measurement by the colour's mask.
-        gains: Of the light against that of calibration, blue, green, red.
-        colour: The marker's range.
-        support: Of its outline, 0: none was found, or none was sought.
-        alternative: Whether a second blob of the colour may be the marker.
+    `gains`: of the light against calibration, blue, green, red; `support`: of its outline, 0: none was found or
+    sought.
     """
     hue = _hue(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
     middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
@@ -103,10 +84,7 @@ def probability_of(evidence: Evidence) -> float:
 
 
 def clarity_of(seen: Measured, whole: float) -> float:
-    """Return how purely (0.01..1) the core shows the marker colour alone.
-
-    Given the marker's whole area [px^2].
-    """
+    """How purely (0.01..1) the core shows the marker; `whole`: its area [px^2]."""
     area, contrast = seen.area, seen.contrast
     clarity = math.sqrt(area / whole) if area < whole else 1.0
     if contrast < CLEAR_CONTRAST:

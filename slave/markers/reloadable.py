@@ -1,32 +1,12 @@
 """Wrap the detector: colours follow the light, and the camera file may change.
 
-Detector that sees no marker, for a slave without calibrated colours.
-
-Its lens or its place is being measured meanwhile.
-
-Detector of the markers whose colours are known.
-
-It finds none while no colour is known: for a slave that is still being set up.
-
-Its colours are fixed: few markers cannot separate light from their colour. With the last colour another detector takes
-over (`changing`), which follows the light.
-
-A marker detector whose colours follow the light.
-
-The ranges of a camera file hold under the light of calibration. Here the detector is given, as the light moves, tables
-that see the picture as under that light. A table takes a few frames to make on a small machine, so it is made by
-`workers`: a thread of its own on a live slave, `Inline` where every run must give the same.
-
-Where the table is far from the light, or the light is not known and the markers do not fit it, one marker could be
-taken for another: then nothing is reported seen, and a warning states why.
-
-Detector that is replaced at run time by one for another camera file.
-
-The change happens between two frames; tracks are kept.
-
-A colour table takes as long as some tens of frames to make, so the new detector is made on another thread. Where it
-follows the light it must know the light before it is of use: it looks at some frames beside the old one, on that thread
-too, and takes over as soon as it may distinguish markers by their colours.
+`CalibratedDetector` detects the markers whose colours are known, by fixed colours: few markers cannot separate light
+from their colour. `LightAdaptiveDetector` reads the ranges as under the light of calibration; a table takes a few
+frames to make, so `workers` make it: a thread on a live slave, `Inline` where every run must give the same. Where the
+table is far from the light, or the light is not known, nothing is reported seen, and a warning states why.
+`ReloadableDetector` switches to the detector of a changed camera file between two frames and keeps the tracks. One
+that follows the light first looks at some frames on another thread, until it may distinguish markers by their
+colours.
 """
 
 import time
@@ -53,7 +33,7 @@ from slave.tuning import CameraFiles, Prepare
 
 
 class NullDetector:
-    """A detector that detects nothing. Holds the answer."""
+    """Detector of no marker, for a slave without calibrated colours."""
 
     def __init__(self, markers: int) -> None:
         """Answer for so many markers."""
@@ -68,11 +48,7 @@ class NullDetector:
 
 
 class CalibratedDetector:
-    """Holds the detector of the markers that have a colour, if any has.
-
-    Attributes:
-        missing: Markers without a colour, which are never seen.
-    """
+    """Detector of the markers that have a colour; those `missing` are never seen."""
 
     def __init__(
         self,
@@ -81,10 +57,7 @@ class CalibratedDetector:
         engine: Engine = NUMPY,
         free: Collection[str] = (),
     ) -> None:
-        """Build the detector.
-
-        Arguments are as of `MarkerDetector`, but the camera may lack colours.
-        """
+        """Build it as `MarkerDetector` is built; the camera may lack colours."""
         calibrated = tuple(name for name in markers if name in (camera.markers or {}))
         self.missing = tuple(name for name in markers if name not in calibrated)
         self._rows = [markers.index(name) for name in calibrated]
@@ -119,13 +92,12 @@ class CalibratedDetector:
         return every
 
 
-REFUSE = 0.2  # and from which the old one may take one marker for another: three to six hues
+# log gains of red or blue against green by which a table may take one marker for another: three to six hues
+REFUSE = 0.2
 
 
 class LightAdaptiveDetector:
     """Marker detector whose colours follow the light.
-
-    Holds the light, the table in use and the one being made.
 
     Attributes:
         warnings: What is to be warned of as of the last frame.
@@ -142,18 +114,10 @@ class LightAdaptiveDetector:
         engine: Engine = NUMPY,
         free: Collection[str] = (),
     ) -> None:
-        """Build the detector and its colour table (0.3 s).
+        """Build the detector and its colour table (0.3 s), as `MarkerDetector`.
 
-        Args:
-            camera: Camera file; every marker has a range with its reference colour.
-            markers: Marker names in the order of the rig.
-            workers: Where tables are made and a first light is sought.
-            seeds: As of `MarkerDetector`.
-            engine, free: As of `MarkerDetector`.
-
-        Raises:
-            CalibrationError: The camera has no colour range for a marker.
-            ValueError: A range has no reference colour; see `can_adapt`.
+        Tables are made, and a first light is sought, by `workers`. Raises CalibrationError: the camera has no colour
+        range for a marker; ValueError: a range has no reference colour, see `can_adapt`.
         """
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
@@ -177,10 +141,7 @@ class LightAdaptiveDetector:
 
     @property
     def trusted(self) -> bool:
-        """Return whether markers may be distinguished by their colours.
-
-        The light must be known and the table made for it.
-        """
+        """Whether colours distinguish markers: light known, and table made for it."""
         return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
 
     @property
@@ -189,18 +150,12 @@ class LightAdaptiveDetector:
         return self._detector
 
     def adopt(self, other: "LightAdaptiveDetector") -> None:
-        """Take over the tracks and counts of another detector.
-
-        The light stays the one that this detector knows.
-        """
+        """Take over the tracks and counts, not the light, of another detector."""
         self._detector.adopt(other._detector)
         self.refused, self.tables = other.refused, other.tables + self.tables
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Apply a changed camera file, as `MarkerDetector` does.
-
-        What an exposure does to the colours is seen as a change of the light.
-        """
+        """As of `MarkerDetector`; colours see an exposure as a change of the light."""
         self._detector.tune(camera)
 
     def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
@@ -210,15 +165,7 @@ class LightAdaptiveDetector:
         return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
-        """Detect in one frame.
-
-        Args:
-            image: (H, W, 3) BGR of the camera's size.
-            t_ns: Time of the frame [ns], rising; only differences matter.
-
-        Raises:
-            ValueError: The image is not of the camera's size, or not 8-bit colour.
-        """
+        """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
         image = np.ascontiguousarray(image)
         self._light.look(image, t_ns)
         self._adapt()
@@ -233,10 +180,7 @@ class LightAdaptiveDetector:
         return found
 
     def _learn(self, found: Detections, t_ns: int) -> None:
-        """Learn the light, and check the colour margins in the next frame.
-
-        Split over two frames so that none takes long.
-        """
+        """Learn the light, and check the colour margins in the frame after."""
         if self._look_next:
             undone = found.colour * np.exp(-self.log_gains)
             self._near = self._watch.push(undone, found.clarity, t_ns)
@@ -275,13 +219,7 @@ def detector_for(
     engine: Engine = NUMPY,
     free: Collection[str] = (),
 ) -> LightAdaptiveDetector | MarkerDetector:
-    """Return a light-adaptive detector where the camera file allows it.
-
-    Else one with fixed colours.
-
-    Raises:
-        CalibrationError: The camera has no colour range for a marker.
-    """
+    """A light-adaptive detector, or one of fixed colours; CalibrationError as those."""
     if can_adapt(camera, markers):
         return LightAdaptiveDetector(camera, markers, workers, initial_uv, engine, free)
     return MarkerDetector(camera, markers, initial_uv, None, engine, free)
@@ -298,11 +236,7 @@ AnyDetector: TypeAlias = MarkerDetector | LightAdaptiveDetector | CalibratedDete
 
 
 class ReloadableDetector:
-    """Marker detector that can be replaced between two frames.
-
-    Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and recent
-    detections. Attribute `choice`: whether whole frames are scanned; None: they are.
-    """
+    """Detector that can be replaced; `choice`: to scan whole frames, None: always."""
 
     def __init__(
         self,
@@ -310,10 +244,7 @@ class ReloadableDetector:
         choice: ScanChoice | None = None,
         processor_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
-        """Begin with `detector`.
-
-        `processor_ns` returns the processor time [ns] that this thread has had.
-        """
+        """Begin with `detector`; `processor_ns`: processor time [ns] of this thread."""
         self._detector = detector
         self.choice, self._processor_ns = choice, processor_ns
         self._next: deque[AnyDetector] = deque(maxlen=1)  # one thread fills it, another empties it
@@ -349,10 +280,7 @@ class ReloadableDetector:
             self.choice.tune(camera)
 
     def replace(self, detector: AnyDetector) -> None:
-        """Let `detector`, of the same markers, take over.
-
-        Not from the loop's thread: it may take a second.
-        """
+        """Let `detector` take over. Not from the loop's thread: it may take a second."""
         if isinstance(detector, LightAdaptiveDetector):
             try:
                 # a first light takes some tens of frames to be proven, or is not there to be proven
@@ -371,26 +299,17 @@ class ReloadableDetector:
         return self._frames.newest
 
     def found(self, t_ns: int) -> Float | None:
-        """Return the centroids (M, 2) [px] in the frame of a time [ns].
-
-        NaN: not seen; None: too long ago. From any thread.
-        """
+        """Centroids (M, 2) [px] at `t_ns`, NaN: not seen; None: too old. From any thread."""
         return next((uv for at_ns, uv in tuple(self._found) if at_ns == t_ns), None)
 
     @property
     def plain(self) -> MarkerDetector | None:
-        """Return the present plain detector with its colour table.
-
-        None: no colour is known. From any thread.
-        """
+        """The present plain detector; None: no colour is known. From any thread."""
         return plain_of(self._detector)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Return the markers without a colour, which are not sought.
-
-        Or will not be sought from the next frame on. From any thread.
-        """
+        """Markers without a colour, not sought as of the next frame. From any thread."""
         coming = tuple(self._next)
         latest = coming[-1] if coming else self._detector
         return latest.missing if isinstance(latest, CalibratedDetector) else ()
@@ -424,17 +343,18 @@ class ReloadableDetector:
 def marker_changes(
     detector: ReloadableDetector, make: Callable[[CameraCalibration, RigCalibration], AnyDetector]
 ) -> Prepare:
-    """Return how changed files reach `detector`.
-
-    What `make` makes of them takes over, where colours or markers changed.
-    """
+    """Return how changed files reach `detector`: `make` where colours changed."""
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         made = None
         looks = [(files.camera.markers, files.rig.free_markers) for files in (old, new)]
         if looks[0] != looks[1]:
             made = make(new.camera, new.rig)
-            _refuse_blinding(detector, made)
+            if detector.adapts and isinstance(made, MarkerDetector):
+                raise CalibrationError(
+                    "markers: reference_bgr_linear: the colours in use have it for every marker, and the light is "
+                    "followed: restart the slave to change that"
+                )
         tuned = [
             (files.camera.exposure_us, files.camera.roi_margin, files.camera.frame_rate_hz)
             for files in (old, new)
@@ -450,14 +370,6 @@ def marker_changes(
         return switch
 
     return prepare
-
-
-def _refuse_blinding(old: ReloadableDetector, made: AnyDetector) -> None:
-    if old.adapts and isinstance(made, MarkerDetector):
-        raise CalibrationError(
-            "markers: reference_bgr_linear: the colours in use have it for every marker, and the light is followed: "
-            "restart the slave to change that"
-        )
 
 
 def plain_of(detector: AnyDetector) -> MarkerDetector | None:

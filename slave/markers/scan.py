@@ -1,21 +1,13 @@
 """Scan whole frames, or windows of them, and choose which by their cost.
 
-Scan for blobs of the markers' colours: a whole frame, or windows of it.
-
     whole    one table look-up on every fourth pixel of every fourth row, and on a further grid where a colour shows on
              none of these points
-    windows  the same points in the windows of tracked markers alone (`roi`). While a marker is lost, one strip of the
-             frame is searched for its colour in every frame, all of it in `STRIPS` frames, and what is found there is
-             looked at like a window
+    windows  the same points in the windows of tracked markers alone. While a marker is lost, one strip of the frame is
+             searched for its colour in every frame, all of it in `STRIPS` frames
 
-A blob has the same points, and so the same centroid and box, in both: a window is widened until it holds the blob and
-all around it that may be a fragment of it.
-
-Choose whole frames or windows: by name, or by what whole frames cost.
-
-What counts is the processor time of the detection, of which a busy machine takes nothing away, against the time between
-two frames of the camera's file. Windows are for where a whole frame does not fit; from time to time one frame is
-scanned whole then, so that it shows when they fit again.
+A blob has the same points, centroid and box in both: a window is widened until it holds the blob and all around it
+that may be a fragment of it. The choice goes by the processor time of the detection against the time between two
+frames; from time to time one frame is scanned whole, so that it shows when whole frames fit again.
 """
 
 import logging
@@ -42,15 +34,10 @@ Part: TypeAlias = tuple[int, int, int, int]
 
 
 class Scanned(NamedTuple):
-    """What a scan saw.
+    """What a scan saw."""
 
-    Attributes:
-        parts: What was scanned, and the codes (H, W) of its points.
-        blobs: Of each marker's colour, the largest first.
-    """
-
-    parts: list[tuple[Part, Codes]]
-    blobs: list[list[Blob]]
+    parts: list[tuple[Part, Codes]]  # what was scanned, and the codes (H, W) of its points
+    blobs: list[list[Blob]]  # of each marker's colour, the largest first
 
     def skin_share(self, skin: int, blob: Blob) -> float:
         """Return the share 0..1 of skin around one of the blobs; `skin`: its bit."""
@@ -79,11 +66,7 @@ class Scanner:
         return self._cycle >= 0
 
     def whole(self, image: Image, table: ColourTable) -> Scanned:
-        """Scan the whole frame (H, W, 3).
-
-        A colour that the grid shows nowhere is sought on further grids: in the first frame on all of them, later on
-        one more each time, in turn.
-        """
+        """Scan a frame; for colours that show nowhere also further grids, in turn."""
         codes, blobs = self._scan(image, table, table.bits, SCALE, 0, 0, None)
         missing = [m for m, options in enumerate(blobs) if not options]
         if missing:
@@ -100,14 +83,7 @@ class Scanner:
     def around(
         self, image: Image, table: ColourTable, windows: Sequence[Sequence[Window]], lost: Sequence[int]
     ) -> Scanned:
-        """Scan where markers are expected, and for lost ones the next strip of the frame.
-
-        Args:
-            image: (H, W, 3) BGR.
-            table: Colour table of the camera.
-            windows: Of each marker where it may be; none: it is not expected anywhere.
-            lost: Rows of those markers that are sought.
-        """
+        """Scan where markers are expected, and for lost ones the next strip of the frame."""
         wanted = {m for m, some in enumerate(windows) if some}
         asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for some in windows for w in some]
         proposed = self._search(image, table, lost) if lost else {}
@@ -155,19 +131,8 @@ class Scanner:
 
     def _around(self, left: float, top: float, right: float, bottom: float) -> Part:
         """The part of the frame that holds this box [px]."""
-        columns, rows = self._columns, self._rows
-        x0, y0, x1, y1 = (
-            int(left) // SCALE,
-            int(top) // SCALE,
-            int(right) // SCALE + 1,
-            int(bottom) // SCALE + 1,
-        )
-        return (
-            x0 if x0 > 0 else 0,
-            y0 if y0 > 0 else 0,
-            x1 if x1 < columns else columns,
-            y1 if y1 < rows else rows,
-        )
+        x1, y1 = min(int(right) // SCALE + 1, self._columns), min(int(bottom) // SCALE + 1, self._rows)
+        return max(int(left) // SCALE, 0), max(int(top) // SCALE, 0), x1, y1
 
     def _of(self, blob: Blob) -> Part:
         """The part that holds a blob, and around it whatever may be a fragment of it."""
@@ -232,18 +197,10 @@ _LOG = logging.getLogger(__name__)
 
 
 class ScanChoice:
-    """Push machine. Holds the choice, and what whole frames of late cost.
-
-    Attributes:
-        frames: Frames that were scanned in windows only.
-    """
+    """Choice by what frames cost; `frames`: those scanned in windows only."""
 
     def __init__(self, scan: Scan, camera: CameraCalibration) -> None:
-        """Choose for the frames of `camera`; "auto" begins with whole frames.
-
-        Raises:
-            ValueError: No such name.
-        """
+        """Choose for `camera`; "auto" begins with whole frames; ValueError: no such name."""
         if scan not in SCANS:
             raise ValueError(f"scan {scan!r}, not one of {', '.join(SCANS)}")
         self._scan, self._name = scan, camera.name
@@ -260,11 +217,7 @@ class ScanChoice:
     @property
     def windows(self) -> bool:
         """Whether only windows are scanned in the next frame."""
-        return self._windows and not self._probes
-
-    @property
-    def _probes(self) -> bool:
-        return self._scan == "auto" and self._since >= PROBE_EVERY
+        return self._windows and not (self._scan == "auto" and self._since >= PROBE_EVERY)
 
     def push(self, spent_ns: int) -> None:
         """Record the processor time [ns] of a frame scanned as `windows` specified."""

@@ -1,34 +1,22 @@
 """Track one marker: its window, its centre if covered, its deviation.
 
-Notify where a tracked marker is expected, and whether a blob there may be it.
+Window: the last box, moved by its velocity and widened by `roi_margin` (Kalbfleisch: "40 px at 640x480 was best"),
+more the longer the marker was not seen. It decides which blob is the marker, and where only windows are scanned.
 
-The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
-(Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the marker, and
-where the frame is scanned at all when only windows are (`scan`).
+Centre of a covered cap: 15 % hidden moves the centroid by an eighth of the radius. The cap's shape before is known
+(an ellipse with the second moments of its shares), so only its place is sought: the distances of the visible edge and
+of the ellipse along rays from a point inside give the shift by least squares. Rays on which the cap ends too early
+see the edge of the thing in front; they are rejected by their residual, one side only, until nothing changes.
 
-Centre of a partly occluded marker cap from its visible edge.
+Deviation of the centroid [px]: independent causes, added in squares (numbers of bench/marker_accuracy):
 
-Something in front of the cap covers it in part; only the edge that is still the cap's own is used.
-
-What is left of the cap has its centroid elsewhere: 15 % hidden moves it by an eighth of the radius. The shape that
-the cap had before is known (an ellipse with the second moments of its shares), so only its place is sought: rays
-from a point inside meet the visible edge at some distance, the ellipse at another; the difference of the two along
-all rays that see the cap's own edge gives the shift by least squares. Rays on which the cap ends too early see the
-edge of the thing in front; they are identified by their residual and rejected, one side only, until nothing changes.
-Where too little is left, or the rest does not fit the ellipse, there is no answer.
-
-Standard deviation of a measured centroid [px], from the measurement itself.
-
-Five independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
-
-    edge    the rim is known to a fraction of a pixel; a shift of one side moves the centroid the more the smaller
-            the marker, and the less clear its contrast; shading and highlights keep a part at any size
+    edge    the rim is known to a fraction of a pixel; it counts more the smaller the marker and the less its contrast;
+            shading and highlights keep a part at any size
     motion  the cap's shading does not smear like its outline
-    cover   something in front hides a share h: a straight edge moves the centroid of a disc by 0.9 h r
-            (segment of a circle, small h), one direction of two
-    cut     the border of the image does the same, unseen
-    colour  where the contrast is so low that the surroundings may be the marker as well, its colour may be a part of
-            it; an outline (`outline`) knows how well it fits, and takes the place of all but the motion
+    cover   a hidden share h behind a straight edge moves the centroid of a disc by 0.9 h r (small h), one direction
+            of two; the border of the image does the same, unseen
+    colour  at low contrast the colour may be a part of the marker; an outline knows how well it fits, and takes the
+            place of all but the motion
 """
 
 import math
@@ -50,31 +38,18 @@ SUDDEN = 2.5  # an area that changes by more between two frames is looked at clo
 
 
 class Window(NamedTuple):
-    """Expected region of one marker in one frame.
+    """Expected region of one marker: the gate for blobs, and what is scanned."""
 
-    It is both the gate for blobs and the region that is scanned.
-
-    Attributes:
-        u, v: Expected centroid [px].
-        x, y: How far from there the centroid may be [px]: the margin and the marker's own side.
-        margin: How much wider than the marker the window is, to each side [px].
-        area: Last area of the scan's blob [px^2].
-        largest: Area [px^2] beyond which a blob is something else.
-    """
-
-    u: float
+    u: float  # expected centroid u, v [px]
     v: float
-    x: float
+    x: float  # how far the centroid may be off, x, y [px]: the margin and the marker's own side
     y: float
-    margin: float
-    area: float
-    largest: float
+    margin: float  # how much wider than the marker the window is, to each side [px]
+    area: float  # last area of the scan's blob [px^2]
+    largest: float  # area [px^2] beyond which a blob is something else
 
     def cost(self, blob: Blob) -> float:
-        """Return the cost of assigning `blob`.
-
-        0 is perfect, about 1 is the rim of the window, inf is impossible.
-        """
+        """Cost of assigning `blob`: 0 perfect, about 1 at the rim, inf impossible."""
         x, y = abs(blob.u - self.u), abs(blob.v - self.v)
         if x > self.x or y > self.y or blob.area > self.largest:
             return math.inf
@@ -82,36 +57,23 @@ class Window(NamedTuple):
 
 
 class Track(NamedTuple):
-    """What is known of one marker from its past.
+    """What is known of one marker from its past."""
 
-    Attributes:
-        u, v: Last centroid [px].
-        du, dv: Velocity [px/s].
-        area: Last area of the scan's blob [px^2].
-        seen: Last measured area [px^2].
-        whole: Area of the whole marker [px^2]: the largest seen, slowly forgotten.
-        usual: Its area of late [px^2].
-        covered: Something came in front of it, and has not gone.
-        xx, xy, yy: Second central moments of its shape [px^2] of late, when it was not covered.
-        width, height: Last box [px].
-        t_ns: When it was last seen.
-    """
-
-    u: float
+    u: float  # last centroid u, v [px]
     v: float
-    du: float
+    du: float  # velocity du, dv [px/s]
     dv: float
-    area: float
-    seen: float
-    whole: float
-    typical: float
-    covered: bool
-    xx: float
+    area: float  # last area of the scan's blob [px^2]
+    seen: float  # last measured area [px^2]
+    whole: float  # area of the whole marker [px^2]: the largest seen, slowly forgotten
+    typical: float  # its area of late [px^2]
+    covered: bool  # something came in front of it, and has not gone
+    xx: float  # second central moments of its shape [px^2] of late, when it was not covered
     xy: float
     yy: float
-    width: float
+    width: float  # width, height: last box [px]
     height: float
-    t_ns: int
+    t_ns: int  # when it was last seen
 
     def alive(self, t_ns: int) -> bool:
         """Return whether the track still predicts where the marker is."""
@@ -120,9 +82,8 @@ class Track(NamedTuple):
     def window(self, t_ns: int, image_width: int, roi_margin: float) -> "Window":
         """Predict where the marker may be at `t_ns`.
 
-        At constant velocity for a short time, then anywhere about that place.
-
-        `roi_margin`: how much wider than the marker the window is, share of the image width.
+        At constant velocity for a short time, then anywhere about that place. `roi_margin`: how much wider than the
+        marker the window is, share of the image width.
         """
         away_ns = t_ns - self.t_ns
         if away_ns > VELOCITY_NS:
@@ -140,10 +101,7 @@ class Track(NamedTuple):
         return t_ns - self.t_ns > VELOCITY_NS
 
     def sudden(self, blob: Blob) -> bool:
-        """Return whether the area of `blob` jumped against the last frame.
-
-        The jump must be larger than the grid of the scan explains.
-        """
+        """Return whether the area of `blob` jumped by more than the grid explains."""
         ratio = blob.area / self.area
         return not 1.0 / SUDDEN <= ratio <= SUDDEN and abs(blob.area - self.area) > 80.0
 
@@ -163,10 +121,7 @@ class Track(NamedTuple):
 
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
-    """Return the track after one more observation.
-
-    A track that was lost is reinitialised, without velocity.
-    """
+    """Return the track after an observation; a lost one begins without velocity."""
     u, v, area, xx, xy, yy = seen.u, seen.v, seen.area, seen.xx, seen.xy, seen.yy
     if area < 1.0:
         area = 1.0
@@ -182,7 +137,7 @@ def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track
     du = dv = 0.0
     if dt_s <= VELOCITY_NS * 1e-9:
         du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
-    # of its usual one: a finger turns in this time, something passes in front of it faster
+    # memory of its usual area: a finger turns in this time, something passes in front of it faster
     typical_life_s = 0.25
     keep = math.exp(-dt_s / typical_life_s)
     typical = area + (track.typical - area) * keep
@@ -208,10 +163,7 @@ _WAY: Float = 2.0 / 3.0 * (1.0 - _CHORD**2) ** 1.5 / (math.pi * (1.0 - _SHARE))
 
 
 class Ellipse(NamedTuple):
-    """Second central moments [px^2] of a filled ellipse.
-
-    Its edge is at x' C^-1 x = 4.
-    """
+    """Second central moments [px^2] of a filled ellipse with edge x' C^-1 x = 4."""
 
     xx: float
     xy: float
@@ -219,10 +171,7 @@ class Ellipse(NamedTuple):
 
 
 class Centre(NamedTuple):
-    """Centre of a cap (u, v) [px] and RMS of its edge about it [px].
-
-    The centre is in the frame of the cap's window.
-    """
+    """Centre of a cap (u, v) in its window and RMS of its edge about it [px]."""
 
     u: float
     v: float
@@ -230,15 +179,9 @@ class Centre(NamedTuple):
 
 
 def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | None:
-    """Centre of a partly covered cap.
+    """Centre of a partly covered cap; None: the visible edge does not determine it.
 
-    Args:
-        share: (H, W) share of marker colour of every pixel of a window, 0..1.
-        shape: The cap's shape when it was whole.
-        u, v: A point inside what is visible [px], in the window: its centroid.
-
-    Returns:
-        The centre, or None where the visible edge does not determine it.
+    `share`: (H, W) 0..1 of a window; `shape`: of the whole cap; (u, v): centroid of what is visible [px].
     """
     determinant = shape.xx * shape.yy - shape.xy**2
     if determinant <= 0.0:
@@ -285,10 +228,9 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
 def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
     """Return whether an occlusion can have moved the centroid by (du, dv) [px].
 
-    The centroid is that of the visible rest of a cap of which this share is hidden.
-
-    Of all parts of one area the segment behind a straight edge lies farthest out, so nothing moves the centroid more:
-    in a unit disc whose edge is at d by 2/3 (1 - d^2)^1.5 / (pi (1 - h)). An ellipse is such a disc, stretched.
+    `hidden`: share of the cap. Of all parts of one area the segment behind a straight edge lies farthest out, so
+    nothing moves the centroid more: in a unit disc whose edge is at d by 2/3 (1 - d^2)^1.5 / (pi (1 - h)). An ellipse
+    is such a disc, stretched.
     """
     determinant = shape.xx * shape.yy - shape.xy**2
     if determinant <= 0.0:
@@ -301,10 +243,7 @@ def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
 
 
 def _edge(share: Float32, start: Float, reach: float) -> Float:
-    """Return the distance (RAYS,) [px] from `start` to the edge along each ray.
-
-    The edge is where the shares fall to a half: the marker colour on each ray is added up.
-    """
+    """Distance (RAYS,) [px] from `start` to the edge: marker colour summed on rays."""
     step_px = 0.5
     steps = (np.arange(math.ceil(reach / step_px)) + 0.5) * step_px
     x = (start[0] + DIRECTIONS[:, :1] * steps).astype(np.float32)
@@ -322,15 +261,7 @@ COVERED_PX = 0.15  # a centre found from the edge that is left
 def sigma_of(
     seen: Measured, before: Track | None, track: Track, exposure_s: float, outline: Outline | None = None
 ) -> float:
-    """Standard deviation per axis of the centroid [px].
-
-    Args:
-        seen: The measurement.
-        before: The track before it; None: the marker was not tracked.
-        track: The track after it.
-        exposure_s: Exposure time.
-        outline: The marker's outline, where the measurement is that of its disc.
-    """
+    """Standard deviation per axis of the centroid [px]; `outline`: of its disc."""
     if outline is not None:
         return math.hypot(outline.sigma, BLUR * math.hypot(track.du, track.dv) * exposure_s)
     radius = math.sqrt((seen.area if seen.area > 1.0 else 1.0) / math.pi)
@@ -345,11 +276,9 @@ def sigma_of(
     hidden = persistent * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
     if before is not None and track.covered:
         hidden = max(hidden, before.hidden(seen.area))
-    # cover
     cover = 0.65 * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0
-    # of the radius
     cut = 0.3 * radius if seen.cut else 0.0
-    # of the radius: a part of the marker's colour that has no outline
+    # a part of the marker's colour that has no outline
     partial = 0.5 * radius if seen.contrast < CLEAR_CONTRAST else 0.0
     sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut + partial * partial)
     thin = 2.0  # times, for a sliver

@@ -1,38 +1,17 @@
 """Follow the light of one camera, and warn of colours that leave their range.
 
-Early warning that a marker's colour is about to leave its range.
+    initial_white_balance  the first picture: all colours together prove one light      at the start, or if uncertain
+    LightMeter             what stands still: how the light changes, at once            every frame
+    ColourDrift            the markers: where the light stands, slowly but for certain  10 times a second
 
-It warns while the marker is still detected, by the distance of its colour from the border of its range.
+The light is *proven* when two or more markers of one picture agree on it and on no other, until much of the picture
+changes at once and no marker vouches for the old light, or the markers fit it badly; then the last known light is
+used on, but not where the picture excludes it. `LightMeter` takes the median over a few hundred points of the log
+ratio to what each showed before: a hand in front of some of a still desk does not move a median.
 
-Colours are undone to the light of calibration first, so what is left is what following the light does not mend: light
-beyond the bounds, a lamp whose colour von Kries' law does not describe, a marker that is dirty or worn. Each
-marker's hue, saturation and value are averaged over half a second; the room to each border of its range is counted
-in the spread of that average, so a colour that flickers is warned of earlier.
-
-Immediate detection of light changes on static parts of the image.
-
-The same few hundred pixels of every frame are compared.
-
-A camera of a rig does not move, so most of its picture is the same desk in every frame. The median over all
-points of the log ratio to what each point showed before is the change of the light; a hand in front of some of them
-does not move a median, and where a hand or a card covers too many, there is no answer. It measures only how the
-light *changes*; where it stands against calibration only the marker colours determine (`drift`).
-
-Execution of jobs that take longer than a frame.
-
-In a thread pool on a live slave, in the caller where runs must be equal.
-
-Light of one camera at every frame, from three sources.
-
-The sources differ in what they can estimate.
-
-    initial_white_balance   the first picture: all colours together prove one light      at the start, or if uncertain
-    light_meter   what stands still: how the light changes, at once             every frame
-    drift         the markers: where the light stands, slowly but for certain   10 times a second
-
-The light is *proven* when two or more markers of one picture agree on it and on no other. It is uncertain again when
-much of the picture changes at once and no marker vouches for the old light, or when the markers fit it badly. A light
-uncertain, the last one known is used on, but not where the picture excludes it.
+`ColourMonitor` warns while a marker is still detected, of what following the light does not mend: light beyond the
+bounds, a lamp beyond von Kries' law, a dirty marker. The room of the mean HSV over half a second to each border is
+counted in spreads, so a colour that flickers is warned of earlier.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -70,26 +49,16 @@ FLOOR = np.array([1.5, 8.0, 8.0])
 
 @dataclass(frozen=True, slots=True)
 class ColourWarning:
-    """Something that will cost a marker, and what to do.
+    """Something that will cost a marker, and what to do."""
 
-    Attributes:
-        marker: Its name; None: it concerns all.
-        text: What is seen, and the fix.
-        ambiguous: Another marker that looks like it; None: it is about this one alone.
-        hues: How far the two are apart, of 180.
-    """
-
-    marker: str | None
-    text: str
-    ambiguous: str | None = None
-    hues: float = 0.0
+    marker: str | None  # its name; None: it concerns all
+    text: str  # what is seen, and the fix
+    ambiguous: str | None = None  # another marker that looks like it
+    hues: float = 0.0  # how far the two are apart, of 180
 
 
 def hsv(light: Float) -> Float:
-    """Convert linear light (..., 3), blue first, to OpenCV's HSV.
-
-    H (0..180), S and V (0..255), unrounded.
-    """
+    """Linear light (..., 3), blue first, to unrounded OpenCV H 0..180, S, V 0..255."""
     code = 255.0 * to_srgb(light)
     blue, green, red = code[..., 0], code[..., 1], code[..., 2]
     value, span = code.max(axis=-1), np.ptp(code, axis=-1)
@@ -104,10 +73,7 @@ def hsv(light: Float) -> Float:
 
 
 class ColourMonitor:
-    """Monitor of the margin between every marker's colour and its range.
-
-    Holds the mean, spread and observed time of each marker, and for which markers a warning was given.
-    """
+    """Monitor of the margin between every marker's colour and its range."""
 
     def __init__(self, names: Sequence[str], ranges: Mapping[str, HsvRange]) -> None:
         """Watch `names`, each in its range."""
@@ -127,12 +93,9 @@ class ColourMonitor:
         self._t_ns: int | None = None
 
     def push(self, light: Float, clarity: Float, t_ns: int) -> list[ColourWarning]:
-        """Take in one frame; what is to be warned of now.
+        """What is to be warned of after one frame.
 
-        Args:
-            light: (M, 3) linear light of each marker's core, undone to the light of calibration; NaN: not seen.
-            clarity: (M,) 0..1; NaN: not seen.
-            t_ns: Time of the frame [ns], rising.
+        `light`: (M, 3) linear light of each core, undone to the light of calibration, NaN: not seen; `clarity`: 0..1.
         """
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0) * 1e-9, TIME_S)
         self._t_ns = t_ns
@@ -142,17 +105,13 @@ class ColourMonitor:
             self._learn(good, hsv(np.maximum(light[good], 1e-5)), dt_s)
         room = self.room()
         with np.errstate(invalid="ignore"):
-            # spreads: less is a warning; a marker that is warned of is well again with
-            well = 3.0
-            self._warned = np.where(np.isnan(room), self._warned, room < np.where(self._warned, well, 2.0))
+            # less than 2 spreads is a warning, which ends at 3
+            self._warned = np.where(np.isnan(room), self._warned, room < np.where(self._warned, 3.0, 2.0))
         warned = [self._of(int(m), float(room[m])) for m in np.flatnonzero(self._warned)]
         return warned + self._ambiguous()
 
     def room(self) -> Float:
-        """Return the margin (M,) of each colour to the nearest border of its range.
-
-        In spreads; NaN: not observed for long enough.
-        """
+        """Margin (M,) of each colour in its range, in spreads; NaN: seen too briefly."""
         spread = np.maximum(np.sqrt(self._variance), FLOOR)
         hue = (self._half - np.abs(self._mean[:, 0])) / spread[:, 0]
         rest = (self._mean[:, 1:] - self._low[:, 1:]) / spread[:, 1:]
@@ -201,31 +160,21 @@ class ColourMonitor:
 
 GRID = 16  # points along each side
 AGREE = 0.55  # share of the points that must agree
-EVERY_NS = 50_000_000  # a slow change is measured so often,
+EVERY_NS = 50_000_000  # a slow change is measured so often
 LOG_LIGHT = np.log(np.maximum(to_linear(np.arange(256) / 255.0), 1e-4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """How the light changed since it was last measured.
+    """How the light changed since it was last measured."""
 
-    Attributes:
-        log_gains: (3,) natural logarithms, blue, green, red; 0 where nothing can be estimated.
-        sure: Enough points agree.
-        agreeing: Share of all points that agree, 0..1.
-    """
-
-    log_gains: Float
-    sure: bool
-    agreeing: float
+    log_gains: Float  # (3,) natural logarithms, blue, green, red; 0 where nothing can be estimated
+    sure: bool  # enough points agree
+    agreeing: float  # share of all points that agree, 0..1
 
 
 class LightMeter:
-    """Measures changes of the light on the still points of one camera.
-
-    Holds what each point shows under the light of the first frame, the light since then, the last time it was
-    measured, and the last bytes.
-    """
+    """Measures changes of the light on the still points of one camera."""
 
     def __init__(self, width: int, height: int) -> None:
         """Place the points on a grid over a picture of this size [px]."""
@@ -238,12 +187,7 @@ class LightMeter:
         self._t_ns = 0
 
     def push(self, image: Image, t_ns: int) -> Change | None:
-        """The change since it was last measured; None where it need not be measured now.
-
-        Args:
-            image: (H, W, 3) BGR, C-contiguous.
-            t_ns: Time of the frame [ns], rising.
-        """
+        """Change since it was last measured in a C-contiguous image; None: not due."""
         bytes_ = image.reshape(-1, 3).take(self._pixel, axis=0)
         last, self._bytes = self._bytes, bytes_.astype(np.int16)
         if self._still is None or last is None:
@@ -298,10 +242,7 @@ class Workers(Protocol):
 
 
 class Inline:
-    """Worker that does every job at once, in the caller's thread.
-
-    The same input gives the same output.
-    """
+    """Worker in the caller's thread: the same input gives the same output."""
 
     def submit(self, fn: Callable[[], T], /) -> Future[T]:
         """Do it; the future is done."""
@@ -311,22 +252,14 @@ class Inline:
 
 
 class WhiteBalance:
-    """Light of one camera.
-
-    Holds its estimate, whether it is proven, and the proof under way.
-    """
+    """Light of one camera: estimate, whether it is proven, the proof under way."""
 
     def __init__(self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Workers) -> None:
         """Begin with the light of calibration, not proven.
 
-        Args:
-            table: Colour table of the calibration.
-            reference: (M, 3) linear light of each marker's core at calibration, blue first.
-            size: Width and height of the picture [px].
-            workers: Where a first light is sought: it takes as long as some tens of frames.
-
-        Raises:
-            ValueError: A reference is not three positive numbers.
+        `reference`: (M, 3) linear light of each marker's core at calibration, blue first, positive or ValueError;
+        `size`: width and height of the picture [px]; `workers` seek a first light, which takes as long as some tens
+        of frames.
         """
         self._table, self._reference, self._workers = table, reference, workers
         self._drift = ColourDrift(reference)
@@ -349,12 +282,7 @@ class WhiteBalance:
         return self.proven or self._plausible
 
     def look(self, image: Image, t_ns: int) -> None:
-        """Take in a picture before its markers are sought.
-
-        Args:
-            image: (H, W, 3) BGR, C-contiguous.
-            t_ns: Time of the frame [ns], rising; only differences matter.
-        """
+        """Take in a picture (H, W, 3) BGR, C-contiguous, before its markers are sought."""
         change = self._meter.push(image, t_ns)
         if change is not None and change.sure:
             self._change(image, change)
@@ -362,15 +290,7 @@ class WhiteBalance:
             self._prove(image, t_ns)
 
     def learn(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
-        """Update the light from the marker colours of an image.
-
-        Returns None where the last look is too recent.
-
-        Args:
-            colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
-            clarity: (M,) 0..1; NaN: not seen.
-            t_ns: Time of the frame [ns].
-        """
+        """Update the light as `ColourDrift.push`; None: the last look is too recent."""
         fit = self._drift.push(colour, clarity, t_ns)
         if fit is not None:
             seen = fit.residual[np.isfinite(fit.residual)]
@@ -441,11 +361,10 @@ class WhiteBalance:
                 self._drift.restart(light.log_gains + since)
 
 
-# what a change of brightness counts against a change of hue: the ranges are wide in brightness
 def apart(a: Float, b: Float, dim: float = 0.15) -> float:
-    """Return how different two lights (3,) look to the colour table.
+    """How different two lights (3,) look, in log gains of red or blue against green.
 
-    In log gains of red or blue against green.
+    `dim`: what brightness counts against hue: the ranges are wide in it.
     """
     blue, green, red = (a - b).tolist()
     return max(abs(blue - green), abs(red - green), dim * abs(green))

@@ -1,22 +1,14 @@
 """Read a Vive tracker by SteamVR, through openvr.
 
-Interface to openvr (pyopenvr), as far as Phalanx uses it.
-
-Its interface as types, and the one place that imports it.
-
-It is there on PCs with x86 processors only, and useless without SteamVR, so it is imported when a tracker is opened.
-Names and meanings were read in openvr 2.12 (openvr/__init__.py, error_code/__init__.py).
-
-A Vive tracker by SteamVR, through openvr.
+The library (pyopenvr) is there on PCs with x86 processors only, and useless without SteamVR, so it is imported when a
+tracker is opened. Names and meanings were read in openvr 2.12 (openvr/__init__.py, error_code/__init__.py).
 
 SteamVR is asked some hundred times a second where the tracker is at the very moment of the call: it leads its newest
-measurement over the milliseconds since (position by velocity, and the same for the turn), so a pose holds when it was
-asked for and needs no stamp of the device. Poses are in the raw frame of the base stations, y up: to set the room's
-floor or middle anew moves nothing, to move a base station does.
-
-A pose counts only where SteamVR reports that it is valid, of a connected device, and tracked by light (`Running_OK`);
-what it leads by the gyroscope alone is NaN here. It is notified when SteamVR ends, confirms, and lets go: a program
-that holds on is ended by SteamVR (ValveSoftware/openvr, issues 878 and 1490).
+measurement over the milliseconds since, so a pose holds when it was asked for and needs no stamp of the device. Poses
+are in the raw frame of the base stations, y up: to set the room's floor or middle anew moves nothing, to move a base
+station does. A pose counts only where SteamVR reports that it is valid, of a connected device, and tracked by light
+(`Running_OK`); what it leads by the gyroscope alone is NaN. A program that holds on when SteamVR ends is ended by
+SteamVR (ValveSoftware/openvr, issues 878 and 1490), so its end is confirmed.
 """
 
 import importlib
@@ -41,10 +33,7 @@ class VrSystem(Protocol):
     def getDeviceToAbsoluteTrackingPose(
         self, origin: int, predictedSecondsToPhotonsFromNow: float, trackedDevicePoseArray: Any
     ) -> Sequence[Any]:
-        """Return `TrackedDevicePose_t` of all devices.
-
-        Predicted to a time so many seconds after the call.
-        """
+        """Return `TrackedDevicePose_t` of all devices, predicted to after the call."""
         ...
 
     def getTrackedDeviceClass(self, deviceIndex: int) -> int:
@@ -89,11 +78,7 @@ class Library(Protocol):
 
 
 def load_library() -> Library:
-    """Import the module.
-
-    Raises:
-        TrackerError: It is not installed, or has no code for this machine.
-    """
+    """Import the module; TrackerError: not installed, or no code for this machine."""
     try:
         return cast(Library, importlib.import_module("openvr"))
     except ImportError as error:
@@ -103,11 +88,7 @@ def load_library() -> Library:
 
 
 def connect(library: Library) -> VrSystem:
-    """Connect to a SteamVR that runs; it is never started from here.
-
-    Raises:
-        TrackerError: With what to do.
-    """
+    """Connect to a SteamVR that runs, never start it; TrackerError: what to do."""
     try:
         return library.init(library.VRApplication_Background)
     except library.OpenVRError as error:
@@ -133,10 +114,7 @@ _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
 
 class OpenVrTracker:
-    """`TrackerSource` that reads a device from SteamVR.
-
-    Holds the connection to SteamVR, which device is ours, and when it is asked next.
-    """
+    """`TrackerSource` that reads a device from SteamVR."""
 
     def __init__(
         self,
@@ -149,16 +127,8 @@ class OpenVrTracker:
     ) -> None:
         """Connect to SteamVR.
 
-        Args:
-            name: Of the device in our messages.
-            serial: Its serial number (LHR-...); None: there is one tracker only.
-            clock: The slave's clock.
-            stop: Set when the slave is to end.
-            loader: Imports the library.
-            rate_hz: How often SteamVR is asked.
-
-        Raises:
-            TrackerError: The library is missing, or SteamVR does not answer.
+        `serial`: number of the device (LHR-...); None: there is one tracker only. `rate_hz`: how often SteamVR is
+        asked. Raises TrackerError: the library is missing, or SteamVR does not answer.
         """
         self._name, self._serial, self._clock, self._stop = name, serial, clock, stop
         self._library = loader()
@@ -174,9 +144,7 @@ class OpenVrTracker:
     def read(self) -> TrackerPose | None:
         """Ask where it is when that is due; None once stopped or closed.
 
-        Raises:
-            TrackerError: SteamVR is ending.
-            TrackerChoiceError: There are several trackers, and none was selected.
+        Raises TrackerError: SteamVR is ending; TrackerChoiceError: several trackers, and none was selected.
         """
         while not self._stop.is_set() and self._system is not None:
             left_ns = self._next_ns - self._clock.now_ns()
@@ -197,10 +165,7 @@ class OpenVrTracker:
             self._library.shutdown()
 
     def counts(self) -> Mapping[str, int]:
-        """Return the counts `lost_itself` and `absent`.
-
-        `lost_itself`: asked while it saw no base station; `absent`: while it was switched off.
-        """
+        """Asked while it saw no base station, `lost_itself`, or was off, `absent`."""
         return dict(self._counts)
 
     def metrics(self) -> Mapping[str, float]:
@@ -216,10 +181,7 @@ class OpenVrTracker:
                 raise TrackerError("SteamVR ends: start it again")
 
     def _ask(self, system: VrSystem) -> TrackerPose | None:
-        """Ask for one pose.
-
-        None: the device is lost, and that has just been reported.
-        """
+        """Ask for one pose; None: the device is lost, and that has just been reported."""
         before_ns = self._clock.now_ns()
         poses = system.getDeviceToAbsoluteTrackingPose(
             self._library.TrackingUniverseRawAndUncalibrated, 0.0, None
@@ -239,10 +201,7 @@ class OpenVrTracker:
         return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
     def _found(self, system: VrSystem, now_ns: int) -> int | None:
-        """Return the device's number, which stays while SteamVR runs.
-
-        It is searched again once a second until the device is there.
-        """
+        """Return the device's number; searched once a second until it is there."""
         poll_ns = 1_000_000_000  # between two searches for the device
         if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= poll_ns):
             self._looked_ns = now_ns
@@ -302,10 +261,7 @@ class OpenVrTracker:
 
 
 def matrix34(matrix: object) -> tuple[Float, Float] | None:
-    """Convert an `HmdMatrix34_t` to place (3,) [m] and quaternion (4,) wxyz.
-
-    The matrix is given row by row; None: it is no pose.
-    """
+    """`HmdMatrix34_t` as place (3,) [m], quaternion (4,) wxyz; None: it is no pose."""
     rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
     if rows.shape != (3, 4) or not np.isfinite(rows).all():
         return None

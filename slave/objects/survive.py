@@ -1,35 +1,23 @@
 """Read a tracker through libsurvive's own program, survive-cli.
 
-Decode libsurvive's lines to poses of one device on the slave's clock.
-
-Every line that --record-stdout or --record writes begins with the program's time [s since its start], then who, then
-what (src/survive_recording.c of https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
+Every line of --record-stdout or --record begins with the program's time [s since its start], then who, then what
+(src/survive_recording.c of https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
 
     8.042091 WM0 POSE -0.284080 0.936063 0.374069 0.707107 0.000000 0.000000 0.707107 CR LF
     0.331402 WM0 CONFIG {... "device_serial_number": "LHR-1A2B3C4D" ...} CR LF
     9.112874 WM0 DISCONNECT CR LF
     8.042070 WM0 VELOCITY ...     0.001240 OPTION ...     7.120011 0 LH_POSE ...     0.001000 INFO LOG ...
 
-A pose is the device's in libsurvive's world, metres, its quaternion with w first. The world is z up, its origin and
-heading those of its calibration. Numbers are decimals, or hexadecimal where it was built with SURVIVE_HEX_FLOATS. Lines
-carry no checksum: that a quaternion has length 1 is what shows a line whose end was cut or run into by another thread.
+A pose is the device's in libsurvive's world [m], z up, quaternion w first; decimals, or hexadecimal where built with
+SURVIVE_HEX_FLOATS. Lines carry no checksum: the length 1 of a quaternion shows that none was cut. Names (WM0, T20) go
+by order of appearance, which a restart may turn about; the serial number stays.
 
-Devices are called by kind and order of appearance (WM0, T20), which a restart may turn about; what stays is the serial
-number. Without a choice there must be one device only: with two, a guess would show one object as the other.
+A stamp is when the program wrote the line, by this machine's wall clock, which may be set or slewed, so `DeviceClock`
+makes it a time. The constant delay before that is measured by `phalanx-master calibrate tracker`.
 
-A stamp is the program's own time when it wrote the line. The clock behind it is this machine's wall clock, which may be
-set or slewed, so stamps become times of the slave's clock as those of any foreign device do (`DeviceClock`): by the
-least delay, whatever jitter and bunches the arrivals have. How late a pose is when its line is written is unknown; it
-is constant, and `phalanx-master calibrate tracker` measures it.
-
-Tracker source that reads libsurvive's own program, survive-cli.
-
-The program is started here and its lines are read; or the lines of a file are.
-
-The library has no Linux wheel, so nothing of it is loaded: whoever wants it builds it (docs/tracker.md). The program
-writes its lines into a pseudo terminal, because into a pipe C's stdio would write blocks of 4 kB, half a second of
-poses at once; its messages to people go to stderr, as ever. It ends with its slave, also with one that was killed: the
-terminal is that of its session, and hangs up when nobody has the other end any more (setsid(2), termios(3)).
+The program writes into a pseudo terminal, because into a pipe C's stdio would write blocks of 4 kB, half a second of
+poses. It ends with its slave, also with one that was killed: the terminal is that of its session, and hangs up when
+nobody has the other end any more (setsid(2), termios(3)). Nothing of the library is loaded (docs/tracker.md).
 """
 
 import gzip
@@ -63,13 +51,10 @@ _DEVICE = re.compile(rb"[A-Za-z0-9_.-]{1,32}")
 
 
 class Pose(NamedTuple):
-    """Where a device is: time [s] of the program, place [m], quaternion wxyz.
-
-    NaN: it does not know.
-    """
+    """Where a device is; NaN: it does not know."""
 
     device: str
-    t_s: float
+    t_s: float  # of the program
     position_m: tuple[float, float, float]
     orientation_wxyz: tuple[float, float, float, float]
 
@@ -108,10 +93,7 @@ class LineDecoder:
         self._rest = b""
 
     def push(self, data: bytes) -> Iterator[Found]:
-        """Parse the lines that end in `data`, in order.
-
-        Other lines yield nothing.
-        """
+        """Parse the lines that end in `data`, in order; other lines yield nothing."""
         lines = (self._rest + data).split(b"\n")
         self._rest = lines.pop()
         if len(self._rest) > LONGEST:
@@ -124,10 +106,7 @@ class LineDecoder:
 
 
 def read_line(line: bytes) -> Found | None:
-    """Parse one line without its end.
-
-    None: nothing that matters here.
-    """
+    """Parse one line without its end; None: nothing that matters here."""
     words = line.split(None, 3)
     if len(words) < 3:
         return None
@@ -180,17 +159,12 @@ SLEWED = 600e-6  # at most 500 ppm by NTP, and the crystals
 
 
 class SurviveDevice:
-    """Push machine that dates the poses of one device.
-
-    Holds who is there, the clock of the program, and number and time of the newest pose.
-    """
+    """Push machine that dates the poses of one device."""
 
     def __init__(self, name: str, wanted: str | None) -> None:
         """Begin with a program that was just started.
 
-        Args:
-            name: Of the device in our messages.
-            wanted: Its serial number, or what libsurvive calls it; None: there is one only.
+        `wanted`: serial number of the device, or what libsurvive calls it; None: there is one only.
         """
         self._name, self._wanted = name, wanted
         self._decoder = LineDecoder()
@@ -202,11 +176,7 @@ class SurviveDevice:
         self._counts: Counter[str] = Counter()
 
     def push(self, data: bytes, arrival_ns: int) -> list[TrackerPose]:
-        """Take bytes that were there at `arrival_ns`; return the poses in them.
-
-        Raises:
-            TrackerChoiceError: A second device has poses, and none was selected.
-        """
+        """Poses in bytes of `arrival_ns`; TrackerChoiceError: devices, and none selected."""
         ours = [one for found in self._decoder.push(data) if (one := self._ours(found)) is not None]
         dated = [(one, self._observe(one, arrival_ns)) for one in ours]  # all, before one becomes a time
         poses: list[TrackerPose] = []
@@ -233,10 +203,7 @@ class SurviveDevice:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Events: `broken.` lines by reason, `clock_steps`, `gone`.
-
-        `others`: poses of other devices.
-        """
+        """Events: `broken.` lines by reason, `clock_steps`, `gone`, poses of `others`."""
         return self._counts
 
     def there(self) -> str:
@@ -296,10 +263,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class SurviveTracker:
-    """`TrackerSource` that reads survive-cli.
-
-    Holds the program, its terminal, and poses not handed over yet.
-    """
+    """`TrackerSource` that reads survive-cli."""
 
     def __init__(
         self,
@@ -310,19 +274,7 @@ class SurviveTracker:
         program: str = PROGRAM,
         options: Sequence[str] = OPTIONS,
     ) -> None:
-        """Start the program.
-
-        Args:
-            name: Of the device in our messages.
-            wanted: Its serial number, or what libsurvive calls it; None: there is one only.
-            clock: The slave's clock.
-            stop: Set when the slave is to end.
-            program: Name or path of survive-cli.
-            options: What it is called with.
-
-        Raises:
-            TrackerError: There is no such program, or it cannot be started.
-        """
+        """Start the program; `wanted` as of `SurviveDevice`; TrackerError: it cannot."""
         self._program, self._clock, self._stop = program, clock, stop
         self._device = SurviveDevice(name, wanted)
         self._came: deque[TrackerPose] = deque()
@@ -333,9 +285,8 @@ class SurviveTracker:
     def read(self) -> TrackerPose | None:
         """Next pose, or one of NaN while none come; None once stopped or closed.
 
-        Raises:
-            TrackerError: The program has ended.
-            TrackerChoiceError: Several devices have poses, and none was selected.
+        Raises TrackerError: the program has ended; TrackerChoiceError: several devices have poses, and none was
+        selected.
         """
         while not self._stop.is_set() and self._terminal is not None:
             if self._came:
@@ -370,7 +321,6 @@ class SurviveTracker:
         return {}
 
     def _receive(self, terminal: int) -> None:
-        """Read what has come, and wait a little for it."""
         ready, _, _ = select.select([terminal], [], [], 0.05)  # then it is looked whether it is to stop
         if not ready:
             return
@@ -384,10 +334,7 @@ class SurviveTracker:
         self._came.extend(self._device.push(data, self._clock.now_ns()))
 
     def _lost(self, now_ns: int) -> TrackerPose:
-        """Return a pose of NaN for a lost device.
-
-        Its time is between the last pose and any that may still be on its way.
-        """
+        """A pose of NaN, between the last one and any that may still be on its way."""
         self._received_ns = now_ns
         if now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
@@ -400,22 +347,15 @@ class SurviveTracker:
 
 
 class SurviveFile:
-    """`TrackerSource` that plays recorded lines at the pace of their times.
-
-    Holds the open file.
-    """
+    """`TrackerSource` that plays recorded lines at the pace of their times."""
 
     def __init__(
         self, name: str, wanted: str | None, path: Path, clock: Clock, stop: threading.Event
     ) -> None:
         """Open the file, plain or compressed, and look which devices it has.
 
-        Args:
-            name: Of the device in our messages.
-            wanted: Its serial number, or what libsurvive calls it; None: there is one only.
-            path: What `survive-cli --record FILE` wrote, or its --record-stdout.
-            clock: The slave's clock, on which the recording begins when it is read first.
-            stop: Ends the stream, also while a pose is waited for.
+        `wanted` as of `SurviveDevice`; `path`: what `survive-cli --record FILE` wrote, or its --record-stdout; on
+        `clock` the recording begins when it is read first.
 
         Raises:
             TrackerError: The file cannot be read, or has no pose of the device.
@@ -448,11 +388,7 @@ class SurviveFile:
 
 
 def _poses_of(path: Path, wanted: str | None) -> list[Pose]:
-    """The poses of one device in a file, in order of time.
-
-    Raises:
-        TrackerError: As `SurviveFile`.
-    """
+    """The poses of one device in a file, in order of time; raises as `SurviveFile`."""
     decoder, device = LineDecoder(), SurviveDevice("check", wanted)
     names: dict[str, str] = {}
     every: list[Pose] = []
@@ -486,11 +422,7 @@ def _poses_of(path: Path, wanted: str | None) -> list[Pose]:
 
 
 def _started(program: str, options: Sequence[str]) -> tuple["subprocess.Popen[bytes]", int]:
-    """The program, and our end of the terminal that it writes to.
-
-    Raises:
-        TrackerError: It cannot be started.
-    """
+    """The program, and our end of the terminal that it writes to."""
     found = shutil.which(program)
     if found is None:
         raise TrackerError(f"--device survive: cannot start {program}: no such program: {INSTALL}")

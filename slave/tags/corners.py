@@ -1,12 +1,9 @@
 """Find dark quadrilaterals, and refine their corners to hundredths of a pixel.
 
-Corners of tags to some hundredths of a pixel.
-
-A line is fitted along each side; the corners are where two lines meet.
-
-A side is an edge between black print and white paper, blurred by lens, pixel and motion: across it the light follows a
-cumulative normal distribution. Its place, slope, width and both levels are fitted to what is seen along the side
-(Gauss-Newton, all sides of all tags at once). Four things make it right to hundredths:
+A side is an edge between black print and white paper, blurred by lens, pixel and motion: across it the light follows
+a cumulative normal distribution. Its place, slope, width and both levels are fitted to what is seen along the side
+(Gauss-Newton, all sides of all tags at once); a corner is where two lines meet, and is as sure as their residuals
+show:
 
 - It is done in linear light. On the bytes the middle of an edge lies in the white, by a third of its width, and every
   tag seems smaller.
@@ -14,12 +11,6 @@ cumulative normal distribution. Its place, slope, width and both levels are fitt
 - Behind the border, one cell further in, begins the code. Where that is white it is blurred into the border, which
   moves the edge of a small tag by a tenth of a pixel; once it is known what the code is, that is part of the law.
 - The light may rise along a side.
-
-How sure a corner is follows from the residuals of the two lines through it.
-
-Dark quadrilaterals on bright ground, as candidates for tags.
-
-They are found before the code of a tag is read.
 """
 
 from dataclasses import dataclass
@@ -41,25 +32,18 @@ SQRT_2_PI = np.sqrt(2.0 * np.pi)
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Corners of N tags.
+    """Corners of N tags."""
 
-    Attributes:
-        uv: (N, 4, 2) [px], in the order of the corners that were begun with.
-        sigma_px: (N,) standard deviation per axis; NaN: a side could not be followed, `uv` means nothing.
-        contrast: (N,) linear light of the white minus that of the black, of the side that has least.
-        width_px: (N,) standard deviation of what blurs an edge.
-    """
-
-    uv: Float
-    sigma_px: Float
-    contrast: Float
-    width_px: Float
+    uv: Float  # (N, 4, 2) [px], in the order of the corners that were begun with
+    sigma_px: Float  # (N,) standard deviation per axis; NaN: a side could not be followed
+    contrast: Float  # (N,) linear light of white less black, of the side that has least
+    width_px: Float  # (N,) standard deviation of what blurs an edge
 
 
 def refine(
     grey: Image, corners: Float, cells: int, lens: CameraModel | None, inner: Float | None = None
 ) -> Corners:
-    """Lay lines along the sides of tags.
+    """Fit lines along the sides of tags.
 
     Args:
         grey: (H, W) bytes.
@@ -123,10 +107,7 @@ def _fit(
 
 
 def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -> Float:
-    """Return points (N, 4, ALONG, 2) [px] on the sides of the tags.
-
-    At shares `place` (N, 4, ALONG) of their length.
-    """
+    """Points (N, 4, ALONG, 2) [px] at shares `place` (N, 4, ALONG) of the sides."""
     if lens is None:
         return begin[..., None, :] + place[..., None] * (end - begin)[..., None, :]
     a = lens.undistort(begin)
@@ -135,54 +116,37 @@ def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -
 
 
 def _sampled(light: Float, at: Float) -> Float:
-    """Interpolate the light at points (N, 4, ALONG, ACROSS, 2) [px].
-
-    Between pixels; the rim of the image goes on outside.
-    """
+    """Interpolate the light at points (N, 4, ALONG, ACROSS, 2) [px]."""
     flat = np.ascontiguousarray(at.reshape(-1, ALONG * ACROSS, 2), np.float32)
-    found = cv2.remap(
-        light.astype(np.float32),
-        flat[..., 0],
-        flat[..., 1],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    x, y = flat[..., 0], flat[..., 1]
+    found = cv2.remap(light.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return found.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class _Sides:
-    """Samples of S sides.
+    """Samples of S sides."""
 
-    Light (S, ALONG, ACROSS), their places along (S, ALONG) 0..1 and across (S, ACROSS) [px], how deep and how long a
-    cell is (S,) [px], whether those behind the border are white (S, cells).
-    """
-
-    seen: Float
-    place: Float
-    across: Float
-    cell: Float
-    cell_along: Float
-    inner: Float | None
+    seen: Float  # light (S, ALONG, ACROSS)
+    place: Float  # (S, ALONG) along, 0..1
+    across: Float  # (S, ACROSS) [px]
+    cell: Float  # (S,) how deep a cell is [px]
+    cell_along: Float  # (S,) how long it is [px]
+    inner: Float | None  # (S, cells) whether those behind the border are white
 
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
-    """Fitted lines of S sides.
+    """Fitted lines of S sides."""
 
-    How far outward they lie [px] at begin and end (S, 2), its variances (S, 2) per variance of a sample, mean square
-    of the residuals (S,), contrast (S,), width of the edge (S,) [px].
-    """
-
-    offset: Float
-    variance: Float
-    most_residual: Float
-    contrast: Float
-    width: Float
+    offset: Float  # (S, 2) how far outward they lie at begin and end [px]
+    variance: Float  # (S, 2) its variances per variance of a sample
+    mean_square: Float  # (S,) of the residuals
+    contrast: Float  # (S,)
+    width: Float  # (S,) of the edge [px]
 
 
 def _edges(sides: _Sides) -> _Lines:
-    """Fit S edges."""
     seen, s = sides.seen, len(sides.seen)
     dark, bright = seen[..., :2].mean(axis=(1, 2)), seen[..., -2:].mean(axis=(1, 2))
     p: Float = np.stack([dark, bright, *np.zeros((3, s)), np.full(s, np.log(0.8))], axis=1)
@@ -206,10 +170,10 @@ def _edges(sides: _Sides) -> _Lines:
 
 
 def _law(p: Float, sides: _Sides) -> tuple[Float, Float]:
-    """Return the Jacobian and light of the edge model at given parameters.
+    """Return Jacobian (S, ALONG * ACROSS, 6) and light (S, ALONG, ACROSS) of edges.
 
-    Jacobian (S, ALONG * ACROSS, 6) and light (S, ALONG, ACROSS) of edges with parameters (S, 6): light of the black
-    and of the white, offsets at begin and end, by what share the light rises along the side, log of the width.
+    Parameters (S, 6): light of the black and of the white, offsets at begin and end, by what share the light rises
+    along the side, log of the width.
     """
     dark, bright, first, last, rise, width = p.T[:, :, None, None]
     width = np.exp(width)
@@ -258,7 +222,7 @@ def _met(
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)
     bilinear = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
-    noise = line.most_residual.reshape(n, 4) * np.maximum(bilinear * density, 1.0)
+    noise = line.mean_square.reshape(n, 4) * np.maximum(bilinear * density, 1.0)
     contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
     floor_px = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
     # an edge that is wider is off by so much of what it is wider: motion has its own law
@@ -281,7 +245,7 @@ def _met(
         & (contrast > least_contrast)
         & (width < 0.99 * WIDEST_PX)
     )
-    good &= line.most_residual.reshape(n, 4) < (most_residual * contrast) ** 2
+    good &= line.mean_square.reshape(n, 4) < (most_residual * contrast) ** 2
     sigma = np.sqrt(spread.mean(axis=1) / 2.0)
     return Corners(met, np.where(good.all(axis=1), sigma, np.nan), contrast.min(axis=1), width.mean(axis=1))
 
@@ -318,10 +282,7 @@ def quads(grey: Image) -> Float:
 
 
 def _with_margin(corners: Float) -> Float:
-    """Return the same quadrilaterals with their sides moved outward.
-
-    An outline runs through the middles of the outermost dark pixels.
-    """
+    """Move the sides outward: an outline runs through the middles of dark pixels."""
     along = np.roll(corners, -1, axis=1) - corners
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     before = np.roll(along, 1, axis=1)

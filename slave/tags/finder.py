@@ -1,24 +1,14 @@
 """Find tags in a frame, and read their codes.
 
-Reading of a tag's code, with its fit to what is printed.
-
-The corners of the tag are known to hundredths.
-
-The light of every cell is compared with what each tag of the objects would show there, blurred as the tag's edges are:
-by the correlation of the code's cells. So a tag is read though its cells are but two or three pixels wide and no bit of
-it stands alone, and what is no tag correlates with none.
-
-Tag finder: frame in, tags out.
-
-Tags that were seen are sought where they should be, the rest of the image is searched part by part.
-
 A push machine; it holds where each tag was and how it moved, and which part of the image is next.
 
-    expected   where the tag must be by its motion, its sides are fitted and its code is read    corners, reading
+    expected   where the tag must be by its motion, its sides are fitted and its code is read
     near       where that fails, and about what was found (the next face of the box): quads
     anywhere   a part of the image each time, the whole in turn; all of it in the first frame
 
-So a frame costs what the tags in it cost and a fixed part of a search, whatever the camera sees.
+So a frame costs what the tags in it cost and a fixed part of a search. A code is read by the correlation of the light
+of its cells with what each tag of the objects would show there, blurred as the tag's edges are: so a tag is read
+though its cells are but two or three pixels wide, and what is no tag correlates with none.
 """
 
 import math
@@ -37,44 +27,32 @@ from common.geometry.tag_family import GRIDS, tag_bits
 from common.messages import MAX_TAGS
 from slave.tags.corners import LIGHT, Corners, normal_law, quads, refine
 
-SPOTS = np.array(
-    [[0.0, 0.0], [-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]]
-)  # of a cell, where it is looked at
+# of a cell, where it is looked at
+SPOTS = np.array([[0.0, 0.0], [-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])
 SURE = {4: 0.97, 5: 0.88, 6: 0.82}  # cells of code -> correlation from which a tag is accepted
 EXPECTED = {4: 0.8, 5: 0.7, 6: 0.6}  # and where it is expected
 
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """What N quads are.
+    """What N quads are."""
 
-    Attributes:
-        which: (N,) index of the tag that fits best.
-        quarter_turns: (N,) which of the quad's corners is the first of the print.
-        fit: (N,) correlation -1..1; NaN: the border is not black.
-    """
-
-    which: Int
-    quarter_turns: Int
-    fit: Float
+    which: Int  # (N,) index of the tag that fits best
+    quarter_turns: Int  # (N,) which of the quad's corners is the first of the print
+    fit: Float  # (N,) correlation -1..1; NaN: the border is not black
 
 
 class Codes:
-    """The tags of one family that are sought. Holds their patterns.
+    """The tags of one family that are sought, and their patterns.
 
     Attributes:
-        family: Of them.
         ids: (K,) numbers, rising.
         cells: Along a side, the black border included.
         inner: (K, 4, cells) whether the cells behind the border are white, along the four sides, clockwise.
     """
 
     def __init__(self, family: TagFamily, numbers: Sequence[int]) -> None:
-        """Seek `numbers`.
-
-        Raises:
-            ValueError: The family has no such tag.
-        """
+        """Seek `numbers`; ValueError: the family has no such tag."""
         self.family: TagFamily = family
         self.ids: Ids = np.array(sorted(numbers), np.uint16)
         code = GRIDS[family].cells
@@ -128,10 +106,7 @@ class Codes:
 
 
 def _blur(cells: int, width: float) -> Float:
-    """Return the blur matrix (cells, cells) of a row of cells.
-
-    It holds the share that each cell has in the light at the middle of each other, blurred by `width` cells.
-    """
+    """Share (cells, cells) of each cell in the light of each, blurred by `width`."""
     apart = (np.arange(cells)[:, None] - np.arange(cells)).astype(np.float64)
     width = max(width, 0.05)
     weight = normal_law((apart + 0.5) / width) - normal_law((apart - 0.5) / width)
@@ -167,13 +142,10 @@ class FoundTags:
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """Track of a tag.
+    """Track of a tag."""
 
-    Its corners (4, 2) [px], their velocity (4, 2) [px/s], the time, and how wide its edges were.
-    """
-
-    uv: Float
-    speed: Float
+    uv: Float  # corners (4, 2) [px]
+    speed: Float  # (4, 2) [px/s]
     t_ns: int
 
     def expected(self, t_ns: int) -> Float:
@@ -185,20 +157,12 @@ class _Track:
 
 
 class TagFinder:
-    """Finder of the tags of one camera's objects.
-
-    Holds a track per tag, and which part is searched next.
-    """
+    """Finder of the tags of one camera's objects: a track per tag, the next part."""
 
     def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
-        """Seek the tags of `objects`.
+        """Seek the tags of `objects`; with intrinsics sides are as the lens bends them.
 
-        Args:
-            camera: Camera file; with intrinsics the sides are followed as the lens bends them.
-            objects: One or more of them with tags.
-
-        Raises:
-            CalibrationError: Two objects have a tag of the same number, or a family has no such tag.
+        Raises CalibrationError: two objects have a tag of the same number, or a family has no such tag.
         """
         self._camera, self._objects = camera, tuple(objects)
         self._size = (camera.height_px, camera.width_px)
@@ -220,12 +184,8 @@ class TagFinder:
     def push(self, image: Image, t_ns: int) -> FoundTags:
         """Find the tags of one frame.
 
-        Args:
-            image: (H, W, 3) BGR of the camera's size, or (H, W) grey.
-            t_ns: Time of the frame [ns], rising; only differences matter.
-
-        Raises:
-            ValueError: The image is not of the camera's size, or not 8 bit.
+        `image`: (H, W, 3) BGR of the camera's size, or (H, W) grey. `t_ns`: Time of the frame [ns], rising;
+        only differences matter. Raises ValueError: the image is not of the camera's size, or not 8 bit.
         """
         if image.shape[:2] != self._size or image.dtype != np.uint8:
             raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {self._size} uint8")
@@ -278,10 +238,7 @@ class TagFinder:
     def _search(
         self, part: Image, grey: Image, box: Box, scale: int, found: dict[int, tuple[Float, float]]
     ) -> None:
-        """Search for tags in a part of the image.
-
-        The part begins at left, top of `box` and is smaller by `scale`.
-        """
+        """Search a part of the image, from left, top of `box`, smaller by `scale`."""
         begun = quads(part)
         begun = (begun + 0.5) * scale - 0.5 + np.array(box[:2], np.float64)
         begun = begun[[not _known(quad, found) for quad in begun]] if len(begun) else begun
@@ -306,10 +263,7 @@ class TagFinder:
                     found[number] = final.uv[k], float(final.sigma_px[k])
 
     def _near(self, tracks: dict[int, _Track], found: dict[int, tuple[Float, float]], t_ns: int) -> list[Box]:
-        """Return the boxes in which lost tags may be.
-
-        And those beside what was found; boxes that touch become one.
-        """
+        """Return the boxes in which lost tags may be, and those beside found ones."""
         boxes: list[Box] = []
         for number, track in tracks.items():
             margin = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone astray
@@ -351,11 +305,7 @@ class TagFinder:
 
 
 def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
-    """What is sought for the tags of objects, by family.
-
-    Raises:
-        CalibrationError: Two objects have a tag of the same number, or a family has no such tag.
-    """
+    """What is sought for the tags of objects, by family; raises as `TagFinder`."""
     owner: dict[int, str] = {}
     families: dict[TagFamily, list[int]] = {}
     for profile in objects:
@@ -378,7 +328,6 @@ def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
 
 
 def _known(quad: Float, found: dict[int, tuple[Float, float]]) -> bool:
-    """Whether a patch is a tag that was found."""
     middle = quad.mean(axis=0)
     same = 0.35  # of a tag's size: a patch whose middle is nearer to a tag that was found is that tag
     return any(

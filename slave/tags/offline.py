@@ -1,19 +1,12 @@
 """Find tags of objects in live or recorded frames.
 
-Detect the tags of frames once their markers are sent, as time allows.
-
-Nothing of it is loaded where no object has tags.
-
-Tags of a whole recording, into one file per camera.
-
-Beside the markers of its frames; deterministic.
+Live, after the markers of a frame are sent, as time allows; recorded, in every frame, into one file per camera.
 """
 
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,17 +19,11 @@ from common.recording.frame_recording import FrameRow
 from slave.sources import Frame
 from slave.tags.finder import FoundTags, TagFinder
 
-if TYPE_CHECKING:
-    from slave.tags.finder import TagFinder
-
 SHARE = 0.8  # of the time between two frames that markers and tags together may take
 
 
 class Pace:
     """Grants searches out of the time that frames leave.
-
-    Holds what is left [ns], what a search takes [ns], and the
-    times of the last frame and the last search.
 
     What a frame leaves of its share of the time since the frame before is saved until a search fits into it, and no
     more than one search is saved up: so a machine that is too slow for tags in every frame looks at every second or
@@ -83,11 +70,7 @@ class LiveTags:
     """Finds the tags of frames. Holds the finder in use, if any, its pace and counts."""
 
     def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
-        """Seek the tags of `objects`, of which none may have any.
-
-        Raises:
-            CalibrationError: As of `TagFinder`.
-        """
+        """Seek the tags of `objects`, of which none may have any; raises as `TagFinder`."""
         self._camera = camera.name
         self._pace = Pace(camera.frame_rate_hz)
         self._finder = finder_of(camera, objects)
@@ -119,7 +102,7 @@ class LiveTags:
         self._found += len(found.ids)
         return message
 
-    def replace(self, finder: "TagFinder | None") -> None:
+    def replace(self, finder: TagFinder | None) -> None:
         """Go on with another finder; None: no object has tags any more."""
         self._finder = finder
 
@@ -135,16 +118,10 @@ class LiveTags:
         }
 
 
-def finder_of(camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> "TagFinder | None":
-    """A finder of the tags of `objects`; None: none has any.
-
-    Raises:
-        CalibrationError: As of `TagFinder`.
-    """
+def finder_of(camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> TagFinder | None:
+    """A finder of the tags of `objects`; None: none has any; raises as `TagFinder`."""
     if all(profile.tags is None for profile in objects):
         return None
-    from slave.tags.finder import TagFinder
-
     return TagFinder(camera, objects)
 
 
@@ -175,11 +152,7 @@ class TagCollector:
     def __init__(
         self, camera: CameraCalibration, objects: Mapping[str, ObjectProfile], continuous: bool = True
     ) -> None:
-        """Seek the tags of `objects`; not `continuous`: each frame by itself.
-
-        Raises:
-            CalibrationError: As of `TagFinder`.
-        """
+        """Seek the tags of `objects`, as `TagFinder`; `continuous`: with tracks."""
         self._finder = TagFinder(camera, list(objects.values()))
         self._continuous = continuous
         self._rows: list[FrameRow] = []
@@ -208,12 +181,9 @@ class TagCollector:
 def tagged_objects(
     recorded: Mapping[str, ObjectProfile], rig: RigCalibration, calibration: Path | None
 ) -> dict[str, ObjectProfile]:
-    """Return the objects of a rig that have tags.
+    """Objects of a rig that have tags, as in `calibration`/objects, or as recorded.
 
-    As recorded, or as DIR/objects has them, where `calibration` is given.
-
-    Raises:
-        CalibrationError: A file is broken, or an object of the rig is nowhere.
+    Raises CalibrationError: a file is broken, or an object of the rig is nowhere.
     """
     objects: dict[str, ObjectProfile] = {}
     for name in rig.objects:

@@ -1,19 +1,9 @@
 r"""Detect five fingers in the frames of a wrist camera.
 
-Complete pipeline of a wrist camera.
-
-From frames to what its laser and its LEDs show of five fingers.
-
 frame -> strobe -> cycle --- LED less ambient ---> seams between the fingers
                          \-- laser less ambient -> where the laser meets each finger -> fingertips
 
-Detector that sees no finger, for a wrist slave being calibrated.
-
-The wrist device's lens, laser or palm is still being measured.
-
-Device and hand data of a wrist device, from the files of a slave.
-
-Also when the files change while it runs.
+Two strobe cycles have nothing to do with each other: no pose is kept.
 """
 
 from collections import deque
@@ -40,16 +30,10 @@ from slave.wrist.workspace import workspace_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristFound:
-    """Detections in one strobe cycle.
+    """Detections in one strobe cycle."""
 
-    Attributes:
-        cycle: The frames.
-        laser: Where the laser meets each finger.
-        tips: Fingertips.
-    """
-
-    cycle: StrobeCycle
-    laser: LaserLines
+    cycle: StrobeCycle  # the frames
+    laser: LaserLines  # where the laser meets each finger
     tips: Fingertips
 
     def message(self, camera: str, session: int) -> WristDetections:
@@ -73,22 +57,10 @@ class WristFound:
 
 
 class WristDetector:
-    """Detector of a wrist camera.
-
-    Holds the strobe, which knows the frames since the last strobe cycle, the view that the next strobe cycle is seen
-    with, and recent detections, for whoever shows them.
-
-    Of a pose nothing is used again: two strobe cycles have nothing to do with each other.
-    """
+    """Detector of a wrist camera, with recent detections for whoever shows them."""
 
     def __init__(self, view: WristView, frame_rate_hz: float, engine: Engine = NUMPY) -> None:
-        """Begin with no frame; it takes a second or two to prepare the view.
-
-        Args:
-            view: What the device knows of itself and of the hand.
-            frame_rate_hz: Of the camera file: single frames per second, three per strobe cycle.
-            engine: What does the inner loops.
-        """
+        """Begin with no frame; it takes a second or two to prepare the view."""
         self._strobe = Strobe(frame_rate_hz)
         self._engine = engine
         recent = 4  # strobe cycles
@@ -101,10 +73,7 @@ class WristDetector:
         return dict(self._strobe.counts)
 
     def push(self, frame: Frame) -> WristFound | None:
-        """Take the next frame of the camera.
-
-        Returns the detections where it completes a strobe cycle.
-        """
+        """Take the next frame; return detections where it completes a strobe cycle."""
         cycle = self._strobe.push(frame)
         if cycle is None:
             return None
@@ -113,26 +82,16 @@ class WristDetector:
         return found
 
     def found(self, t_ns: int) -> tuple[Float, Float] | None:
-        """Return the laser points and tips (5, 2) [px] of a strobe cycle.
-
-        It is the one whose LED frame is of that time [ns]; NaN: not seen.
-
-        None: too long ago, or no such frame. From any thread.
-        """
+        """Laser points, tips (5, 2) [px] by LED time; NaN: not seen; None: none so old."""
         return next(((laser, tips) for at_ns, laser, tips in tuple(self._found) if at_ns == t_ns), None)
 
     def replace(self, view: WristView) -> None:
-        """Use another view, a prepared one, from the next strobe cycle on.
-
-        From any thread.
-        """
+        """Use another, prepared view from the next strobe cycle on. From any thread."""
         self._view = view
 
 
 def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
-    """Return the same view once all its dependent data has been made and cached.
-
-    That is what depends on the view alone (search bands, templates).
+    """Return the same view once all that depends on it alone is made and cached.
 
     A cycle in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
@@ -167,11 +126,7 @@ class NullWristDetector:
 
 
 def view_of(files: CameraFiles) -> WristView:
-    """The view that camera, rig and hand make together.
-
-    Raises:
-        CalibrationError: Something is not calibrated; the text names files and key.
-    """
+    """View of camera, rig and hand; CalibrationError names file and key it lacks."""
     if files.hand is None:
         raise CalibrationError(
             f"{files.rig_path}: hand: the profile {files.rig.hand!r} of a wrist rig is not loaded"

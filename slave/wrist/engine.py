@@ -1,7 +1,4 @@
-"""Choice of the code for the inner loops of a wrist device, by name alone.
-
-OpenCV and numpy, or machine code.
-"""
+"""Choice of the code for the inner loops of a wrist device, by name alone."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,15 +18,7 @@ Measure: TypeAlias = Callable[[Runs, Int, int], FingerLines]
 
 @dataclass(frozen=True, slots=True)
 class Engine:
-    """The steps in which much is done with few numbers.
-
-    Attributes:
-        energy: Straightened search bands, and how many circles the thumb crosses -> energy (`valleys.energy`).
-        minimum_cost_paths: As `seams.minimum_cost_paths`.
-        lines: As `runs.lines`.
-        measure: As `finger_lines.measure`.
-        candidates: As `fingertips.candidates`.
-    """
+    """The steps in which much is done with few numbers: functions of those names."""
 
     energy: Energy
     minimum_cost_paths: MinimumCostPaths

@@ -1,17 +1,6 @@
 """Run the inner loops of seams and laser lines as machine code by numba.
 
-Laser line as machine code by numba.
-
-Its runs, how they link up, and the pieces of each finger's line.
-
-What it makes is what `runs` and `finger_lines` make, but for sums added up in another order.
-
-Seams between fingers as machine code by numba.
-
-And the whole of the engine of that name.
-
-What it makes is what `valleys` and `paths` make, but for sums added up in another order. Dozens of calls for a few
-hundred numbers each become one.
+What it makes is what `runs` and `seams` make, but for sums added up in another order.
 """
 
 import math
@@ -35,13 +24,8 @@ def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
     most = band.size // 2 + band.shape[0] + 1
     whole = np.empty((most, 3), dtype=np.int64)
     parts = np.empty((most, 2))
-    limits = (
-        runs.SETTINGS.thickest_px,
-        runs.SETTINGS.flat_px,
-        runs.SETTINGS.top,
-        runs.SETTINGS.of_peak,
-        runs.SETTINGS.of_flat,
-    )
+    of = runs.SETTINGS
+    limits = (of.thickest_px, of.flat_px, of.top, of.of_peak, of.of_flat)
     count = _scan(np.asarray(band, np.uint8), np.asarray(least, np.uint8), corner, limits, whole, parts)
     if not count:
         return NO_RUNS, np.empty(0, dtype=np.bool_)
@@ -63,10 +47,7 @@ def _scan(
     whole: Int,
     parts: Float,
 ) -> int:
-    """Scan an image on its side for runs.
-
-    Fills in column, first row and the one after the last (N, 3), sub-pixel row and peak (N, 2).
-    """
+    """Scan an image on its side for runs: column, rows (N, 3); row and peak (N, 2)."""
     thickest, flat_px, top, of_peak, of_flat = limits
     left, first = corner
     count = 0
@@ -100,10 +81,7 @@ def _scan(
 
 @compiled
 def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: Int) -> int:
-    """Link runs to lines and return their number.
-
-    Fills in the order of runs line by line, the first run of each line, and which line it joins.
-    """
+    """Link runs to lines: run order, first run and joined line of each; their number."""
     count = len(whole)
     to, off = np.full(count, -1), np.full(count, math.inf)
     from_ = np.full(count, -1)
@@ -155,7 +133,7 @@ def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: I
 
 
 def measure(runs_: Runs, finger: Int, width_px: int) -> FingerLines:
-    """As `finger_lines.measure`."""
+    """As `runs.measure`."""
     out = np.zeros((6, 5))
     limits = (runs.STEEPEST, runs.LONG, width_px)
     _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, limits, out)
@@ -165,13 +143,7 @@ def measure(runs_: Runs, finger: Int, width_px: int) -> FingerLines:
 
 @compiled
 def _measure(
-    column: Int,
-    row: Float,
-    peak: Float,
-    first: Int,
-    finger: Int,
-    limits: tuple[float, int, int],
-    out: Float,
+    column: Int, row: Float, peak: Float, first: Int, finger: Int, limits: tuple[float, int, int], out: Float
 ) -> None:
     """Over the parts of lines: sums, then centroids."""
     longest = np.zeros(5)
@@ -215,13 +187,7 @@ def _measure(
 
 @compiled
 def _part(
-    column: Int,
-    row: Float,
-    left: int,
-    right: int,
-    of: int,
-    limits: tuple[float, int, int],
-    out: Float,
+    column: Int, row: Float, left: int, right: int, of: int, limits: tuple[float, int, int], out: Float
 ) -> None:
     """Add the pieces of one part, from its left end to its right one."""
     inner = 2 if right - left >= limits[1] else 0
@@ -284,7 +250,7 @@ def _minimum_cost_paths(energy: Float32, widths: Int, step_cost: np.float32, out
 
 
 def energy(straightened: Image, crossed: int) -> Float32:
-    """As `cost_map.energy`."""
+    """As `seams.energy`."""
     before = np.asarray(cv2.dilate(straightened, seams.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
     behind = np.asarray(cv2.dilate(straightened, seams.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
     around = np.asarray(cv2.dilate(straightened, seams.AROUND), np.uint8)
@@ -325,9 +291,7 @@ def _energy(
 
 
 def prepare() -> None:
-    """Compile everything, on a synthetic line.
-
-    A first hand must not find a slave that compiles.
+    """Compile everything, on a synthetic line, before a first hand comes.
 
     Some ten seconds on a desktop processor the first time a version runs; half a second later, from the cache.
     """

@@ -1,12 +1,10 @@
 """Search for fingertips as machine code by numba.
 
-Postures, what they cost, outlines, ends.
-
 What it makes is what `fingertips.candidates` makes, but for sums added up in another order.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,7 +70,7 @@ class _Limits(NamedTuple):
 
 
 class _Outline(NamedTuple):
-    """Constants of `outline`."""
+    """Constants of the outline in `led_image`."""
 
     log: Float32
     way: Float
@@ -91,10 +89,7 @@ class _Outline(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """N hypotheses of fingertip postures.
-
-    As `fingertips.Hypotheses`, and of the samples the middle of the fingertip and its end (N, 4).
-    """
+    """N hypotheses, as `fingertips.Hypotheses`; `at`: middle and end of tips (N, 4)."""
 
     row: Float
     abduction: Float
@@ -103,70 +98,28 @@ class _Found(NamedTuple):
     at: Float
 
 
-_LIMITS = _Limits(
-    float(fingertips.LEAST_NEAR),
-    fingertips.SETTINGS.most_abduction,
-    fingertips.SETTINGS.within_m,
-    fingertips.SETTINGS.sigma_m,
-    fingertips.SETTINGS.most_off_m,
-    fingertips.SETTINGS.spread_m,
-    fingertips.SETTINGS.aside_m,
-    fingertips.SETTINGS.most_aside,
-    fingertips.SETTINGS.unsure,
-    fingertips.SETTINGS.variant,
-    math.exp(-fingertips.SETTINGS.most_off),
-    math.exp(fingertips.SETTINGS.most_off),
-    fingertips.SETTINGS.thumb_within_m,
-    fingertips.SETTINGS.thumb_sigma_m,
-    fingertips.SETTINGS.abduction_sigma,
-    fingertips.SETTINGS.own_sigma,
-    fingertips.SETTINGS.own_most,
-    fingertips.SETTINGS.scale_sigma,
-    fingertips.SETTINGS.darker,
-    fingertips.SETTINGS.as_bright,
-    fingertips.SETTINGS.above_most,
-    fingertips.SETTINGS.above_unknown,
-    fingertips.SETTINGS.folded_darker,
-    fingertips.SETTINGS.folded_as_bright,
-    fingertips.SETTINGS.unknown_cost,
-    fingertips.SETTINGS.hidden,
-    fingertips.SETTINGS.hides,
-    fingertips.SETTINGS.side,
-    fingertips.SETTINGS.modes,
-    fingertips.SETTINGS.mode_within,
-    fingertips.SETTINGS.apart,
-    fingertips.SETTINGS.unseen_cost,
-    fingertips.SETTINGS.at_sigma,
-    fingertips.SETTINGS.size_sigma,
-    fingertips.SETTINGS.at_sure,
-    fingertips.SETTINGS.twist_sigma,
-    fingertips.SETTINGS.laser_sure_m,
-    fingertips.SETTINGS.ends_within,
-    fingertips.SETTINGS.correlated,
-    postures.END,
-    postures.BONES.stop,
-    postures.HIGHEST,
-    postures.ABOVE.start + fingertips.SETTINGS.far,
-    postures.APEX,
-    fingertips.SETTINGS.upwards,
-    SHRINK,
-)
-_OUTLINE = _Outline(
-    led_image.LOG,
-    led_image.WAY,
-    led_image.SHARE,
-    led_image.WEIGHT,
-    led_image.MIDDLES,
-    led_image.WIDTHS,
-    led_image.SETTINGS.width,
-    led_image.STEP,
-    led_image.SETTINGS.rim,
-    led_image.SETTINGS.least_drop,
-    led_image.SETTINGS.firm_drop,
-    led_image.SETTINGS.edge_sigma,
-    led_image.SETTINGS.middle_sigma,
-    led_image.SETTINGS.radius_sigma,
-)
+_VALUES: dict[str, Any] = fingertips.SETTINGS._asdict() | {
+    "least_near": float(fingertips.LEAST_NEAR),
+    "least_ratio": math.exp(-fingertips.SETTINGS.most_off),
+    "most_ratio": math.exp(fingertips.SETTINGS.most_off),
+    "end": postures.END,
+    "bones": postures.BONES.stop,
+    "highest": postures.HIGHEST,
+    "far": postures.ABOVE.start + fingertips.SETTINGS.far,
+    "apex": postures.APEX,
+    "shrink": SHRINK,
+}
+_LIMITS = _Limits(**{name: _VALUES[name] for name in _Limits._fields})
+_EDGES: dict[str, Any] = led_image.SETTINGS._asdict() | {
+    "log": led_image.LOG,
+    "way": led_image.WAY,
+    "share": led_image.SHARE,
+    "weight": led_image.WEIGHT,
+    "middles": led_image.MIDDLES,
+    "widths": led_image.WIDTHS,
+    "step": led_image.STEP,
+}
+_OUTLINE = _Outline(**{name: _EDGES[name] for name in _Outline._fields})
 
 
 def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
@@ -209,10 +162,7 @@ def _search(
     edges: _Outline,
     out: Float,
 ) -> None:
-    """Search the fingertip of each finger.
-
-    Fills in the outline (x, y, radius, sigma, shown), residual, and `Ends`; NaN: no posture of the finger fits.
-    """
+    """Search each fingertip: outline, residual, `Ends`; NaN: no posture fits."""
     length = table.laser.shape[3]
     variants = 3  # abductions of a row
     most = variants * length
@@ -248,10 +198,7 @@ def _search(
 def _postures(
     image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, finger: int, found: _Found
 ) -> int:
-    """Collect postures of index ... little that match the laser and brightness.
-
-    They meet the laser where it is seen and are as bright as they should be.
-    """
+    """Collect postures of index ... little that match laser and brightness."""
     length = table.laser.shape[3]
     off, share, lateral, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
     sure, typical, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
@@ -303,7 +250,6 @@ def _postures(
 def _thumbs(
     image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, found: _Found
 ) -> int:
-    """Postures of the thumb."""
     count = 0
     for row in range(table.thumb):
         x, z = table.thumb_laser[0, row] - plane[0, 0], table.thumb_laser[1, row] - plane[0, 1]
@@ -345,10 +291,7 @@ def _take(
     found: _Found,
     count: int,
 ) -> int:
-    """Add a posture where its fingertip is about as bright as it should be.
-
-    Returns how many there are.
-    """
+    """Add a posture where its tip is about as bright as it should be; their count."""
     if count == len(found.row):
         return count
     middle, near = table.middle[row], table.near[row]
@@ -471,7 +414,7 @@ def _modes(found: _Found, count: int, table: Postures, limits: _Limits, out: Int
 
 @compiled
 def _fit(led: Image, circle: Float, open_: Float32, edges: _Outline) -> None:
-    """As `outline.fitted`, of one circle (x, y, radius, sigma, shown), in place."""
+    """As `led_image.fitted`, of one circle (x, y, radius, sigma, shown), in place."""
     directions = len(edges.way)
     off, firm, weight = np.empty(directions), np.zeros(directions), np.zeros(directions)
     x, y, radius = circle[0], circle[1], circle[2]
@@ -516,11 +459,7 @@ def _fit(led: Image, circle: Float, open_: Float32, edges: _Outline) -> None:
 def _edge(
     led: Image, x: float, y: float, radius: float, way: Float, log: Float32, edges: _Outline
 ) -> tuple[float, float, bool]:
-    """Find the edge of the light in one direction from a circle.
-
-    Returns how far beyond the circle the edge is, in radii, how much the logarithm of light falls there, and whether
-    the image shows that far.
-    """
+    """As `led_image._edges`, of one circle and direction."""
     height, width = led.shape
     steps = len(edges.share)
     for k in range(steps):

@@ -1,11 +1,9 @@
 """Fingertips in the LED image, by analysis and synthesis.
 
-Postures that the laser allows are compared with what is seen.
-
 The laser gives a point of each finger's skin in space, and with it the abduction and one of the flexions: of the
 finger's table (`postures`) few rows are left. Each predicts its samples' brightness; the scale of brightness comes
 from the laser points too, whose distance is known. The best ones are where the end of the finger may be, and its
-outline, measured at full resolution (`outline`), determines which it is and where exactly.
+outline, measured at full resolution (`led_image`), determines which it is and where exactly.
 """
 
 from collections.abc import Callable
@@ -77,11 +75,10 @@ class FingertipSettings(NamedTuple):
     folded_darker: float = 0.15
     folded_as_bright: float = 0.35
     unknown_cost: float = (
-        1.0  # of a sample outside of the image, or where that is saturated, or where something hides it
+        1.0  # of a sample outside of the image, where that is saturated, or something hides it
     )
     hidden: float = -0.6  # logarithm of nearness of what hides skin
-    hides: float = 8.0  # what it costs that there is such a thing
-    # before a finger: the thumb is before all that a hand grips.
+    hides: float = 8.0  # cost of such a thing before a finger: the thumb is before all that a hand grips
     side: float = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
     modes: int = 8  # places of a finger whose outlines are looked at
     mode_within: float = 24.0  # what they may cost more than the best
@@ -111,34 +108,22 @@ LEAST_SHOWN = np.array([0.75, 0.6])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fingertips:
-    """Of one LED image; NaN where no end of a finger is seen for sure.
+    """Of one LED image; NaN where no end of a finger is seen for sure."""
 
-    Attributes:
-        uv: (5, 2) [px] where the ends of thumb, index ... little are in the (distorted) image.
-        sigma_px: (5,) standard deviation.
-        depth: (5,) relative depth along the optical axis, in units of one constant for all five.
-    """
-
-    uv: Float
-    sigma_px: Float
-    depth: Float
+    uv: Float  # (5, 2) [px] ends of thumb, index ... little in the (distorted) image
+    sigma_px: Float  # (5,) standard deviation
+    depth: Float  # (5,) along the optical axis, in units of one constant for all five
 
 
 NO_TIPS = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
 
 
 class LedImage(NamedTuple):
-    """What samples are compared with, of the shrunken image.
+    """What samples are compared with, of the shrunken image."""
 
-    Attributes:
-        near: (h, w) nearness.
-        clipped: (h, w) where it is a lower bound.
-        over: (h, w) the most within OVER_PX above.
-    """
-
-    near: Float32
-    clipped: Bool
-    over: Float32
+    near: Float32  # (h, w) nearness
+    clipped: Bool  # (h, w) where it is a lower bound
+    over: Float32  # (h, w) the most within `over_px` above
 
     @classmethod
     def of(cls, near: Float32, clipped: Bool) -> Self:
@@ -169,34 +154,23 @@ class LedImage(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """N postures, finger by finger.
-
-    Attributes:
-        table: Of postures.
-        rows: (N,) of it.
-        finger: (N,).
-        abduction: (N,) by ABDUCTION_RAD.
-        aside: (N,) how far the laser's point is beside where the posture has it [m].
-        uv: (N, SAMPLES, 2) [px].
-        cost: (N,) of the laser measurement.
-    """
+    """N postures, finger by finger."""
 
     table: Postures
-    rows: Int
-    finger: Int
-    abduction: Float32
-    aside: Float32
-    uv: Float32
-    cost: Float32
+    rows: Int  # (N,) of the table
+    finger: Int  # (N,)
+    abduction: Float32  # (N,) by ABDUCTION_RAD
+    aside: Float32  # (N,) how far the laser's point is beside where the posture has it [m]
+    uv: Float32  # (N, SAMPLES, 2) [px]
+    cost: Float32  # (N,) of the laser measurement
 
 
 def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32, Float32]:
     """Return the table rows that meet the laser about where each finger does.
 
-    The fingers are (5, 2) [m]. Returns also the `abduction`, `aside` and `cost` of the rows.
-
-    The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser measures little, and rows
-    come in three abductions.
+    `plane`: the fingers' points (5, 2) [m]. Returns also the `abduction`, `aside` and `cost` of the rows. The
+    abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser measures little, and rows come
+    in three abductions.
     """
     x, z = plane[1:, :1], plane[1:, 1:]
     (x0, z0), (x1, z1), (x2, z2) = table.laser
@@ -241,10 +215,7 @@ def on_plane(laser_m: Float, view: WristView) -> Float32:
 
 
 def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) -> Hypotheses | None:
-    """Return postures consistent with the laser and fingertip brightness.
-
-    The laser points (5, 3) [m] allow them, and their fingertips are about as bright as they should be.
-    """
+    """Postures that the laser points (5, 3) [m] and the tips' brightness allow."""
     table = postures_of(view)
     rows, share, aside, cost = allowed(table, on_plane(laser_m, view))
     seen, bound, outside = image.at(_at(table.middle[rows], share))
@@ -269,20 +240,14 @@ def _at(parabola: Float32, share: Float32) -> Float32:
 
 
 def _logarithm(seen: Float32, predicted: Float32, bound: Bool) -> Float32:
-    """Return the logarithm of seen over predicted nearness.
-
-    Where the image is saturated it may be as bright as predicted.
-    """
+    """Return the logarithm of seen over predicted nearness, 0 or more at a `bound`."""
     off = np.log(np.maximum(seen, LEAST_NEAR) / np.maximum(predicted, np.float32(0.1)))
     np.maximum(off, 0.0, out=off, where=bound)
     return off
 
 
 def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
-    """Return minus twice the log likelihood (N,) of hypotheses.
-
-    By laser and samples.
-    """
+    """Return minus twice the log likelihood (N,) of hypotheses by laser and samples."""
     seen, bound, outside = image.at(some.uv[:, :APEX])
     predicted = some.table.near[some.rows] * np.float32(gain)
     off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
@@ -340,35 +305,22 @@ def modes(some: Hypotheses, cost: Float32) -> Int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """The best end of each of K fingers.
+    """The best end of each of K fingers."""
 
-    Attributes:
-        finger: (K,).
-        uv: (K, 2) [px].
-        sigma_px: (K,).
-        radius_px: (K,) of its outline.
-        residual: (K,) minus twice the logarithm of its likelihood, by samples and outline.
-        shown: (K,) share of the outline that is seen.
-        seen: (K,) probability that the finger itself leaves its end to be seen.
-    """
-
-    finger: Int
-    uv: Float
-    sigma_px: Float
-    radius_px: Float
-    residual: Float
-    shown: Float
-    seen: Float
+    finger: Int  # (K,)
+    uv: Float  # (K, 2) [px]
+    sigma_px: Float  # (K,)
+    radius_px: Float  # (K,) of its outline
+    residual: Float  # (K,) minus twice the logarithm of its likelihood, by samples and outline
+    shown: Float  # (K,) share of the outline that is seen
+    seen: Float  # (K,) probability that the finger itself leaves its end to be seen
 
 
 Search: TypeAlias = Callable[[Image, LedImage, Float, WristView], Candidates | None]
 
 
 def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
-    """Return the most likely end of each finger whose laser point is known.
-
-    None: of no finger.
-    """
+    """Most likely end of each finger whose laser point is known; None: of none."""
     laser_m = view.on_plane(laser_uv)
     gain = light_scale(image, laser_uv, laser_m)
     some = hypotheses(laser_m, image, gain, view) if gain is not None else None
@@ -389,10 +341,7 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
 
 
 def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32:
-    """Return `open` (M, DIRECTIONS) of hypotheses (M,), without occluded ends.
-
-    It is cleared where something hides the finger next to its end.
-    """
+    """Return `open` (M, DIRECTIONS), cleared where something hides the finger there."""
     open_, uv = some.table.open[some.rows[which]], some.uv[which]
     seen, bound, outside = image.at(uv[:, BONES])
     off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
@@ -405,25 +354,18 @@ def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32
 
 
 def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
-    """Return the cost of circles (N, 2), (N,) [px] that differ from the postures.
-
-    By place and by size.
-    """
+    """Return the cost of circles (N, 2), (N,) [px] that differ from the postures."""
     off = (middle - at) / (SETTINGS.at_sigma * radius)[:, None]
     return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SETTINGS.size_sigma)) ** 2
 
 
 class Ends(NamedTuple):
-    """Fingertip ends of K fingers.
+    """Fingertip ends of K fingers."""
 
-    Where the end is from the middle of the outline (K, 2) and its spread (K,), in radii; how much it faces the camera
-    (K,), and how likely the finger leaves it to be seen (K,).
-    """
-
-    towards: Float
-    spread: Float
-    facing: Float
-    seen: Float
+    towards: Float  # (K, 2) from the middle of the outline, in radii
+    spread: Float  # (K,) in radii
+    facing: Float  # (K,) how much it faces the camera
+    seen: Float  # (K,) how likely the finger leaves it to be seen
 
 
 def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candidates:
@@ -443,10 +385,7 @@ def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candi
 
 
 def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends:
-    """Return the mean ends over the hypotheses of each finger (K,).
-
-    Weighted by their likelihood where the finger's outline is that circle.
-    """
+    """Return the mean ends of each finger (K,) by likelihood, given its circle."""
     least = np.full(5, np.inf)
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least[some.finger[first]] = np.minimum.reduceat(cost, first)
@@ -474,9 +413,7 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
 def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
     """Return the rotation of ends (M, 2) about the middles of outlines.
 
-    The outlines lie `off` (M, 2) by `sigma` (M,), in radii.
-
-    An outline lies beside where it should be for abduction, which the laser measures, or for a twist of the finger.
+    The outlines lie `off` (M, 2) by `sigma` (M,), in radii: for abduction, which the laser measures, or a twist.
     """
     table, rows, by = some.table, some.rows[which], some.abduction[which]
     radius = table.end[rows, :1].astype(np.float64)
@@ -502,10 +439,7 @@ def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
 
 
 def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | None:
-    """Return the nearness of skin at 1 m facing the camera [grey levels^0.5].
-
-    By where the laser meets fingers (5, 2) [px], (5, 3) [m]; None: nothing is lit there.
-    """
+    """Nearness at 1 m facing the camera [grey levels^0.5], by laser points, or None."""
     known = np.isfinite(laser_m[:, 0])
     near, clipped, outside = image.at(laser_uv[known].astype(np.float32))
     good = ~clipped & ~outside & (near > LEAST_NEAR)
@@ -521,12 +455,9 @@ def fingertips(
 ) -> Fingertips:
     """Find them in one LED image.
 
-    Args:
-        led: (H, W) difference of LED and ambient frame.
-        frame: (H, W) the LED frame itself, which shows where the image is saturated.
-        laser_uv: (5, 2) where the laser meets the fingers [px]; NaN: not seen, then its tip is not sought.
-        view: Device and hand; the wrist is straight.
-        search: The engine's.
+    `led`: (H, W) less the ambient frame; `frame`: the LED frame itself, which shows where it is saturated;
+    `laser_uv`: (5, 2) where the laser meets the fingers [px], NaN: not seen, then no tip is sought; `view`: the wrist
+    is straight.
     """
     out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     optics = led_optics(view)

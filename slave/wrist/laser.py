@@ -1,41 +1,18 @@
-"""Find the laser segment of each finger.
+"""Find the laser segment of each finger and its centroid (Kim et al. 2012).
 
-Separate the fingers of the LED image by seams, which never cross.
+Seams part the fingers of the LED image: paths of least energy through search bands (`seams`), first the three among
+index ... little, side by side, then the thumb's, which lies over them. A pixel costs little where it is dark between
+brighter neighbours; of paths alike the one nearer to the middle of its band is taken.
 
-Seams of least energy by dynamic programming, as in Kim et al. 2012.
+The laser's line is short bright runs in the image's columns (`runs`). Seams assign a line; where they cut one, the
+cut moves to the crease. A pixel of the laser's plane is a known place before the palm, and fingers lean little to the
+side, so a line lies nearest to the axis of its own finger (`LaserWorkspace.place`). A wrist that deviates by 5
+degrees moves all by half a finger; where four lines lie side by side their middle is between the second and the
+third. The thumb crosses the plane near its MCP or beside the palm: what lies as near to its root is its own.
 
-How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
-fingers of this hand can do sets the search band of each of the four seams (`slave.wrist.seams`). Along the
-stations of a search band a seam is the path of least energy, found by dynamic programming: first the three among index
-... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
-minimum, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
-ones, near the LEDs and far from them. The skin of a finger costs so much that no seam crosses one. Of paths alike the
-one nearer to the middle of its band is taken: in an image that shows nothing the seams are those of the hand's
-geometry alone.
-
-Find the laser segment of each finger and its centroid (Kim et al. 2012).
-
-Finger labels of the parts of the laser line.
-
-By where each part lies on the laser's plane, where the seams cannot be right.
-
-A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
-axis of its own (`LaserWorkspace.place`), even where seams lie in another minimum. A wrist that deviates by 5 degrees
-moves all of them by half a finger, and a palm that holds something does not show it; but where four lines lie side by
-side their middle is between the second and the third. The thumb crosses the plane near its MCP or beside the palm:
-what lies as near to its root is its own, and what lies before the knuckles and farther away than that never is.
-
-Separate the thumb's laser line from that of its ball (thenar).
-
-The two run into each other; the plane that halves the angle of the MCP parts them. When the metacarpal stands
-across the laser's plane, a millimetre decides whether all of the line is the thumb's or none: so the centroid is taken
-for borders from near to far, each as likely as the next, and their mean and spread are what is known.
-
-Find the laser segment of each finger and its centroid (Kim et al. 2012).
-
-The line runs from side to side, so each column of the image holds it as short bright runs (`slave.wrist.runs`), one
-per surface. The seams assign a line; where they cut one, the cut is moved to the crease. What is left to each
-finger is measured (`slave.wrist.runs`).
+The lines of thumb and its ball (thenar) run into each other; the plane that halves the angle of the MCP parts them.
+Where the metacarpal stands across the laser's plane, a millimetre decides: so the centroid is taken for borders from
+near to far, each as likely as the next, and their mean and spread are what is known.
 """
 
 from dataclasses import dataclass
@@ -66,7 +43,6 @@ class Fingers:
         seams: (4, S) index|middle, middle|ring, ring|little [px, along the row of each station], and the thumb's
             [rad, along the circle of each station].
         shown: Whether the LED image showed a hand; else the seams are those of geometry alone.
-        palm_pose: How the palm lies.
     """
 
     search_bands: SearchBands
@@ -86,10 +62,6 @@ class Fingers:
         finger[angle > np.interp(radius, search_bands.radius + steps, self.seams[3])] = 0
         finger[np.isnan(radius)] = NONE
         return finger
-
-    def polylines(self) -> list[Float]:
-        """The four seams as pixels (S, 2), for pictures."""
-        return [self.search_bands.pixels(seam, self.seams[seam]) for seam in range(4)]
 
 
 def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
@@ -126,12 +98,7 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
 def _part(
     paths: Int, straightened: Image, energy: Float32, search_bands: SearchBands, engine: Engine
 ) -> None:
-    """Separate neighbouring seams that lie in one minimum.
-
-    The one that is farther out of its search band is sent to another minimum.
-
-    `paths` (3, S) and `energy` are changed.
-    """
+    """Send the outer one of two seams in one minimum to another; changes both arrays."""
     lit = straightened[:, : STARTS[3]].max(axis=1) > DARK
     same_minimum = 0.35  # of the distance of two search bands, and of the rows of the hand
     near = same_minimum * np.abs(np.diff(search_bands.middle[:3], axis=0))
@@ -154,10 +121,7 @@ def _part(
 
 
 def _in_thumbs(search_bands: SearchBands, seams: Float) -> Float:
-    """Return the sample (3, S) of the thumb's search band that each seam crosses.
-
-    For each of three seams (3, S), at every circle.
-    """
+    """Return the sample (3, S) of the thumb's search band that each seam crosses."""
     count = seams.shape[1]
     steps = STATION_PX * np.arange(count, dtype=np.float64)
     rows = np.broadcast_to(search_bands.row + steps, seams.shape)
@@ -177,10 +141,7 @@ _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has
 
 
 def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
-    """Return the fingers (N,) of runs at pixels (N, 2).
-
-    From the labels (N,) that the seams give, `NONE` where there is no line.
-    """
+    """Fingers (N,) of runs at pixels (N, 2), from the labels (N,) of the seams."""
     beyond, place = workspace.on_plane(points)
     on = finger != NONE
     near = on & workspace.only_thumb(beyond, place)
@@ -208,14 +169,7 @@ def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorksp
 
 
 def _shift(place: Float) -> float:
-    """Measure by how much all fingers lie beside their axes.
-
-    Args:
-        place: (N,) of their runs.
-
-    Returns:
-        As a place; 0 where they lie about there, or not all four are there.
-    """
+    """By how much all four lie beside their axes, from `place` (N,) of runs, or 0."""
     if not len(place):
         return 0.0
     across = np.sort(place)
@@ -228,12 +182,7 @@ def _shift(place: Float) -> float:
 
 
 def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
-    """Return which parts (N,) of fingers `of` may go to the `nearest` finger.
-
-    Not all of a finger's line may go to a finger that has its own line.
-
-    Then the finger is spread, or the palm is not quite where it should be.
-    """
+    """Which parts (N,) may go to `nearest`: not all of a line if that has its own."""
     unmoved = np.zeros(6, np.bool_)
     unmoved[of[~moving]] = True  # those of no finger come last
     return unmoved[of] | ~unmoved[nearest]
@@ -242,10 +191,8 @@ def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
 def _at_creases(finger: Int, runs: Runs) -> Int:
     """Move each change of finger along a line to the crease near by.
 
-    Returns the fingers (N,) of runs.
-
-    A line bends away at the sides of every finger, so that between two that touch its farthest, in the image its
-    uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
+    A line bends away at the sides of every finger: between two that touch its uppermost point in the image is the
+    crease; where none is near, the line ends and is one finger's.
     """
     out = finger.copy()
     change = finger[1:] != finger[:-1]
@@ -266,10 +213,7 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
 
 
 def _climb(start: int, along: range, row: Float, same: Bool) -> int:
-    """Return the last run of the same finger from one run on along a line.
-
-    It covers some columns, and goes farther while the line rises.
-    """
+    """Last run of a finger along a line: some columns, farther while it rises."""
     last = start
     for count, k in enumerate(along, 1):
         crease_px = 20  # columns on either side of a seam in which the crease may be
@@ -291,22 +235,17 @@ _BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _T3
 def on_ball(beyond_m: Float) -> bool:
     """Return whether a line (N,) is rather on the ball than on the thumb.
 
-    The line is so far beyond the MCP's skin [m].
-
-    Where the wrist is straight the thumb stands across the plane; a bent one can bring the ball there alone.
+    The line is so far beyond the MCP's skin [m]. Where the wrist is straight the thumb stands across the plane; a
+    bent one can bring the ball there alone.
     """
     return float(np.median(beyond_m)) < _BORDER_M
 
 
 def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
-    """Return the centroid offset of the thumb's part of a line (2,).
+    """Centroid offset (2,) of the thumb's part of a line, and its deviation [px].
 
-    It is how much this centroid lies beside that of the whole line; also its deviation [px].
-
-    Args:
-        runs: The runs.
-        of_thumb: (N,) which of them are on the thumb or its ball.
-        beyond_m: (N,) how far each is beyond the MCP's skin [m], from the thumb's root.
+    `of_thumb` (N,): runs on the thumb or its ball; `beyond_m` (N,): how far each is beyond the MCP's skin [m], from
+    the thumb's root.
     """
     points: Float = np.stack([runs.column[of_thumb], runs.row[of_thumb]], axis=-1, dtype=np.float64)
     length = np.ones(len(points))
@@ -338,17 +277,11 @@ _FAINT = 3.0 * SETTINGS.floor  # a line no brighter: what is left of one where t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserLines:
-    """One laser segment per finger, thumb ... little; NaN where none was seen.
+    """One laser segment per finger, thumb ... little; NaN where none was seen."""
 
-    Attributes:
-        uv: (5, 2) centroids by length [px].
-        sigma_px: (5,) standard deviation per axis.
-        length_px: (5,) length.
-    """
-
-    uv: Float
-    sigma_px: Float
-    length_px: Float
+    uv: Float  # (5, 2) centroids by length [px]
+    sigma_px: Float  # (5,) standard deviation per axis
+    length_px: Float  # (5,)
 
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
@@ -381,12 +314,7 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
 
 
 def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
-    """Return the standard deviations (5,) of centroids.
-
-    Of lines that are whole, in parts, faint, doubtful, and where no seam was seen.
-
-    Of a line in parts all but the longest may be another finger's, or what hides the middle of its own.
-    """
+    """Standard deviations (5,) of centroids; parts of a line may be another's."""
     apart = finger_lines.apart
     # at least, of a line in parts, some of which may be another's, or of one cut by the image
     in_parts_px = 2.0

@@ -1,37 +1,17 @@
 """Predict the LED image of the wrist camera from its view.
 
-Know device and hand before the first frame, and sample what fingers reach.
-
-Knowledge of the slave of a wrist device before the first frame.
-
-Device and hand, and the LEDs that light it.
-
-Sample the workspace of the fingers of a hand as points along their bones.
-
-Measure relative depth and fingertip outlines in the LED image.
-
-Estimate relative depth from the fall-off of the LED light.
-
-Kim et al. 2012 take sqrt(I) for distance; docs/theory/sources.md#nearness-and-distance has the correction.
-
-Light from beside the lens falls with the square of the distance and comes back once: the root of the intensity is
-*nearness*, not distance. With alpha the angle of the ray off the optical axis,
+Relative depth: light from beside the lens falls with the square of the distance and comes back once, so the root of
+the intensity is *nearness*, not distance (Kim et al. 2012 take sqrt(I) for distance; correction:
+docs/theory/sources.md#nearness-and-distance). With alpha the angle of the ray off the optical axis,
 
     depth = c cos(alpha) / sqrt(I / F),        F the flat field, what the LEDs make of a white surface
 
-along the optical axis; c is the surface's whiteness, the LEDs' power and the camera's gain in one, and is not known. So
-depth is *relative*: monotone, and right up to one factor where the surface is of one kind and faces the camera. Where
-it is inclined by theta it looks farther away by 1 / sqrt(cos theta).
+along the optical axis. c (whiteness, the LEDs' power, the camera's gain) is not known: depth is monotone, and right
+up to one factor where the surface is of one kind and faces the camera; inclined by theta it looks farther by 1 /
+sqrt(cos theta). A pixel as dark as noise has no depth (NaN); a saturated one is at most as far as it looks.
 
-A pixel as dark as the noise of the difference has no depth (NaN); a saturated one is at most as far as it looks.
-
-Outline of fingertips at full resolution.
-
-Circles are fitted to the edges of light around where they should be.
-
-Along rays from the predicted middle the edge is where light falls off most steeply in proportion; that is the contour
-before the dark, and the foot of the shadow before what is lit behind. Middle and radius are then those of the circle
-that fits the edges best, given what was predicted: least squares, in which edges that lie off count less.
+Outline of a fingertip: along rays from the predicted middle the edge is where light falls off most steeply in
+proportion. The circle fits the edges by least squares, given what was predicted; edges that lie off count less.
 """
 
 from dataclasses import dataclass
@@ -51,23 +31,14 @@ from common.hand.wrist import WristDevice
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristView(WristDevice):
-    """A wrist rig, its camera and its hand, checked.
+    """A wrist rig, its camera and its hand, checked."""
 
-    Attributes:
-        led_m: LEDs (L, 3) [m]; none known: (0, 3).
-        flat_field: What the LEDs make of a white surface, where it was measured.
-    """
-
-    led_m: Float
-    flat_field: FlatField | None
+    led_m: Float  # LEDs (L, 3) [m]; none known: (0, 3)
+    flat_field: FlatField | None  # what the LEDs make of a white surface, where it was measured
 
     @classmethod
     def of(cls, rig: RigCalibration, camera: CameraCalibration, hand: HandProfile) -> "WristView":
-        """Bring the three files together.
-
-        Raises:
-            CalibrationError: As of `WristDevice.joined`, or a joint of the hand is wrong.
-        """
+        """Bring the three files together; CalibrationError as `WristDevice.joined`."""
         device = WristDevice.joined(rig, camera, HandModel.of(hand))
         return cls(
             optics=device.optics,
@@ -85,10 +56,7 @@ NEAREST_M = 0.03  # what is nearer to the camera is not seen as a finger
 
 
 def finger_postures(view: WristView, *counts: int) -> Float:
-    """Return postures (P, 5, 4) [rad] of index ... little in their limits.
-
-    With so many abductions, flexions, PIP flexions.
-    """
+    """Postures (P, 5, 4) [rad] of so many abductions, flexions, PIP flexions."""
     low, high = view.model.limits_rad[1].T
     out = _all(*[_spread(low[k], high[k], n) for k, n in enumerate(counts)], np.zeros(1))
     dip_per_pip = 0.84  # of natural flexion (Kim et al. 2012)
@@ -98,10 +66,7 @@ def finger_postures(view: WristView, *counts: int) -> Float:
 
 
 def thumb_postures(view: WristView, *counts: int) -> Float:
-    """Return postures (P, 5, 4) [rad] of the thumb in its limits.
-
-    With so many values of each of its four angles.
-    """
+    """Postures (P, 5, 4) [rad] of the thumb, so many of each of its four angles."""
     low, high = view.model.limits_rad[0].T
     return _all(*(_spread(low[k], high[k], n) for k, n in enumerate(counts)))
 
@@ -112,19 +77,13 @@ def _spread(low: float, high: float, count: int) -> Float:
 
 
 def _all(*values: Float) -> Float:
-    """Return all combinations (P, 5, 4) of given values of the four angles [rad].
-
-    The same for every finger.
-    """
+    """Return all combinations (P, 5, 4) of values of the four angles [rad]."""
     grid = np.stack(np.meshgrid(*values, indexing="ij"), axis=-1).reshape(-1, 1, 4)
     return np.broadcast_to(grid, (len(grid), 5, 4)).copy()
 
 
 def along_bones(view: WristView, angles: Float) -> Float:
-    """Return points along the fingers' bones of postures (P, 5, 4).
-
-    The points (P, 5, 3 PER_BONE, 3) [m] are in the palm frame, root first.
-    """
+    """Points (P, 5, 3 PER_BONE, 3) [m] of postures (P, 5, 4), palm frame, root first."""
     joints = view.model.chains(angles).position_m
     return _between(joints[:, :, :, None, :]).reshape(*joints.shape[:2], -1, 3)
 
@@ -135,19 +94,13 @@ def radius_along(view: WristView) -> Float:
 
 
 def _between(ends: Float) -> Float:
-    """Interpolate values (..., 3, PER_BONE, K) along three bones.
-
-    From those (..., 4, 1, K) at their ends.
-    """
+    """Interpolate values (..., 4, 1, K) at bones' ends to (..., 3, PER_BONE, K)."""
     share = np.linspace(0.0, 1.0, PER_BONE, dtype=np.float64)[:, None]
     return ends[..., :-1, :, :] * (1.0 - share) + ends[..., 1:, :, :] * share
 
 
 def in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
-    """Project points (..., 3) in the palm frame to pixels and depths.
-
-    Pixels (..., 2) and depths (...) [m]; what is too near is held off.
-    """
+    """Pixels and depths [m] of palm points (..., 3); what is too near is held off."""
     camera = palm_m @ view.T_camera_palm[:3, :3].T + view.T_camera_palm[:3, 3]
     depth = camera[..., 2]
     held = np.concatenate([camera[..., :2], np.maximum(depth, NEAREST_M)[..., None]], axis=-1)
@@ -161,24 +114,15 @@ SHRINK = 4  # the LED image is read at a quarter of its resolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LedOptics:
-    """What each pixel of the shrunken image is multiplied with.
+    """What each pixel of the shrunken image is multiplied with."""
 
-    Attributes:
-        cosine: (h, w) float32 of the angle off the optical axis.
-        level: (h, w) float32 1 / sqrt(F).
-        ray: (h, w, 3) float32 ray of depth 1 along the optical axis.
-    """
-
-    cosine: Float32
-    level: Float32
-    ray: Float32
+    cosine: Float32  # (h, w) of the angle off the optical axis
+    level: Float32  # (h, w) 1 / sqrt(F)
+    ray: Float32  # (h, w, 3) of depth 1 along the optical axis
 
 
 def shrink(led: Image) -> Float32:
-    """Return the difference of LED and ambient frame at a quarter of its resolution.
-
-    In grey levels (h, w).
-    """
+    """Return LED less ambient frame [grey levels] at a quarter of its resolution."""
     height, width = led.shape
     half = cv2.resize(led, (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # in halves it is fast
     size = (width // SHRINK, height // SHRINK)
@@ -186,17 +130,12 @@ def shrink(led: Image) -> Float32:
 
 
 def nearness(grey: Float32, optics: LedOptics) -> Float32:
-    """Return the nearness sqrt(I / F) (h, w) of grey levels >= 0.
-
-    NaN where the levels are NaN; h rows from the top of the image.
-    """
+    """Nearness sqrt(I / F) (h, w) of the top h rows' grey levels >= 0; NaN of NaN."""
     return np.sqrt(grey) * optics.level[: len(grey)]
 
 
 def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:
-    """Return the relative depth of what is nearest about a pixel of the image.
-
-    Within a radius [px], of nearness (h, w).
+    """Relative depth of what is nearest within a radius [px] about a pixel.
 
     The nearest faces the camera, so it is the least inclined. NaN: too dark to measure.
     """
@@ -208,20 +147,15 @@ def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px:
     return float(depth.min()) if len(depth) else float("nan")
 
 
-def image_rows(view: WristView) -> Float:
-    """Rows of the image [px] at the centres of the shrunken image's rows."""
-    return _centres(view.optics.height_px)
-
-
 def _centres(size_px: int) -> Float:
+    """Pixels of the image at the centres of the shrunken image's rows or columns."""
     return np.arange(size_px // SHRINK, dtype=np.float64) * SHRINK + 0.5 * (SHRINK - 1)
 
 
 @lru_cache(maxsize=8)
 def led_optics(view: WristView) -> LedOptics:
     """The maps of one wrist rig; made once."""
-    v = image_rows(view)
-    u = _centres(view.optics.width_px)
+    u, v = _centres(view.optics.width_px), _centres(view.optics.height_px)
     xy = view.optics.undistort(np.stack(np.meshgrid(u, v), axis=-1))
     ray = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
     flat = np.ones(xy.shape[:2]) if view.flat_field is None else flat_of(view.flat_field, xy)
@@ -270,28 +204,18 @@ STEP = float(SHARE[1] - SHARE[0])
 
 
 class Circles(NamedTuple):
-    """Outlines of N fingertips.
+    """Outlines of N fingertips."""
 
-    Attributes:
-        middle, radius: (N, 2), (N,) [px].
-        sigma_px: (N,) standard deviation of the middle per axis.
-        shown: (N,) which share of the edges that should be seen is seen where the circle has it.
-    """
-
-    middle: Float
-    radius: Float
-    sigma_px: Float
-    shown: Float
+    middle: Float  # (N, 2) [px]
+    radius: Float  # (N,) [px]
+    sigma_px: Float  # (N,) standard deviation of the middle per axis
+    shown: Float  # (N,) share of the edges to be seen that are where the circle has them
 
 
 def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: Float | Float32) -> Circles:
-    """Circles nearest to the outlines of N fingertips.
+    """Circles nearest to the outlines of N fingertips, expected at (N, 2), (N,) [px].
 
-    Args:
-        led: (H, W) difference of LED and ambient frame.
-        middle: (N, 2) where they are expected [px].
-        radius: (N,) [px].
-        open_: (N, DIRECTIONS) 1: an edge is to be seen in that direction, 0: the finger goes on.
+    `led`: (H, W) less the ambient frame; `open_` (N, DIRECTIONS): 1: an edge is to be seen, 0: the finger goes on.
     """
     middle, radius = middle.astype(np.float64), radius.astype(np.float64)
     off, strength, inside = _edges(led, middle, radius)

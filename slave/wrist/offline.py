@@ -1,9 +1,7 @@
 """Offline detection of a whole recording of a wrist camera.
 
-Deterministic, without clock or network, a row per strobe cycle.
-
-The illumination label of a frame in the recording is not used: the strobe estimates it from the frames. Where the two
-disagree it is counted, because one of them is wrong then.
+Deterministic, without clock or network, a row per strobe cycle. The illumination label of a frame is not used: the
+strobe estimates it from the frames, and where the two disagree it is counted.
 """
 
 import logging
@@ -29,29 +27,16 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedWristDetections:
-    """Content of detections_<camera>.npz of a wrist camera.
+    """Content of detections_<camera>.npz, T strobe cycles; NaN: finger not seen."""
 
-    T strobe cycles, fingers thumb ... little, NaN = not seen.
-
-    Attributes:
-        t_ns: (T,) middle of the exposure of row 0 of the laser frame [ns].
-        seq: (T,) frame counter of the laser frame.
-        laser_uv: (T, 5, 2) where the laser meets each finger [px], distorted image.
-        laser_sigma_px: (T, 5) their standard deviation per axis [px].
-        laser_px: (T, 5) length of the part of the line that was seen [px].
-        tip_uv: (T, 5, 2) fingertips [px].
-        tip_sigma_px: (T, 5) their standard deviation per axis [px].
-        tip_depth: (T, 5) distance of the fingertips by the fall-off of the LED light, relative.
-    """
-
-    t_ns: Int
-    seq: Int
-    laser_uv: Float
-    laser_sigma_px: Float
-    laser_px: Float
-    tip_uv: Float
-    tip_sigma_px: Float
-    tip_depth: Float
+    t_ns: Int  # (T,) middle of the exposure of row 0 of the laser frame [ns]
+    seq: Int  # (T,) frame counter of the laser frame
+    laser_uv: Float  # (T, 5, 2) where the laser meets each finger [px], distorted image
+    laser_sigma_px: Float  # (T, 5) standard deviation per axis [px]
+    laser_px: Float  # (T, 5) length of the part of the line that was seen [px]
+    tip_uv: Float  # (T, 5, 2) fingertips [px]
+    tip_sigma_px: Float  # (T, 5) standard deviation per axis [px]
+    tip_depth: Float  # (T, 5) distance by the fall-off of the LED light, relative
 
     @classmethod
     def of(cls, found: list[WristDetections]) -> "RecordedWristDetections":
@@ -70,19 +55,12 @@ class RecordedWristDetections:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WristRecordingFound:
-    """A recording of a wrist camera, detected.
+    """A recording of a wrist camera, detected."""
 
-    Attributes:
-        detections: A row per strobe cycle.
-        frames: Frames read.
-        counts: What the strobe counted: event -> how often.
-        mislabelled: Frames of recognised strobe cycles that were lit otherwise by frames.csv.
-    """
-
-    detections: RecordedWristDetections
-    frames: int
-    counts: Mapping[str, int]
-    mislabelled: int
+    detections: RecordedWristDetections  # a row per strobe cycle
+    frames: int  # read
+    counts: Mapping[str, int]  # of the strobe: event -> how often
+    mislabelled: int  # frames of recognised strobe cycles that were lit otherwise by frames.csv
 
     def summary(self) -> str:
         """One line for a person."""
@@ -104,14 +82,8 @@ def view_of(
 ) -> WristView:
     """What the wrist device of a recording knows of itself and of its hand.
 
-    Args:
-        recording: Gives rig and camera.
-        rig: Its wrist rig.
-        calibration: calib_json tree with hands/<hand of the rig>.json, or None.
-        hand_file: Another hand profile, or None.
-
-    Raises:
-        CalibrationError: There is no hand profile, or something is not calibrated; the text names files and key.
+    `calibration`: calib_json tree with hands/<hand of the rig>.json; `hand_file`: another hand profile.
+    Raises CalibrationError: no hand profile, or something is not calibrated; the text names files and key.
     """
     if hand_file is None:
         if calibration is None:
@@ -146,12 +118,8 @@ def detect_wrist_recording(
 ) -> WristRecordingFound:
     """Detect laser points and fingertips in every strobe cycle of one camera.
 
-    Args:
-        folder: Recording.
-        camera: The camera of its wrist rig.
-        calibration: calib_json tree with the hand profile.
-        hand_file: Hand profile in its place.
-        progress: Called with frames done and frames in all.
+    `calibration`: calib_json tree with the hand profile; `hand_file`: profile in its place; `progress`: called with
+    frames done and frames in all.
 
     Raises:
         RecordingError: The recording is broken or has no such wrist camera or no frame of it.
@@ -182,10 +150,7 @@ def detect_wrist_recording(
 
 
 def _mislabelled(cycle: StrobeCycle) -> int:
-    """Count the frames of a cycle whose label contradicts the strobe.
-
-    How many of the three have a label that is not what the strobe took them for; NONE is no label.
-    """
+    """Count the frames of a cycle whose label contradicts the strobe; NONE is none."""
     taken = (
         (cycle.ambient, Illumination.AMBIENT),
         (cycle.laser, Illumination.LASER),

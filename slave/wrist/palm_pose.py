@@ -1,16 +1,15 @@
 """Pose of the palm before the camera while the wrist is flexed.
 
-Found in each LED image, with a straight wrist as prior.
-
-The device sits on the forearm. A bent wrist turns the palm in the image, ten degrees aside by nearly the breadth of a
-finger, so that roots and search bands of a straight wrist name the neighbour. Two things of the palm are plain
-whatever the fingers do: up to the webs the skin is whole, beyond them a gap or a crease parts every two fingers; and
-along the little finger's side skin ends. Each of some hundred bends predicts where in the image both are, and what is
-seen there is compared (contrast of the roots of light, so that neither distance nor power of the LEDs matters):
+A bent wrist turns the palm in the image, ten degrees aside by nearly the breadth of a finger, so that roots and
+search bands of a straight wrist name the neighbour. Whatever the fingers do, up to the webs the skin is whole, beyond
+them a gap or a crease parts every two fingers; and along the little finger's side skin ends. Each of some hundred
+bends predicts where both are in the LED image, and what is seen there is compared (contrast of the roots of light, so
+that neither distance nor power of the LEDs matters):
 
     E(bend) = gaps beyond the webs - gaps below them + edges at the sides, less (bend / usual bend)^2 / 2
 
-Of a strobe cycle alone, nothing is kept. Where the image does not clearly show that it is bent, the wrist is straight.
+Of a strobe cycle alone, nothing is kept. Where the image does not clearly show that it is bent, the wrist is
+straight.
 """
 
 from dataclasses import dataclass, replace
@@ -60,36 +59,21 @@ class PalmPose:
 
     @property
     def straight(self) -> bool:
-        """Return whether the palm is where a straight wrist has it.
-
-        As far as can be determined.
-        """
+        """Whether the palm is where a straight wrist has it, as far as is seen."""
         return not self.wrist_angles_rad.any()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Marks:
-    """Marks of the palm in the shrunken image for B wrist flexions.
+    """Marks of the palm in the shrunken image, as flat indices, for B bends."""
 
-    Counted row by row.
-
-    Attributes:
-        candidates: (B, 2) [rad].
-        prior: (B,) what each costs.
-        near_straight: (B,) whether it is hardly one.
-        gap: (B, 3, G) pixels of a gap's two sides and its middle.
-        gap_weight: (B, G) below 0 where there is none; 0 outside of the image.
-        edge: (B, 2, S) pixels inside of skin and outside.
-        edge_weight: (B, S).
-    """
-
-    candidates: Float
-    prior: Float32
-    near_straight: Bool
-    gap: Int
-    gap_weight: Float32
-    edge: Int
-    edge_weight: Float32
+    candidates: Float  # (B, 2) [rad]
+    prior: Float32  # (B,) what each costs
+    near_straight: Bool  # (B,) whether it is hardly one
+    gap: Int  # (B, 3, G) pixels of a gap's two sides and its middle
+    gap_weight: Float32  # (B, G) below 0 where there is none; 0 outside of the image
+    edge: Int  # (B, 2, S) pixels inside of skin and outside
+    edge_weight: Float32  # (B, S)
 
 
 def find_palm_pose(led: Image, view: WristView) -> PalmPose:
@@ -126,10 +110,7 @@ def _view(view: WristView, flexion: int, deviation: int) -> WristView:
 
 
 def wrist_angles_seen(near: Float32, view: WristView) -> Float:
-    """Estimate the wrist flexion (2,) [rad] from the shrunken image.
-
-    By roots of grey levels (h, w); 0 where none is plain.
-    """
+    """Estimate the bend (2,) [rad] from roots of grey levels (h, w); 0: none plain."""
     marks = _marks(view)
     shown = _shown(near.ravel(), marks)
     evidence = 14.0  # logarithm of probability per unit of E
@@ -165,12 +146,9 @@ def _marks(view: WristView) -> _Marks:
     hardly: Bool = np.abs(candidates / _NEAR_STRAIGHT_RAD).max(axis=1) <= 1.0
     gap, gap_weight = _gaps(view)
     edge, edge_weight = _edges(view)
-    at, inside = zip(
-        *(_pixels(rotated_view(view, wrist_angles), gap) for wrist_angles in candidates), strict=True
-    )
-    sides, shows = zip(
-        *(_pixels(rotated_view(view, wrist_angles), edge) for wrist_angles in candidates), strict=True
-    )
+    views = [rotated_view(view, wrist_angles) for wrist_angles in candidates]
+    at, inside = zip(*(_pixels(one, gap) for one in views), strict=True)
+    sides, shows = zip(*(_pixels(one, edge) for one in views), strict=True)
     return _Marks(
         candidates,
         (0.5 * ((candidates / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
@@ -183,10 +161,7 @@ def _marks(view: WristView) -> _Marks:
 
 
 def _pixels(view: WristView, points: Float) -> tuple[Int, Float]:
-    """Pixels (K, N) of the shrunken image that show points (K, N, 3) [m] of the palm.
-
-    And whether (N,) all K are in it.
-    """
+    """Flat pixels (K, N) of palm points (K, N, 3) [m]; whether (N,) all K are seen."""
     size = np.array([view.optics.width_px, view.optics.height_px]) // SHRINK
     uv, depth = in_image(view, points)
     seen = (depth > NEAREST_M) & np.isfinite(uv).all(axis=-1)
@@ -199,10 +174,7 @@ def _pixels(view: WristView, points: Float) -> tuple[Int, Float]:
 
 
 def _gaps(view: WristView) -> tuple[Float, Float]:
-    """Return points of the gaps between fingers and their weights.
-
-    Both sides and the middle (3, G, 3) of gaps [m], palm frame, and the weights (G,).
-    """
+    """Both sides and middle (3, G, 3) of gaps [m], palm frame, and weights (G,)."""
     knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
     bone = ends - knuckles
     along = bone / np.linalg.norm(bone, axis=1, keepdims=True)
@@ -219,10 +191,7 @@ def _gaps(view: WristView) -> tuple[Float, Float]:
 
 
 def _edges(view: WristView) -> tuple[Float, Float]:
-    """Return points on both sides of skin's edges at the palm and their weights.
-
-    Inside and outside (2, S, 3) of the edges at the sides of the palm [m], palm frame, and the weights (S,).
-    """
+    """Inside and outside (2, S, 3) of the palm's sides [m], and weights (S,)."""
     rest, radius = view.model.rest_position_m, view.model.radius_m
     index, little = CHAINS[1], CHAINS[4]
     out = np.array([np.sign(rest[little[0], 0] - rest[index[0], 0]), 0.0, 0.0])

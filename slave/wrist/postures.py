@@ -1,15 +1,13 @@
 """Tables of what the wrist camera sees of each posture of a finger.
 
-Made once; the fingertip is found by them.
+The palm stands still before the camera, so a finger of known bones has four angles: abduction, and the flexions of
+MCP, PIP and DIP. Each finger's table holds a grid of the last three, and a parabola through three values of the
+abduction, with which it changes smoothly. The thumb's four angles are one list.
 
-The palm stands still before the camera, so a finger of known bones has four angles: abduction, and the flexions of MCP,
-PIP and DIP. Each finger's table holds a grid of the last three, any combination of them; what it holds changes smoothly
-with the abduction, so three values of that and a parabola through them do. The thumb's four angles are one list.
-
-For each posture the finger is drawn as round cones, lit from the lens: a surface at distance t whose normal is inclined
-by theta to the ray gives back light in proportion to cos(theta) / t^2. Of a drawing a few *samples* are kept, pixels
-and the root of the light there (nearness): along the bones, and above the highest point of the finger in the image,
-where there is nothing of it.
+For each posture the finger is drawn as round cones, lit from the lens: a surface at distance t whose normal is
+inclined by theta to the ray gives back light in proportion to cos(theta) / t^2. A few *samples* are kept, pixels and
+the root of the light there (nearness): along the bones, and above the highest point of the finger, where there is
+nothing of it.
 """
 
 from functools import lru_cache
@@ -40,9 +38,7 @@ _ORIGIN = np.zeros(3)
 
 
 class Postures(NamedTuple):
-    """Postures of all five fingers, one after another.
-
-    H of the thumb, then 4 L of index ... little.
+    """Postures of all five fingers: H of the thumb, then 4 L of index ... little.
 
     Attributes:
         thumb: H.
@@ -70,10 +66,7 @@ class Postures(NamedTuple):
 
 
 class _OfFinger(NamedTuple):
-    """Rows of one finger.
-
-    `uv`, `near`, `laser` (H, 3, 2), `open`, `end` and `twist` of `Postures`.
-    """
+    """Rows of one finger, as of `Postures`; `laser` (H, 3, 2)."""
 
     uv: Float
     near: Float
@@ -85,10 +78,7 @@ class _OfFinger(NamedTuple):
 
 @lru_cache(maxsize=8)
 def plane_axes(view: WristView) -> Float:
-    """Return two unit vectors (2, 3) in the laser's plane.
-
-    One across the fingers, to the right in the image, and one away.
-    """
+    """Unit vectors (2, 3) in the laser's plane: to the right in the image, and away."""
     across = np.array([1.0, 0.0, 0.0]) - view.normal[0] * view.normal
     across /= np.linalg.norm(across)
     away = np.cross(across, view.normal)
@@ -97,11 +87,7 @@ def plane_axes(view: WristView) -> Float:
 
 @lru_cache(maxsize=8)
 def postures_of(view: WristView) -> Postures:
-    """The tables of one wrist rig and hand.
-
-    Raises:
-        CalibrationError: The camera does not see the fingers of this hand above its palm.
-    """
+    """Tables of a wrist rig and hand; CalibrationError: it does not see the fingers."""
     knuckles = view.optics.project(
         view.model.forward(view.T_camera_palm, np.zeros((5, 4))).position_m[CHAINS[1:, 0]]
     )
@@ -187,10 +173,7 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
 
 
 def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Float, radius: Float) -> Float:
-    """Return `twist` of `Postures` (H, 5).
-
-    Of a finger at angles (H, 5, 4) of its joints (H, 4, 3) and end (H, 3) [m].
-    """
+    """`Postures.twist` (H, 5) at angles (H, 5, 4), joints (H, 4, 3), end (H, 3) [m]."""
     straight = angles[:1].copy()
     straight[..., 1:] = 0.0
     chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
@@ -210,10 +193,7 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
 
 
 def _parabola(values: Float) -> Float:
-    """Return the coefficients (H, 3, ...) of 1, a, a^2 through given values.
-
-    The values (H, A, ...) are at a = -1, 0, 1, or there is one value.
-    """
+    """Coefficients (H, 3, ...) of 1, a, a^2 by values (H, A, ...) at a = -1, 0, 1."""
     if values.shape[1] == 1:
         return np.concatenate([values, np.zeros_like(values), np.zeros_like(values)], axis=1)
     low, middle, high = (values[:, k] for k in range(3))
@@ -221,10 +201,7 @@ def _parabola(values: Float) -> Float:
 
 
 def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
-    """Return the line along each bone's skin that faces the camera.
-
-    As start and stop (T, 3), of joints (T, 4, 3) [m].
-    """
+    """Start, stop (T, 3) of each bone's skin line before the camera, (T, 4, 3) [m]."""
     out: list[tuple[Float, Float]] = []
     for k in range(3):
         start, stop = bones[:, k], bones[:, k + 1]
@@ -241,10 +218,7 @@ def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
 
 
 def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
-    """Return where lines along the skin first meet the laser's plane (T, 3) [m].
-
-    First as seen from the camera; NaN: nowhere.
-    """
+    """Where lines along the skin first meet the laser's plane (T, 3) [m]; NaN: never."""
     best = np.full(surface[0][0].shape, np.nan)
     nearest = np.full(len(best), np.inf)
     for k, (start, stop) in enumerate(surface):
@@ -261,10 +235,7 @@ def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
 
 
 def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Float]:
-    """Return pixels (T, 2) of the highest joint in the image, and above it.
-
-    Of joints (T, 4, 3) [m].
-    """
+    """Pixels (T, 2) of the highest of joints (T, 4, 3) [m], and above it."""
     uv = view.optics.project(bones)
     size = view.optics.matrix[0, 0] * radius / np.maximum(bones[..., 2], NEAREST_M)
     tops = (uv[..., 1] - size).reshape(-1, nodes, 4)[:, nodes // 2]
@@ -278,10 +249,7 @@ def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Flo
 
 
 def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Float, Float]:
-    """Return the nearness [1/m] and distance [m] (T, S) of fingers at given pixels.
-
-    The pixels are (T, S, 2), the joints of the fingers (T, 4, 3) [m].
-    """
+    """Nearness [1/m], distance [m] (T, S) at pixels (T, S, 2), joints (T, 4, 3) [m]."""
     near, first = np.zeros(uv.shape[:2]), np.full(uv.shape[:2], np.inf)
     chunk = 4096
     for k in range(0, len(bones), chunk):

@@ -1,19 +1,10 @@
 """Find bright runs in a laser image, join them to lines, and measure the lines.
 
-Find the bright runs in the columns of a laser image, and join them to lines.
-
-Rows are known to parts of a pixel. Lines are the laser segments of Kim et al. 2012.
-
-A run's row is its centre of mass above a share of its own peak: a line that saturates has a flat top and a glow on
-either side of it, and only the flanks of the top measure where it is. Runs of adjacent columns are one line where they
-overlap; a jump is the border of another surface.
-
-Measure length and centroid of each finger's laser line.
-
-A line is made of the pieces between runs of adjacent columns (laser segments of Kim et al. 2012).
-
-A finger's centroid weighs its line by length in the image, not by columns: at the sides of a finger the line falls
-steeply, the last of it in less than a column.
+Lines are the laser segments of Kim et al. 2012; rows are known to parts of a pixel. A run's row is its centre of mass
+above a share of its own peak: a saturated line has a flat top and a glow on either side, and only the flanks of the
+top measure where it is. Runs of adjacent columns are one line where they overlap; a jump is the border of another
+surface. A finger's centroid weighs its line by length in the image, not by columns: at the sides of a finger the line
+falls steeply, the last of it in less than a column.
 """
 
 from dataclasses import dataclass
@@ -48,12 +39,9 @@ _NEAR = np.ones((5, 3), dtype=np.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Runs:
-    """Bright runs of columns.
-
-    Line after line, and in each line column by column; N of them.
+    """N bright runs of columns, line after line, and in each column by column.
 
     Attributes:
-        column: (N,).
         row: (N,) sub-pixel.
         start, end: (N,) first row, and the one after the last.
         peak: (N,) grey levels.
@@ -75,21 +63,13 @@ NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_
 
 
 def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
-    """Return the runs of the rows from `first_row` on, and which lie on a line.
-
-    The latter is a mask (N,).
-    """
+    """Runs of the rows from `first_row` on, and which (N,) lie on a line."""
     runs = line_runs(laser, first_row)
     return runs, in_lines(runs)
 
 
 def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]:
-    """Return the part of a laser image that may be a line, and its thresholds.
-
-    The part is (w, h), column by column; the levels (w, h) must be exceeded.
-
-    And at which column and row of the image it begins.
-    """
+    """Part (w, h) of an image that may be lines, levels (w, h) to exceed, its corner."""
     band = laser[first_row:]
     enough_rows = 40  # above the laser's reach, to know the noise from
     mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= enough_rows else laser)
@@ -135,14 +115,7 @@ def line_runs(laser: Image, first_row: int) -> Runs:
 
 
 def _across(levels: Image, size: Int) -> tuple[Float, Float]:
-    """Return the centres of runs (N,) [px] and their peaks (N,) [grey levels].
-
-    The centres are given beyond the runs' first rows.
-
-    Args:
-        levels: The grey levels of all runs, one run after another.
-        size: (N,) how many each has.
-    """
+    """Centres (N,) beyond first rows [px] and peaks of runs `size` (N,), in a row."""
     first = np.cumsum(size)
     first -= size
     peak = np.maximum.reduceat(levels, first).astype(np.float32)
@@ -159,10 +132,7 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
 
 
 def in_lines(runs: Runs) -> Bool:
-    """Return which runs belong to a line.
-
-    They are long enough, and not much darker than what is near, as a glow is.
-    """
+    """Return which runs belong to a line: long enough, and no glow of what is near."""
     peak, joins = runs.peak, runs.joins
     if not len(peak):
         return np.empty(0, dtype=np.bool_)
@@ -194,12 +164,7 @@ def in_lines(runs: Runs) -> Bool:
 
 
 def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
-    """Link runs (N,), given by column and then by row, to the next column.
-
-    Each run is linked to the nearest of those of the next column that it overlaps.
-
-    Where two meet in one, the line goes on from the nearer one, and the other joins it.
-    """
+    """Link sorted runs (N,) to the nearest that they overlap; farther ones join."""
     there = (column + 1) * SETTINGS.column + row  # the same row of the next column
     after = np.searchsorted(there - SETTINGS.column, there)
     off_above = there - (there - SETTINGS.column)[after - 1]
@@ -255,13 +220,7 @@ class FingerLines(NamedTuple):
 
 
 def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
-    """Of the pieces of line of each finger.
-
-    Args:
-        runs: The runs.
-        finger: (N,) whose each of them is; `NONE`: nobody's.
-        width_px: Of the image.
-    """
+    """Measure the lines of runs (N,) by finger, `NONE`: nobody's."""
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     on = finger != NONE
     goes_on = finger[1:] == finger[:-1]
@@ -296,26 +255,12 @@ def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
 
 
 def _of_fingers(of: Int, weight: Float) -> Float:
-    """Return the sums (5,) of weights (M,) by finger.
-
-    `of` (M,) counts the finger from 1; 0: no finger.
-    """
+    """Return the sums (5,) of weights (M,) by finger, from 1; 0: no finger."""
     return np.asarray(np.bincount(of, weight, 6)[1:], np.float64)
 
 
 def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
-    """Return the centroid spread (5,) [px] of fingers whose line is in parts.
-
-    It is half of the distance of the middle of the line in parts from that of its longest part alone.
-
-    NaN where the line is whole.
-
-    Args:
-        points: (N, 2) of runs.
-        finger: (N,) of runs.
-        left: (P,) the first run of each part.
-        right: (P,) the last one.
-    """
+    """Return `apart` (5,) of `FingerLines`, by the first and last run of each part."""
     out = np.full(5, np.nan)
     part = finger[left]
     for of in np.flatnonzero(np.bincount(part, minlength=5) > 1).tolist():
@@ -330,13 +275,10 @@ def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
 
 
 def _ends(points: Float, left: Int, right: Int) -> tuple[Float, Int]:
-    """Return where lines end (2 P, 2), and the runs from which they are straight.
+    """Ends (2 P, 2) of lines, and the runs (2 P,) from which they go on straight.
 
-    The ends lie beyond the first and last runs (P,) of the lines; they go on straight from runs (2 P,). Left ends
-    first.
-
-    A line goes round a finger until it is seen no more: near its end it falls away as the root of the distance to the
-    end does, most of it in less than a column, and dark. So a long one is continued from a few columns within.
+    Left ends first. A line goes round a finger until it is seen no more: near its end it falls away as the root of the
+    distance to the end does, most of it in less than a column, and dark. So a long one is continued from within.
     """
     long = np.where(right - left >= LONG, 1, 0)
     inner = np.concatenate([left + 2 * long, right - 2 * long])

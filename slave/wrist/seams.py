@@ -1,24 +1,11 @@
 """Find minimum-energy seams between the fingers, inside their search bands.
 
-Minimum-energy paths through several straight search bands at once.
+A search band is a middle and a half width at each station, from a sweep of the hand model through the ranges of its
+joints, made once. The three seams among index ... little have rows of the image as stations [px], the thumb's has
+circles about the thumb's root (CMC) [rad]. The energy is low in a minimum, high on the skin of a finger.
 
-By dynamic programming from both of their ends.
-
-The two halves of every search band lie side by side in one array, so that one loop over half of the stations serves
-all. Which way each sample was reached is then worked out for the whole array in a few passes, and going back along a
-path only reads it.
-
-Search bands in the image for the seams between the fingers of one hand.
-
-Made once, from what its fingers can do.
-
-The three seams among index ... little have rows of the image as stations, the thumb's has circles about the thumb's
-root (CMC). A search band is a middle and a half width at each station, in pixels along the row or in radians along the
-circle, from a sweep of the hand model through the ranges of its joints.
-
-Energy of a seam at each pixel.
-
-Low in a minimum, high on the skin of a finger.
+Paths are found by dynamic programming from both ends: the two halves of every band lie side by side in one array, so
+that one loop over half of the stations serves all; the way back only reads which way each sample was reached.
 """
 
 from dataclasses import dataclass, replace
@@ -45,29 +32,21 @@ from slave.wrist.led_image import (
 
 FENCE = 1e6  # energy of samples between search bands, two or more: no path leaves its own
 STEP_COST = np.float32(0.02)  # energy of a step aside between stations
-_MOVES = (
-    (-1, STEP_COST),
-    (1, STEP_COST),
-    (-2, 2 * STEP_COST),
-    (2, 2 * STEP_COST),
-)  # samples aside, and what they cost
-_Float32 = npt.NDArray[np.float32]
+# samples aside, and what they cost
+_MOVES = ((-1, STEP_COST), (1, STEP_COST), (-2, 2 * STEP_COST), (2, 2 * STEP_COST))
+Float32 = npt.NDArray[np.float32]
 
 
-def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
+def minimum_cost_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
     """Return the path (C, S) of least energy through each search band.
 
-    As its sample at every station; at most two aside a step.
-
-    Args:
-        energy: (S, K), the search bands side by side, `FENCE` at both ends of each.
-        widths: Samples of each of the C search bands, K in all.
+    As its sample at every station; at most two aside a step. `energy`: (S, K), the search bands of so many samples
+    (`widths`) side by side, `FENCE` at both ends of each.
     """
     stations, whole = energy.shape
     half = (stations + 1) // 2
-    cost = np.zeros(
-        (half, 2 * whole), dtype=np.float32
-    )  # where stations are odd, the lower half begins with a free one
+    # where stations are odd, the lower half begins with a free one
+    cost = np.zeros((half, 2 * whole), dtype=np.float32)
     cost[:, :whole] = energy[:half]
     cost[2 * half - stations :, whole:] = energy[: half - 1 : -1]
     for before, here in pairwise(cost):
@@ -87,11 +66,8 @@ def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
     return out[:, :stations]
 
 
-def _cheapest(cost: _Float32) -> _Float32:
-    """Return the least cost (N - 4,) of reaching each sample.
-
-    For each sample but the outer two of `cost` (N,), step included.
-    """
+def _cheapest(cost: Float32) -> Float32:
+    """Return the least cost (N - 4,) of reaching each inner sample of `cost` (N,)."""
     best = np.minimum(cost[:-4], cost[4:])
     best += STEP_COST
     np.minimum(best, cost[1:-3], out=best)
@@ -101,11 +77,8 @@ def _cheapest(cost: _Float32) -> _Float32:
     return best
 
 
-def _moves(cost: _Float32) -> list[memoryview]:
-    """Return how far aside in the row before each sample was reached from.
-
-    For each row of costs (R, N) but the first.
-    """
+def _moves(cost: Float32) -> list[memoryview]:
+    """Return how far aside each sample was reached from, row by row but the first."""
     best = cost[:-1, 2:-2].copy()
     moves = np.zeros((len(best), cost.shape[1]), dtype=np.int8)
     inner = moves[:, 2:-2]
@@ -117,18 +90,13 @@ def _moves(cost: _Float32) -> list[memoryview]:
 
 
 def _back(moves: list[memoryview], k: int) -> list[int]:
-    """Trace the path that ends at sample k of the last row.
-
-    Returns its samples (R,) from there to the first.
-    """
+    """Trace the path that ends at sample k of the last row, back to the first (R,)."""
     out = [k]
     for row in reversed(moves):
         k += row[k]
         out.append(k)
     return out
 
-
-Float32 = npt.NDArray[np.float32]
 
 STATION_PX = 10.0
 _FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
@@ -145,7 +113,7 @@ class SearchBands:
     Attributes:
         row: First row of the stations of the three finger seams [px].
         radius: Radius of the first station of the thumb's seam [px].
-        root: (2,) the thumb's root in the image [px]; angles about it are `angle_of`.
+        root: (2,) the thumb's root in the image [px]; angles are about it.
         up: (2,) image direction of angle 0, from the root to the middle finger's knuckle.
         thumb_side: +1.0 where the thumb is to the right in the image, -1.0 to the left.
         middle: (4, S) middle of each search band: u [px], or angle [rad].
@@ -172,36 +140,24 @@ class SearchBands:
     palm: Int
 
     def polar(self, uv: Float) -> tuple[Float, Float]:
-        """Return the polar coordinates of pixels (N, 2) about the thumb's root.
-
-        Radius [px] and angle [rad], positive towards the thumb's side.
-        """
+        """Radius [px], angle [rad] to the thumb's side of pixels (N, 2) about its root."""
         x, y = uv[:, 0] - self.root[0], uv[:, 1] - self.root[1]
         along = x * self.up[0] + y * self.up[1]
         across = self.thumb_side * (y * self.up[0] - x * self.up[1])
         return np.hypot(x, y), np.arctan2(across, along)
 
     def lateral(self, seam: int) -> Float:
-        """Return the lateral positions of the samples across one search band.
-
-        The positions are (S, LATERAL[seam] + 2 MARGIN), including its margins.
-        """
+        """Lateral positions (S, LATERAL[seam] + 2 MARGIN) of the samples of one band."""
         share = np.arange(-MARGIN, LATERAL[seam] + MARGIN, dtype=np.float64) / (LATERAL[seam] - 1) * 2.0 - 1.0
         return self.middle[seam, :, None] + self.half[seam, :, None] * share
 
     def across(self, seams: slice, path: Int) -> Float:
-        """Return the lateral positions (M, S) of samples of some search bands.
-
-        The samples are (M, S).
-        """
+        """Return the lateral positions (M, S) of samples (M, S) of some search bands."""
         count = np.array(LATERAL[seams])[:, None] - 1
         return self.middle[seams] + self.half[seams] * (2.0 * (path - MARGIN) / count - 1.0)
 
     def sample(self, seam: int, lateral: Float) -> Float:
-        """Return the samples (..., S) of one search band at lateral positions.
-
-        With fractions, of lateral positions (..., S): the inverse of `across`.
-        """
+        """Samples (..., S), with fractions, at lateral positions: inverse of `across`."""
         share = (lateral - self.middle[seam]) / self.half[seam]
         return (share + 1.0) * (LATERAL[seam] - 1) / 2.0 + MARGIN
 
@@ -219,11 +175,7 @@ class SearchBands:
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie
 def search_bands_of(view: WristView) -> SearchBands:
-    """Return the search bands of one wrist rig and hand.
-
-    Raises:
-        CalibrationError: The palm lies so that no finger can be seen.
-    """
+    """Search bands of a wrist rig and hand; CalibrationError: no finger can be seen."""
     knuckles = in_image(view, view.model.rest_position_m[[7, 12, 22]])[0]
     thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
     root = in_image(view, view.model.rest_position_m[2])[0]
@@ -246,10 +198,7 @@ def search_bands_of(view: WristView) -> SearchBands:
 
 
 def _palm(view: WristView) -> Int:
-    """Return pixels along the outer half of the metacarpals of index ... little.
-
-    Columns and rows (P, 2) of the image.
-    """
+    """Pixels (P, 2) along the outer half of the metacarpals of index ... little."""
     rest = view.model.rest_position_m
     roots, ends = rest[list(METACARPALS)], rest[CHAINS[1:, 0]]
     uv = in_image(view, np.concatenate([roots + share * (ends - roots) for share in (0.5, 0.75, 1.0)]))[0]
@@ -259,10 +208,7 @@ def _palm(view: WristView) -> Int:
 
 
 def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
-    """Return the search bands among index ... little at the given rows.
-
-    Middle and half width (3, S) [px].
-    """
+    """Middle and half width (3, S) [px] of the bands among index ... little at rows."""
     limits = view.model.limits_rad
     points = along_bones(view, finger_postures(view, 1, 8, 8))
     focal = view.optics.matrix[0, 0]
@@ -298,10 +244,7 @@ def _weight(view: WristView, rows: Float) -> Float32:
 
 
 def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
-    """Return the middle and half width (S,) of the intervals near each station.
-
-    The intervals are low ... high (N,).
-    """
+    """Return the middle and half width (S,) of intervals low ... high (N,) near each."""
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
     if not known.any():
@@ -314,14 +257,7 @@ def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, F
 
 
 def _thumb_workspace(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
-    """Return the thumb's search band and the stations that the thumb crosses.
-
-    Middle and half width [rad] on the finger's side of all that its axis can reach; and how many stations the thumb
-    crosses however it is held.
-
-    Raises:
-        CalibrationError: No posture of the thumb, or of its tip, is before the camera.
-    """
+    """Middle, half width [rad] of the thumb's band; stations that it always crosses."""
     points = along_bones(view, thumb_postures(view, 7, 7, 3, 3))[:, 0, PER_BONE:]  # beyond the metacarpal
     uv, depth = in_image(view, points)
     radius, angle = still.polar(uv.reshape(-1, 2))
@@ -357,12 +293,10 @@ SIDE_KERNEL = np.ones((1, MARGIN), dtype=np.uint8)
 def energy(straightened: Image, crossed: int) -> Float32:
     """Return the energy of the straightened search bands (S, K).
 
-    From 0 in a black minimum to `SURFACE` on a finger, and `PRIOR`.
-
-    A pixel is as much of a minimum as it lies below the darker of its two sides, and below what is brightest right
-    beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
-    counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
-    no thumb at all beyond it would mean that the seam lies outside of the thumb.
+    From 0 in a black minimum to `SURFACE` on a finger, and `PRIOR`. A pixel is as much of a minimum as it lies below
+    the darker of its two sides, and below what is brightest right beside it. The thumb's seam has the thumb on one
+    side, and on the other perhaps nothing near: only the thumb's side counts. Where nothing is lit beside a pixel it
+    is open, except for the thumb's seam on the first `crossed` circles: else the seam would lie outside of the thumb.
     """
     before = cv2.dilate(straightened, SIDE_KERNEL, anchor=(MARGIN - 1, 0))
     behind = cv2.dilate(straightened, SIDE_KERNEL, anchor=(0, 0))

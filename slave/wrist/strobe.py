@@ -1,43 +1,19 @@
 """Recognise ambient, laser and LED frames by content, and subtract the ambient.
 
-Check by content that three strobed frames are ambient, laser and LED.
-
-In this order.
-
-All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
-ambient light that swings, explain:
+A coarse image is judged cell by cell, by how far one frame is brighter than another *beyond* what noise, and ambient
+light that swings, explain; saturated cells are not counted:
 
     broad      a square of 72 px fits into what is brighter: LEDs light a palm, which is wider than that
     thin       much brighter, and in its column lower than 72 px: the line of the laser
     flash      thin, and brighter than both other frames: light that was there in one frame alone
 
-LEDs are detected by broad light; the laser by a flash on what the LEDs light, or at its edge, and nowhere else: a
-window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
-hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds. Nothing is compared
-with a frame before them, so it does not matter what the ambient light was then.
-Where both frames are saturated neither is brighter: such cells measure nothing and are not counted.
+LEDs are detected by broad light; the laser by a flash on what the LEDs light, or at its edge, and nowhere else
+(windows between moving fingers, shadows, passers-by); the ambient frame is nowhere brighter, as light only adds.
 
-Recognition of ambient, laser and LED frames by content.
-
-The frames are joined to strobe cycles.
-
-The strobe is that of Kim et al. 2012.
-
-Three frames are a strobe cycle if
-
-    1. each followed the one before by one period, by time and by counter,
-    2. they show ambient, laser, LED with a margin above 0 (`illumination.evidence`),
-    3. the strobe cycle before them, accepted or not, had the same phase, three periods earlier.
-
-Each three frames are classified by themselves, so that ambient light which is switched costs the cycle that it is
-switched in, and no other. The last rule is for pictures that were exchanged while their times were not: after two such
-swaps A1 L1 E0 may follow one another, of the right kinds and of two poses, but not where the cycle has them. A cycle
-that has slipped (a frame lost or added, unseen in the times) is known anew with its second cycle. Counting thus only
-ever rejects cycles. A frame that is a copy of the one before, pixel by pixel, is dropped.
-
-Subtraction of the ambient frame of a strobe cycle.
-
-The device's own light is left.
+The strobe is that of Kim et al. 2012. Three frames are a strobe cycle if each followed the one before by one period, by
+time and by counter; if they show ambient, laser, LED with a margin above 0 (`evidence`); and if the cycle before,
+accepted or not, had the same phase: where pictures were exchanged while their times were not, A1 L1 E0 may follow one
+another, of two poses. A cycle that has slipped is known with its second cycle. Copies of a frame are dropped.
 """
 
 from collections import Counter
@@ -77,9 +53,8 @@ class IlluminationSettings(NamedTuple):
 
 
 SETTINGS = IlluminationSettings()
-_NOISE_OF_LEVEL = (SETTINGS.noise + SETTINGS.swing * np.arange(256)).astype(
-    np.uint8
-)  # by the darker of two levels
+# by the darker of two levels
+_NOISE_OF_LEVEL = (SETTINGS.noise + SETTINGS.swing * np.arange(256)).astype(np.uint8)
 # Neighbourhoods, (rows, columns) of cells.
 _SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
 _COLUMN = np.ones((9, 1), np.uint8)
@@ -90,21 +65,12 @@ _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a windo
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence that three frames are ambient, laser, LED.
+    """Evidence of ambient, laser, LED: log2 of measures over their thresholds."""
 
-    Base-2 logarithms of measures over their thresholds.
-
-    Attributes:
-        led: The LED frame has broad light that the ambient frame has not.
-        laser: The laser frame has a flash where the LEDs light.
-        alone: There are no such lines in the ambient frame, nor as many flashes there or elsewhere.
-        steady: Nothing broad came or went with the laser, or went with the LEDs.
-    """
-
-    led: float
-    laser: float
-    alone: float
-    steady: float
+    led: float  # the LED frame has broad light that the ambient frame has not
+    laser: float  # the laser frame has a flash where the LEDs light
+    alone: float  # no such lines in the ambient frame, nor as many flashes there or elsewhere
+    steady: float  # nothing broad came or went with the laser, or went with the LEDs
 
     @property
     def margin(self) -> float:
@@ -116,10 +82,7 @@ NO_EVIDENCE = Evidence(-inf, -inf, -inf, -inf)
 
 
 def coarse(image: Image) -> Image:
-    """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3).
-
-    By halves as far as that goes: means of two by two are what a processor is quickest at.
-    """
+    """(60, 80) uint8 means over cells of a frame, by halves, which is quickest."""
     cells: _Cells = image
     while cells.shape[1] % (2 * _SIZE[0]) == 0 and cells.shape[0] % (2 * _SIZE[1]) == 0:
         cells = cv2.resize(cells, (cells.shape[1] // 2, cells.shape[0] // 2), interpolation=cv2.INTER_AREA)
@@ -129,10 +92,7 @@ def coarse(image: Image) -> Image:
 
 
 def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
-    """Return the evidence that three coarse frames (60, 80) are as they should be.
-
-    -inf: not evaluated, as another measure is not positive.
-    """
+    """Evidence of three coarse frames (60, 80); -inf: not evaluated."""
     darker = cv2.min(ambient, led)
     valid = _valid(darker)
     if valid < SETTINGS.valid_least * ambient.size:
@@ -173,10 +133,7 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
 
 
 def unlit(frames: Sequence[Image]) -> bool:
-    """Return whether no broad light comes or goes within these coarse frames.
-
-    Frames are (60, 80). The LEDs light none of them, or all.
-    """
+    """Whether no broad light comes or goes in coarse frames (60, 80): no LED, or all."""
     darkest = reduce(cv2.min, frames)
     valid = _valid(darkest)
     if valid < SETTINGS.valid_least * darkest.size:
@@ -189,10 +146,7 @@ def unlit(frames: Sequence[Image]) -> bool:
 
 
 def brighter(frame: Image, other: Image) -> bool:
-    """Return whether one coarse frame (60, 80) has broad light the other has not.
-
-    It must also lack none that the other has; such light is that of the LEDs.
-    """
+    """Whether a coarse frame has broad light the other lacks, and not vice versa."""
     darker = cv2.min(frame, other)
     valid = max(_valid(darker), SETTINGS.valid_least * frame.size)
     noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
@@ -203,19 +157,13 @@ def brighter(frame: Image, other: Image) -> bool:
 
 
 def _valid(darker: _Cells) -> int:
-    """Count the cells in which one frame may be brighter than another.
-
-    `darker` is the darker of both frames.
-    """
+    """Count the cells that are not saturated in the darker of two frames."""
     saturated = 250  # level of a cell
     return cv2.countNonZero(cv2.threshold(darker, saturated - 1, 255, cv2.THRESH_BINARY_INV)[1])
 
 
 def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
-    """Return how far each frame is brighter than the other [levels].
-
-    Beyond what noise and a swing of ambient light explain.
-    """
+    """How far each frame is brighter than the other [levels], beyond noise and swing."""
     noise = cv2.LUT(cv2.min(first, second), _NOISE_OF_LEVEL)
     one, other = cv2.subtract(first, second), cv2.subtract(second, first)
     return cv2.subtract(one, noise), cv2.subtract(other, noise)
@@ -236,20 +184,14 @@ def _inside(over: _Cells) -> _Cells:
 
 
 def _broad(over: _Cells, least: float = 0.0) -> int:
-    """Count the cells that are broadly brighter.
-
-    0 where no more than `least` are brighter at all.
-    """
+    """Count the cells that are broadly brighter; 0: no more than `least` are at all."""
     if cv2.countNonZero(over) <= least:
         return 0
     return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
 
 
 def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
-    """Count the cells of thin lines that lie there.
-
-    `where` is called only if there can be any.
-    """
+    """Count the cells of thin lines there; `where` is called if there can be any."""
     if cv2.minMaxLoc(over)[1] <= SETTINGS.line:
         return 0
     return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
@@ -287,23 +229,17 @@ class StrobeCycle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A frame and its coarse image (60, 80), and how it lies in the stream.
-
-    `place` counts periods in which the strobe went on. `follows`: the frame before by one period. `latest`: the frame
-    or its last copy.
-    """
+    """A frame and its coarse image (60, 80), and how it lies in the stream."""
 
     frame: Frame
     cells: Image
-    place: int
-    follows: bool
-    latest: Frame
+    place: int  # periods in which the strobe went on
+    follows: bool  # the frame before by one period
+    latest: Frame  # the frame or its last copy
 
 
 class Strobe:
     """Assembler of frames to strobe cycles.
-
-    Holds the last three frames, and where the last strobe cycle and the present cycle end.
 
     Attributes:
         counts: Event -> how often since the start.
@@ -318,11 +254,7 @@ class Strobe:
     """
 
     def __init__(self, frame_rate_hz: float) -> None:
-        """Start with no frame and no cycle.
-
-        Args:
-            frame_rate_hz: Of the camera file: single frames per second, three per strobe cycle.
-        """
+        """Start with no frame; `frame_rate_hz`: single frames, three per strobe cycle."""
         self._period_ns = 1e9 / frame_rate_hz
         self._seen: list[_Seen] = []
         self._at: int | None = None
@@ -331,10 +263,7 @@ class Strobe:
         self.margin = np.nan
 
     def push(self, frame: Frame) -> StrobeCycle | None:
-        """Return the strobe cycle that this frame completes, or None.
-
-        Never looks at `frame.illumination`.
-        """
+        """The strobe cycle that this frame completes, or None, by content alone."""
         cells = coarse(frame.image)
         last = self._seen[-1] if self._seen else None
         periods = 0.0 if last is None else (frame.t_ns - last.latest.t_ns) / self._period_ns
@@ -343,7 +272,7 @@ class Strobe:
         if last is None or abs(periods) > forgotten:
             self._begin(frame, cells)
             return None
-        if _copied(last, frame, cells):
+        if last.cells.tobytes() == cells.tobytes() and np.array_equal(last.frame.image, frame.image):
             self.counts["doubled"] += 1
             self._seen[-1] = replace(last, latest=frame)  # the strobe did not go on meanwhile
             return None
@@ -354,10 +283,7 @@ class Strobe:
         return self._completed()
 
     def _begin(self, frame: Frame, cells: Image) -> None:
-        """Reset the cycle position.
-
-        The next strobe cycle is accepted, wherever it is.
-        """
+        """Reset the phase: the next strobe cycle is accepted, wherever it is."""
         self.counts["gaps"] += bool(self._seen)
         self._seen = [_Seen(frame, cells, 0, follows=False, latest=frame)]
         self._at = None
@@ -384,10 +310,7 @@ class Strobe:
         return StrobeCycle(*(one.frame for one in self._seen)) if in_step else None
 
     def _instead(self, *, whole: bool) -> str | None:
-        """Classify a cycle whose last frame is not lit by LEDs.
-
-        By those of its frames that were received.
-        """
+        """Classify a cycle whose last frame is not lit by LEDs, by its frames received."""
         frames = [one for one in self._seen if self._due - CYCLE < one.place <= self._due]
         early = [one.cells for one in frames if one.place < self._due]
         last = [one.cells for one in frames if one.place == self._due]
@@ -398,16 +321,11 @@ class Strobe:
         return "unsure" if last and whole else None
 
 
-def _copied(last: _Seen, frame: Frame, cells: Image) -> bool:
-    return last.cells.tobytes() == cells.tobytes() and np.array_equal(last.frame.image, frame.image)
-
-
 def lit_line(frame: Image, ambient: Image) -> Image:
     """Return the image (H, W) of the laser's line, as `lit` does.
 
-    White where the light that was added made the frame white.
-
-    In the sun a line has less room up to white the brighter the skin is: what is left of it does not measure the line.
+    White where the light that was added made the frame white: in the sun a line has less room up to white the
+    brighter the skin is, and what is left of it does not measure the line.
     """
     out = lit(frame, ambient)
     # grey levels of a frame: as bright or brighter
@@ -420,18 +338,9 @@ def lit_line(frame: Image, ambient: Image) -> Image:
 def lit(frame: Image, ambient: Image) -> Image:
     """Subtract the ambient frame; the difference saturates at 0 (Kim et al. 2012).
 
-    The black level cancels. Where the ambient frame is saturated the light that was added cannot be measured, and
-    the difference is 0 there by itself.
-
-    Args:
-        frame: (H, W) laser or LED frame, uint8.
-        ambient: (H, W) ambient frame of the same strobe cycle, uint8.
-
-    Returns:
-        (H, W) uint8.
-
-    Raises:
-        ValueError: The two are not of one size.
+    The black level cancels. Where the ambient frame is saturated the light that was added cannot be measured,
+    and the difference is 0 there by itself. Frames (H, W) uint8 of the same strobe cycle. Raises ValueError:
+    the two are not of one size.
     """
     if frame.shape != ambient.shape:
         raise ValueError(f"frame of {frame.shape} and ambient frame of {ambient.shape} are not of one size")

@@ -1,8 +1,6 @@
 """Regions of the image in which the laser can meet each finger.
 
-And where what it meets there is beside the palm.
-
-A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
+The laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
 """
 
 from dataclasses import dataclass, replace
@@ -39,25 +37,15 @@ _ORIGIN = np.zeros(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserWorkspace:
-    """Which pixels can show the laser on a finger.
+    """Which pixels can show the laser on a finger."""
 
-    Attributes:
-        cells: (5, H / 8, W / 8), thumb ... little, where it can be.
-        plane_m: (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing.
-        focal_px: Of the camera.
-        T_camera_palm: (4, 4) how the palm lies [m].
-        flexed: Whether the wrist is.
-        palm: What is known of the palm.
-        first_row: Above it the laser meets no finger.
-    """
-
-    cells: Bool
-    plane_m: Float32
+    cells: Bool  # (5, H / 8, W / 8), thumb ... little, where it can be
+    plane_m: Float32  # (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing
     focal_px: float
-    T_camera_palm: Float
-    flexed: bool
+    T_camera_palm: Float  # (4, 4) how the palm lies [m]
+    flexed: bool  # whether the wrist is
     palm: "Palm"
-    first_row: int
+    first_row: int  # above it the laser meets no finger
 
     def at_palm_pose(self, palm_pose: PalmPose) -> "LaserWorkspace":
         """The same where the palm lies just so."""
@@ -73,27 +61,16 @@ class LaserWorkspace:
         )
 
     def beyond_m(self, uv: Float) -> Float:
-        """Return how far (N,) the plane at pixels is beyond the skin of the thumb's MCP.
-
-        At pixels (N, 2), from the thumb's root [m].
-        """
+        """How far (N,) [m] the plane at pixels (N, 2) is beyond the skin of the MCP."""
         return self.palm.beyond_m(self._before_palm(uv))
 
     def on_plane(self, uv: Float) -> tuple[Float, Float]:
-        """Return `beyond_m` (N,) of pixels (N, 2), and the finger axis there.
-
-        The latter states beside whose axis the plane is there (N,): 1 index ... 4 little.
-
-        Between and beyond them by their distances.
-        """
+        """Return `beyond_m` and `Palm.place` (N,) of the plane at pixels (N, 2)."""
         points = self._before_palm(uv)
         return self.palm.beyond_m(points), self.palm.place(points)
 
     def on_palm(self, uv: Float) -> Bool:
-        """Return whether at pixels (N, 2) the palm itself is in the laser's plane.
-
-        A bent wrist has brought it there.
-        """
+        """Whether a bent wrist has brought the palm into the plane at pixels (N, 2)."""
         if not self.flexed:
             return np.zeros(len(uv), np.bool_)
         points = self._before_palm(uv)
@@ -109,10 +86,7 @@ class LaserWorkspace:
         return (beyond_m > _NO_THUMBS_M) & (place > outside_palm)
 
     def metres_per_px(self, uv: Float) -> Float:
-        """Return how much of the plane one pixel shows [m] at pixels (N, 2).
-
-        0 where they are NaN, or show none of it.
-        """
+        """How much of the plane one pixel shows [m] at pixels (N, 2); 0: NaN or none."""
         column, row = self._cell(np.nan_to_num(uv))
         return np.where(np.isnan(uv[:, 0]), 0.0, self.plane_m[row, column, 2] / self.focal_px)
 
@@ -129,39 +103,24 @@ class LaserWorkspace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Palm:
-    """The palm's bones and the thumb's root, in the palm frame.
+    """The palm's bones and the thumb's root, in the palm frame."""
 
-    Attributes:
-        root_m: (3,) the thumb's.
-        border_m: How far from it the skin over the thumb's MCP is [m].
-        knuckles_m: (4, 3).
-        aside: (4, 2) way x, z across the axis of each finger, towards the little one's side.
-        radius_m: (4,) of the knuckles.
-    """
-
-    root_m: Float
-    border_m: float
-    knuckles_m: Float
-    aside: Float
-    radius_m: Float
+    root_m: Float  # (3,) the thumb's
+    border_m: float  # how far from it the skin over the thumb's MCP is [m]
+    knuckles_m: Float  # (4, 3)
+    aside: Float  # (4, 2) way x, z across the axis of each finger, towards the little one's side
+    radius_m: Float  # (4,) of the knuckles
 
     def beyond_m(self, points: Float) -> Float:
-        """Return how far points (N, 3) are beyond the skin over the thumb's MCP.
+        """How far points (N, 3) are beyond the skin over the thumb's MCP (N,) [m].
 
-        As (N,), from the thumb's root [m].
-
-        However the thumb is turned, that skin lies about as far from its root (CMC); so it is a sphere about the root,
-        and for one way the palm lies a fixed line in the image.
+        However the thumb is turned, that skin lies about as far from its root (CMC); so it is a sphere about the
+        root, and for one way the palm lies a fixed line in the image.
         """
         return np.linalg.norm(points - self.root_m, axis=1) - self.border_m
 
     def place(self, points: Float) -> Float:
-        """Return beside whose axis points (N, 3) are (N,), seen from before the palm.
-
-        From index 1 to little 4.
-
-        Between two axes, and beyond the outer ones, by their distances.
-        """
+        """Beside whose axis points (N, 3) are (N,), 1 index ... 4 little, by distance."""
         flat = self.knuckles_m[:, ::2]
         off = points[:, ::2] @ self.aside.T - (flat * self.aside).sum(axis=1)  # falls finger by finger
         left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
@@ -172,9 +131,7 @@ class Palm:
     def surface(self, points: Float, place: Float) -> Bool:
         """Return whether points (N, 3) of these places (N,) are on the palm's skin.
 
-        That is before the knuckles, near their bones.
-
-        A finger that is folded to it lies on it, and is thicker than that.
+        That is before the knuckles, near their bones. A finger folded to it lies on it, and is thicker than that.
         """
         at = np.arange(1.0, 5.0)
         y, z, thick = (np.interp(place, at, of) for of in (*self.knuckles_m.T[1:], self.radius_m))
@@ -204,15 +161,7 @@ def workspace_of(view: WristView) -> LaserWorkspace:
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
-    """Return the cells (H / 8, W / 8) where the skin can meet the plane, as 1.
-
-    The skin is about points (P, K, 3) of bones, palm frame.
-
-    Args:
-        view: The rig.
-        bones: Points of all postures.
-        radius: (K,) of the finger there [m].
-    """
+    """Cells (H / 8, W / 8) where skin about bones (P, K, 3), palm frame, can meet it."""
     T = view.T_camera_palm
     camera = bones @ T[:3, :3].T + T[:3, 3]
     off = camera @ view.normal - view.offset_m
@@ -235,10 +184,7 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
 
 @lru_cache(maxsize=8)
 def _plane(optics: CameraModel, x: float, y: float, z: float, offset_m: float) -> Float32:
-    """Return the point of a plane that every pixel shows (H, W, 3).
-
-    The plane has the normal (x, y, z), camera frame [m]; 0: nothing.
-    """
+    """Point (H, W, 3) [m] of the plane at each pixel, camera frame; 0: nothing."""
     u, v = np.meshgrid(np.arange(optics.width_px), np.arange(optics.height_px))
     rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
     points = intersect_plane(_ORIGIN, rays, np.array([x, y, z]), offset_m)

@@ -12,7 +12,13 @@ from pathlib import Path
 
 import msgspec
 
-from slave.imu.ximu3 import Kind, plain, stuff
+from slave.imu.ximu3 import END, ESC, ESC_END, ESC_ESC, Kind, plain
+
+
+def stuff(message: bytes) -> bytes:
+    """A binary data message, without its end, as it is sent."""
+    return message.replace(ESC, ESC_ESC).replace(END, ESC_END) + END
+
 
 FACTORY: dict[str, object] = {
     "binary_mode_enabled": True,

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.imu.ximu3 import LONGEST, Answer, Data, Decoder, Fault, Kind, encode, plain, stuff
+from slave.imu.ximu3 import LONGEST, Answer, Data, Decoder, Fault, Kind, encode, plain
+from tests.slave.imu.fake_ximu3 import stuff
 
 STAMP = "40 42 0F 00 00 00 00 00"
 # x-IMU3 User Manual v1.11, section "Data messages": the same message as text and as bytes.
