@@ -1,4 +1,4 @@
-"""Records: structs of arrays with fixed shapes, which kernels take as one pointer."""
+"""Records: structs of arrays, which kernels take as one pointer."""
 
 from collections.abc import Mapping
 from functools import cache

@@ -42,8 +42,7 @@ class Estimate(NamedTuple):
     def empty(cls) -> "Estimate":
         """Scratch for one."""
         shapes = (4, 4), 20, (26, 3), (26, 3, 3), (26, 3, 3), (5, 3, 3), 5
-        floats = (np.empty(shape) for shape in shapes)
-        return cls(*floats, tracked=np.empty(26, np.bool_), source=np.empty(26, np.uint8))
+        return cls(*map(np.empty, shapes), tracked=np.empty(26, np.bool_), source=np.empty(26, np.uint8))
 
 
 @inner

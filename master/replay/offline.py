@@ -176,7 +176,7 @@ def solve(
 
 @dataclass(slots=True)
 class _Output:
-    """Poses of each hand and object of an offline solve, and how fast the cameras ran."""
+    """Poses of all hands and objects of an offline solve, and the cameras' rates."""
 
     poses: dict[str, list[HandPose]]
     objects: dict[str, list[ObjectPose]] = field(default_factory=dict[str, list[ObjectPose]])
@@ -220,7 +220,7 @@ def _summarise(
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
-    """Score a hand with markers; of both kinds also where cameras lose what a wrist device sees."""
+    """Score a hand with markers, also where cameras lose what a wrist device sees."""
     found = np.isfinite(poses.markers_raw_m).all(axis=2).sum(axis=0)
     truth = load_truth(recording.folder, found == found.max())
     if truth is None:
@@ -234,7 +234,7 @@ def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> 
 def _score_wrist(
     recording: FrameRecording, setup: RigSetup, messages: Sequence[Detections], poses: Poses
 ) -> dict[str, float]:
-    """Score the observations of a wrist device; without markers also the hand solved from them."""
+    """Score a wrist device's observations; without markers also the hand of them."""
     if setup.wrist is None:
         return {}
     exact = load_wrist_truth(recording, setup.wrist_cameras[0])
@@ -257,7 +257,7 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
 def _messages(
     recording: FrameRecording, setups: Sequence[RigSetup], folder: Path
 ) -> list[Detections | TagDetections]:
-    """Return all cameras' detections by capture time; ties in the order of the cameras, tags last."""
+    """Return all cameras' detections by capture time, then by camera, tags last."""
     shown = {name: len(rig.markers) for rig in recording.manifest.all_rigs for name in rig.cameras}
     messages: list[Detections | TagDetections] = []
     order: dict[str, int] = {}
@@ -277,7 +277,7 @@ def _messages(
 
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:
-    """Count the frames or strobe cycles lost before they were recorded, or of which none was made."""
+    """Count the frames or strobe cycles that were never recorded."""
     numbers = {
         name: FrameSequence(CYCLE_FRAMES if name in setup.wrist_cameras else 1) for name in setup.cameras
     }

@@ -129,7 +129,7 @@ def _where_seen(uv: Float, value: float) -> Float:
 
 
 def _sigma_of(uv: Float, quality: Float) -> Float:
-    """Return standard deviations (T, M) [px] of centroids from their quality (T, M), where a file states none.
+    """Return sigmas (T, M) [px] of centroids from qualities (T, M) without any.
 
     A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap
     that may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.

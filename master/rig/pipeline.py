@@ -55,7 +55,7 @@ class Pipeline(Protocol):
 
 
 def _point_filter(setup: RigSetup) -> PointFilter:
-    """Return the rig file's point filter, along the mean viewing direction of its cameras and across it."""
+    """Return the rig file's point filter, along its cameras' mean view and across it."""
     poses = np.array([model.T_rig_camera for model in setup.models.values()])
     ahead = poses[:, :3, 2].sum(axis=0)
     across = cross(poses[0, :3, 1], ahead)

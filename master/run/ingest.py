@@ -338,7 +338,7 @@ class Ingest:
 
 
 def _check_address(host: str) -> None:
-    """Refuse a host name: looking it up would stop the thread that reads, at every beacon."""
+    """Refuse a host name: its lookup would stop the reading thread at every beacon."""
     try:
         IPv4Address(host)
     except AddressValueError as error:
