@@ -1,6 +1,7 @@
 """The house rules that a machine can check. Every guard is shown a planted violation first, so that it bites."""
 
 import ast
+import functools
 import io
 import os
 import re
@@ -157,6 +158,7 @@ DEVICES = frozenset(
 )
 
 
+@functools.cache
 def sources(package: str) -> list[tuple[str, str]]:
     """(path below the root, text) of every file of one package."""
     files = sorted((ROOT / package).rglob("*.py"))
@@ -164,9 +166,15 @@ def sources(package: str) -> list[tuple[str, str]]:
     return [(path.relative_to(ROOT).as_posix(), path.read_text()) for path in files]
 
 
+@functools.cache
+def tree_of(text: str) -> ast.Module:
+    """The syntax tree of a text, once for all guards."""
+    return ast.parse(text)
+
+
 def imported(text: str) -> Iterator[str]:
     """Top-level names of all imports, also those inside functions."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree_of(text)):
         if isinstance(node, ast.Import):
             yield from (alias.name.split(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
@@ -212,7 +220,7 @@ def undeclared(path: str, text: str) -> set[str]:
 
 def relative_imports(path: str, text: str) -> set[str]:
     """`from . import x`."""
-    nodes = ast.walk(ast.parse(text))
+    nodes = ast.walk(tree_of(text))
     return {ast.unparse(node) for node in nodes if isinstance(node, ast.ImportFrom) and node.level > 0}
 
 
@@ -220,7 +228,7 @@ def bare_excepts(path: str, text: str) -> set[str]:
     """`except:` and `except BaseException:` that do not raise again."""
     return {
         f"line {node.lineno}"
-        for node in ast.walk(ast.parse(text))
+        for node in ast.walk(tree_of(text))
         if isinstance(node, ast.ExceptHandler)
         and (node.type is None or ast.unparse(node.type) == "BaseException")
         and not any(isinstance(inner, ast.Raise) for inner in ast.walk(node))
@@ -233,14 +241,14 @@ def prints(path: str, text: str) -> set[str]:
         return set()
     return {
         f"line {node.lineno}"
-        for node in ast.walk(ast.parse(text))
+        for node in ast.walk(tree_of(text))
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
     }
 
 
 def globals_written(path: str, text: str) -> set[str]:
     """`global x`: state that belongs to no object."""
-    return {ast.unparse(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Global)}
+    return {ast.unparse(node) for node in ast.walk(tree_of(text)) if isinstance(node, ast.Global)}
 
 
 def import_time_work(path: str, text: str) -> set[str]:
@@ -249,7 +257,7 @@ def import_time_work(path: str, text: str) -> set[str]:
     A loop that fills a table of constants is no work in this sense.
     """
     found: set[str] = set()
-    for node in _executed(ast.parse(text)):
+    for node in _executed(tree_of(text)):
         bare_call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
         device = isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in DEVICES
         if bare_call or device or isinstance(node, (ast.While, ast.With, ast.Await)):
@@ -290,7 +298,7 @@ def long_first_lines(path: str, text: str) -> set[str]:
     """Docstrings whose first line is longer than 79 characters."""
     lines = [
         (ast.get_docstring(node) or "").partition("\n")[0]
-        for node in ast.walk(ast.parse(text))
+        for node in ast.walk(tree_of(text))
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
     ]
     return {line for line in lines if len(line) > FIRST_LINE}
@@ -306,7 +314,7 @@ def room_without_sentence(path: str, text: str) -> set[str]:
     """A room whose `__init__` does not say what it is for, what enters and what leaves."""
     if not path.endswith("__init__.py"):
         return set()
-    sentence = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+    sentence = (ast.get_docstring(tree_of(text)) or "").partition("\n")[0]
     said = ":" in sentence and "enter" in sentence and ("leave" in sentence or "go to" in sentence)
     return set() if said or path.removesuffix("/__init__.py") in SHARED else {sentence or "nothing"}
 
@@ -314,7 +322,7 @@ def room_without_sentence(path: str, text: str) -> set[str]:
 def module_constants(text: str) -> int:
     """How many names of a module are bound to plain numbers."""
     count = 0
-    for node in ast.parse(text).body:
+    for node in tree_of(text).body:
         targets = node.targets if isinstance(node, ast.Assign) else []
         value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
         if isinstance(node, ast.AnnAssign) and value is not None and _is_number(value):
@@ -336,7 +344,7 @@ def _is_number(node: ast.expr) -> bool:
 
 def protocols(text: str) -> int:
     """How many seams a file declares."""
-    classes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ClassDef)]
+    classes = [node for node in ast.walk(tree_of(text)) if isinstance(node, ast.ClassDef)]
     return sum(any("Protocol" in ast.unparse(base) for base in node.bases) for node in classes)
 
 
@@ -449,7 +457,7 @@ def test_numbers_at_the_top_of_files_and_seams_become_fewer() -> None:
 def test_the_page_of_the_architecture_has_the_sentence_of_every_room() -> None:
     page = (ROOT / "docs/architecture.md").read_text()
     rooms = {
-        path.removesuffix("__init__.py"): (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+        path.removesuffix("__init__.py"): (ast.get_docstring(tree_of(text)) or "").partition("\n")[0]
         for package in PACKAGES
         for path, text in sources(package)
         if path.endswith("__init__.py")

@@ -237,7 +237,7 @@ class Roll:
         return name not in self._expected and last is not None and f"{name}.received" not in last.counts
 
     def _rate(self, name: str) -> float | None:
-        """Return the messages per second that the master took from a process; None: it does not know it."""
+        """Return the messages per second that the master took from a process, or None."""
         last, before = self._last.get(MASTER), self._before.get(MASTER)
         event = f"{name}.received"
         if last is None or before is None or event not in last.counts:

@@ -282,7 +282,7 @@ def _make(folder: Path, devices: Sequence[str]) -> None:
 
 
 def _show(folder: Path) -> None:
-    """Print each certificate: who has it, what for, until when; and the devices without a secret."""
+    """Print each certificate's holder, use and end, and the devices without a secret."""
     certificates = certificates_of(folder)
     wide = max(len(one.name) for one in certificates)
     for one in certificates:
@@ -361,7 +361,7 @@ class Relay:
             thread.join(2.0)
 
     def _answer(self, command: Command) -> Health:
-        """Return the health; a ValueError for another verb than "report", which the asker reads."""
+        """Return the health; another verb than "report" is a ValueError for the asker."""
         if command.verb != "report":
             raise ValueError(f"{NAME}: no command {command.verb!r}; there is report")
         return self.health()

@@ -164,7 +164,7 @@ class PreviewLeases:
             time.sleep(ask_every_s)
 
     def _mask(self, camera: str) -> tuple[str, ...] | None:
-        """Return all markers that somebody wants tinted; None when nobody looks: its thread then ends."""
+        """Return all markers to tint; None when nobody looks, which ends the thread."""
         with self._lock:
             now = time.monotonic()
             wanted = {mask: until for mask, until in self._until.get(camera, {}).items() if until > now}
@@ -180,7 +180,7 @@ class PictureSizes:
     """Compares the sizes [px] of previews with those of the camera files."""
 
     def __init__(self, camera: Callable[[str], CameraCalibration]) -> None:
-        """Compare with the files that `camera` reads; it raises a `CalibrationError` where there is none."""
+        """Compare with the files that `camera` reads, which raises a `CalibrationError`."""
         self._camera = camera
         self._known: dict[str, tuple[float, Size | None]] = {}
         self._refused: dict[str, str] = {}

@@ -148,7 +148,7 @@ class Sessions:
     """Sessions by the hash of their token: a lookup reveals nothing about tokens."""
 
     def __init__(self, life_s: float = 12 * 3600.0, most: int = 64) -> None:
-        """Nobody is logged in; by default for a working day. With more than `most` the oldest is logged out."""
+        """Nobody is logged in; beyond `most` sessions the oldest is logged out."""
         self._life_s, self._most = life_s, most
         self._by_hash: OrderedDict[bytes, Session] = OrderedDict()
 
@@ -216,7 +216,7 @@ def _hash(token: str) -> bytes:
 
 
 def _network(address: str) -> str:
-    """Return the network whose tries count together: an IPv4 address, or 64 bits of IPv6."""
+    """Return the network whose tries count as one: an IPv4 address, or an IPv6 /64."""
     try:
         found = ip_address(address.split("%", 1)[0])
     except ValueError:
@@ -332,7 +332,7 @@ class LoginRequired:
         return answer
 
     async def _socket(self, session: Session, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a socket on until its session ends: then the handler receives a disconnect."""
+        """Pass a socket on until its session ends, then disconnect its handler."""
         ended = asyncio.ensure_future(_end(session, self._clock()))
 
         async def receive_or_end() -> Message:
@@ -366,7 +366,7 @@ async def _end(session: Session, now_s: float) -> None:
 
 
 async def _password(request: Request) -> str | None:
-    """Return the password from the form; None: nothing, too much, something else, or too slow."""
+    """Return the password from the form; None: none, too long, malformed, too slow."""
     body = b""
     try:
         async with asyncio.timeout(10.0):

@@ -110,7 +110,7 @@ def recording_panel(state: ConsoleState) -> None:
 async def _toggle(
     state: ConsoleState, process: str, start: Callable[[], object], button: ui.button, error: ui.label
 ) -> bool:
-    """Stop a process that runs, else start it; whether it was stopped. An error is shown."""
+    """Stop a process that runs, else start it, and return whether it was stopped."""
     error.set_text("")
     button.disable()
     try:

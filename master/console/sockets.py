@@ -71,7 +71,7 @@ def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
 
 @asynccontextmanager
 async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
-    """Accept the page's socket and listen to it while the block runs, which ends when the page goes."""
+    """Accept the page's socket and listen while the block runs, until the page goes."""
     await socket.accept()
     shown = Shown()
     sending = asyncio.current_task()

@@ -79,7 +79,7 @@ class History:
         return rows[-1][1].get(name) if rows else None
 
     def _counted(self, report: Health) -> dict[str, float]:
-        """Return per second the frames of each camera and the lost messages of each sender.
+        """Return each camera's frames and each sender's lost messages per second.
 
         A count of the master that is absent is 0: what never happened it does not report.
         """

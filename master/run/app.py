@@ -196,7 +196,7 @@ class StageTimes:
     """Sums durations by stage name."""
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Measure with the clock `now_ns`, such as `time.thread_time_ns` for processor time."""
+        """Measure with the clock `now_ns`, for processor time `time.thread_time_ns`."""
         self._now_ns = now_ns
         self._stages: dict[str, StageTime] = {}
 

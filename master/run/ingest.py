@@ -326,7 +326,7 @@ class Ingest:
                 self.queue.put(messages)
 
     def _pending(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
-        """Yield at most 64 datagrams that have arrived: what is due is not looked at for each of a flood."""
+        """Yield at most 64 datagrams that have arrived, so that a flood delays nothing."""
         if first is None:
             return
         yield first

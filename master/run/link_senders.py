@@ -111,7 +111,7 @@ def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
 
 
 def _outside(uv: Float, size: tuple[int, int]) -> bool:
-    """Whether any point (..., 2) is further out of a picture than its size [px]. NaN is not."""
+    """Whether a point (..., 2) is farther outside than a picture's size; NaN is not."""
     width, height = size
     points: list[list[float]] = uv.reshape(-1, 2).tolist()
     return any(u < -width or u > 2 * width or v < -height or v > 2 * height for u, v in points)
@@ -344,7 +344,7 @@ class Quarantine:
 
 
 def _place(error: Exception) -> str:
-    """Kind and place of an error, by which a fault is known, whatever numbers its text has."""
+    """Kind and place of an error, which name its fault whatever its text."""
     frames = traceback.extract_tb(error.__traceback__)
     return (
         f"{type(error).__name__} {frames[-1].filename}:{frames[-1].lineno}" if frames else repr(type(error))

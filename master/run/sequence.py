@@ -117,7 +117,7 @@ class Sequence:
 
 @dataclass(slots=True)
 class _Gap:
-    """Gap between the datagrams `after` and `before` that came: what did not come between."""
+    """Gap of datagrams that did not come between `after` and `before`."""
 
     after: int
     before: int

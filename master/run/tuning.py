@@ -96,7 +96,7 @@ class _WhenOpen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _OrientationSample:
-    """One orientation measurement of an IMU: the arguments of `Pipeline.push_orientation`."""
+    """One orientation measured by an IMU, as `Pipeline.push_orientation` takes it."""
 
     t_ns: int
     orientation_wxyz: Float
@@ -206,7 +206,7 @@ class LivePipeline:
         return shown
 
     def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
-        """Switch to the new pipeline, show it the rest, and return its poses later than the last."""
+        """Switch to the new pipeline, and return its poses later than the last."""
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)

@@ -110,7 +110,7 @@ def _phase(gesture: Gesture) -> str:
 
 
 def _poses(state: ConsoleState) -> None:
-    """Build the controls for the user's own poses, with the same commands as in a terminal."""
+    """Build the controls for the user's own poses, with the terminal's commands."""
     with ui.element("section").classes("panel wide").props('aria-label="Poses of your own"'):
         ui.label("Poses of your own").classes("panel-title")
         ui.label(

@@ -93,7 +93,7 @@ def _camera(state: ConsoleState, camera: str) -> None:
 
 
 def _hands(state: ConsoleState) -> None:
-    """Build the text on the hands as one piece of HTML: a screen reader and a copy find plain words."""
+    """Build the text on the hands as one piece of HTML, plain to a screen reader."""
     text = ui.html("", sanitize=False).classes("words")
 
     def update() -> None:

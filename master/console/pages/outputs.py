@@ -76,7 +76,7 @@ def follow(state: ConsoleState, settings: OutputSettings) -> None:
 
 
 def _of_others(state: ConsoleState) -> bool:
-    """Return whether somebody else runs the output process, once our own has gone from the bus."""
+    """Return whether another output process runs, once ours has left the bus."""
     gone_s = 3.0  # so long one that has ended is still seen on the bus
     until = time.monotonic() + (gone_s if state.local.get(SENDING) is not None else 0.0)
     while NAME in state.alive and time.monotonic() < until:

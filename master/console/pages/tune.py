@@ -251,7 +251,7 @@ class CameraPanel:
         self._do(self._save_both, f"saved to the camera file of {self._camera}", "saved")
 
     def _save_both(self) -> InUse:
-        """Save the slave's file, then this machine's copy, another file where the slave is elsewhere."""
+        """Save the slave's file, then this machine's copy where the slave is elsewhere."""
         saved = self._tuner.save()
         path = self._state.camera_path(self._camera)
         if path.exists():

@@ -375,7 +375,7 @@ class Session:
         return job
 
     def _after(self) -> None:
-        """Restore the cameras and the master that a job borrowed: somebody must carry the bus again."""
+        """Restore the cameras and the master that a job borrowed."""
         try:
             with self._lock:
                 cameras, master = self._bring_back
@@ -428,7 +428,7 @@ def wizard_named(command: str) -> Wizard:
 
 
 def _plan(state: ConsoleState) -> Plan:
-    """Return the page's saved plan if the console shows its rig, else that of the rig's file."""
+    """Return the page's saved plan of the console's rig, else that of the rig's file."""
     tree, rigs = state.settings.calibration, state.settings.rigs
     plan = load_plan(tree)
     if plan.cameras and (not rigs or plan.rig in rigs):
