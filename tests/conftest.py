@@ -28,8 +28,8 @@ LIVE = (
     "tests/aarch64/",
     "tests/docs/examples/",
     "tests/master/console/",
-    "tests/master/test_installed_master.py",
-    "tests/master/test_live",
+    "tests/master/commands/test_installed_master.py",
+    "tests/master/run/test_live",
     "tests/master/outputs/web/test_page.py",
     "tests/master/recording/export/test_export_gltf.py",
 )

@@ -15,7 +15,7 @@ from master.cli.table import program
 from master.commands.summary import summary_lines
 from master.replay import offline
 from slave.cli.table import PROGRAM
-from tests.common.test_frame_recording import camera, rig, write
+from tests.common.recording.test_frame_recording import camera, rig, write
 
 ROOT = Path(__file__).resolve().parents[2]
 

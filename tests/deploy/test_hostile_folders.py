@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import command
-from tests.common.test_frame_recording import ROWS, camera, rig, write
+from tests.common.recording.test_frame_recording import ROWS, camera, rig, write
 
 SECRET = "secret-of-another-folder"
 DETECT, REPLAY, JOIN = ("slave", "run"), ("master", "replay"), ("slave", "record")

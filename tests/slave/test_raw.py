@@ -30,7 +30,7 @@ from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
 from slave.tuning import CameraFiles
 from slave.uplink import Uplink
-from tests.common.test_frame_writing import check_whole
+from tests.common.recording.test_frame_writing import check_whole
 from tests.network_helpers import until
 from tests.slave.test_recorder import ListCamera
 from tests.slave.test_tuning import Wire

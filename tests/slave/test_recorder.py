@@ -30,7 +30,7 @@ from slave.commands.offline import detect_recording
 from slave.markers.detector import MarkerDetector
 from slave.recorder import Length, Progress, ProgressDisplay, Recorder, clock_of, feed, progress_text
 from slave.sources import Frame
-from tests.common.test_frame_writing import check_whole, small_disk
+from tests.common.recording.test_frame_writing import check_whole, small_disk
 from tests.network_helpers import until
 from tests.slave.painted import NAMES, camera, hand, render
 

@@ -14,7 +14,7 @@ from common.bus.keys import access_of
 from common.bus.zenoh_bus import ZenohBus
 from common.hand.model import JOINTS
 from master.commands.keys import make
-from tests.master.send.hands import hand_pose
+from tests.master.outputs.network.hands import hand_pose
 from tests.network_helpers import free_endpoint
 
 _OWN_KEYS = (

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.hand.model import CHAINS, METACARPALS, PALM, TIPS
-from common.records import boxed
 from common.messages import Source
+from common.records import boxed
 from master.estimator.epoch import Fitted, MarkerPositions
 from master.estimator.estimator import pose_of
 from master.estimator.settings import DEFAULT

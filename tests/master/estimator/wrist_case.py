@@ -9,8 +9,8 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.hand.model import CHAINS
 from common.hand.wrist import STRAIGHT
-from common.records import boxed
 from common.messages import HandPose, WristDetections
+from common.records import boxed
 from master.estimator.finger_surface import Surface
 from master.estimator.parameters import HandParameters, HandTables
 from master.estimator.priors import WristModel, loosened

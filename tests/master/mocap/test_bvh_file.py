@@ -12,8 +12,8 @@ from common.hand.model import JOINTS
 from master.mocap.bvh_file import read_bvh
 from master.mocap.read import Reading, read_motion
 from master.recording.export.bvh import Axes
-from tests.master.export.made import poses_of, positions
-from tests.master.export.test_export_bvh import written
+from tests.master.recording.export.made import poses_of, positions
+from tests.master.recording.export.test_export_bvh import written
 
 # Written for this test: two joints beside their parents in other orders of channels, one with a place of its own.
 SMALL = """HIERARCHY

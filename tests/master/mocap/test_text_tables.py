@@ -10,9 +10,9 @@ from common.errors import RecordingError
 from common.hand.model import JOINTS
 from master.mocap.csv_file import read_csv
 from master.mocap.read import Reading, read_motion
-from tests.master.export.made import poses_of
-from tests.master.export.test_export_tables import exported, run_of
 from tests.master.mocap.moved import hand_at, ns, write_table
+from tests.master.recording.export.made import poses_of
+from tests.master.recording.export.test_export_tables import exported, run_of
 
 MOTIVE = """Format Version,1.23,Take Name,grab,Capture Frame Rate,100.000000,Rotation Type,XYZ,Length Units,Millimeters
 ,

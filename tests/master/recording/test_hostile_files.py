@@ -27,7 +27,7 @@ from tests.common.hostile_mcap import (
     tiny_messages,
     wide_channel,
 )
-from tests.master.export.made import RIGHT, poses_of
+from tests.master.recording.export.made import RIGHT, poses_of
 from tests.master.recording.recorded_run import scene
 
 SECRET = "secret-of-another-folder"

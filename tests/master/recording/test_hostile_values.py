@@ -25,7 +25,7 @@ from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.player import Player
 from tests.common.hostile_mcap import RECORD, HostileMcap, chunk, message, record
-from tests.master.export.made import poses_of, results
+from tests.master.recording.export.made import poses_of, results
 from tests.master.recording.recorded_run import report, scene
 
 MOST_S = 5.0  # of processor time for some kB

@@ -19,7 +19,7 @@ from master.rig.setup import RigSetup
 from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.calibrate.extrinsics.worn import errors
-from tests.master.test_solve_both import write_detections
+from tests.master.replay.test_solve_both import write_detections
 
 CERTAIN = {
     "rotation_sigma_deg": 1.0,
