@@ -19,14 +19,8 @@ from bench.report import Row, show, write_json
 # Group -> name -> (module, what it measures). A module has `rows()`, or its own command line `main(arguments)`.
 COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     "markers": {
-        "markers": (
-            "markers.speed",
-            "time of detection, 640x480, six markers; baseline: the published pipeline",
-        ),
-        "marker_accuracy": (
-            "markers.accuracy",
-            "centroids on generated frames with exact truth, kind by kind",
-        ),
+        "markers": ("markers.speed", "time of detection, six markers; baseline: the published pipeline"),
+        "marker_accuracy": ("markers.accuracy", "centroids on generated frames, kind by kind"),
         "real_markers": (
             "markers.real",
             "a real ball in a hand, photographs without markers (PHALANX_PHOTOS)",
@@ -34,10 +28,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "hand": {
         "ik": ("hands.ik", "fingers of a known palm; baseline: the papers' FABRIK with limits, scipy"),
-        "hand_poses": (
-            "hands.poses",
-            "random independent joints, palm turned by 45 degrees; baseline: the papers'",
-        ),
+        "hand_poses": ("hands.poses", "random independent joints, palm turned; baseline: the papers'"),
         "real_motion": ("hands.motion", "recorded and held hands through solver and filter"),
         "real_hands": (
             "hands.grasping",
@@ -45,30 +36,22 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "joint_certainty": ("hands.certainty", "95 % regions of joints that are seen, hidden, gone"),
         "mocap": ("hands.mocap", "poses against motion capture in another frame and clock"),
-        "imu": ("imu", "orientation by rates and forces (BROAD, simulated arms); baseline: VQF"),
-        "reliability": ("reliability", "stated against found, of markers, joints and IMU; --picture FILE"),
+        "imu": ("imu", "orientation by rates and forces (BROAD); baseline: VQF"),
     },
     "cameras": {
-        "sync": ("cameras.sync", "depth of a hand at 1 m/s from unsynchronised cameras; --picture FILE"),
-        "depth": ("cameras.depth", "depth at rest, by fitted laws, and of recorded sweeps"),
+        "sync": ("cameras.sync", "depth of a hand at 1 m/s from unsynchronised cameras"),
+        "depth": ("cameras.depth", "depth at rest, and by the law of the shipped rig"),
         "uncertainty": ("cameras.uncertainty", "95 % regions of markers, rendered hands with wrong radii"),
-        "occlusion": (
-            "cameras.occlusion",
-            "finger tips that no two cameras see; --picture FILE: where to mount",
-        ),
+        "occlusion": ("cameras.occlusion", "finger tips that no two cameras see"),
     },
     "wrist device": {
-        "wrist": ("wrist.triple", "time of a strobe cycle, step by step; --picture FILE"),
         "wrist_strobe": ("wrist.strobe", "strobe cycles of a stream of dropped, doubled, swapped frames"),
         "wrist_tips": ("wrist.tips", "fingertips, recorded and simulated from dark to sun"),
         "wrist_fingers": ("wrist.fingers", "joint angles by the device alone, by level and light"),
-        "wrist_calibration": (
-            "wrist.calibration",
-            "laser plane by number of views, palm and knuckles of a subject",
-        ),
+        "wrist_calibration": ("wrist.calibration", "laser plane by views, palm and knuckles of a subject"),
     },
     "hand, objects and gestures": {
-        "fusion": ("both.fusion", "markers and wrist device as one hand, against each alone; --picture FILE"),
+        "fusion": ("both.fusion", "markers and wrist device as one hand, against each alone"),
         "gesture_poses": ("gestures.poses", "the six study poses: people, rigs, recorded hands"),
         "gestures": ("gestures.actions", "pinch, dial, taps, pointing: late, missed, false"),
         "objects": ("objects.tracked", "objects of beads and of tags, rendered, detected, partly hidden"),
@@ -116,16 +99,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "names", nargs="*", metavar="NAME", help="one of those below (default: all with rows)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the picture of docs instead")
     options = parser.parse_args(given)
     names = cast(list[str], options.names) or [name for name in ALL if hasattr(_module(name), "rows")]
     if unknown := sorted(set(names) - ALL.keys()):
         parser.error(f"unknown benchmark {unknown[0]!r}; there are {', '.join(ALL)}")
-    if options.picture is not None:
-        if len(names) != 1 or not hasattr(_module(names[0]), "picture"):
-            parser.error("--picture goes with one benchmark that has a picture")
-        _module(names[0]).picture(options.picture)
-        return 0
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
     tables: dict[str, list[Row]] = {}
     for name in names:
@@ -143,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _own_options(module: Any, rest: Sequence[str]) -> bool:
     """Whether a benchmark reads its own command line: it has no rows, or is given more than ours."""
-    ours = not rest or rest[0] in (*ALL, "--json", "--picture")
+    ours = not rest or rest[0] in (*ALL, "--json")
     return hasattr(module, "main") and not (hasattr(module, "rows") and ours)
 
 

@@ -26,17 +26,10 @@ from common.errors import PhalanxError
 
 SERVICES = ("pypi", "osv")
 NONE_KNOWN, KNOWN, NOT_ASKED = 0, 1, 2
-_PATIENCE_S = 600.0
 _EXACT = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)==([0-9][A-Za-z0-9.+!_-]*)")
 _MACHINES = tuple(
-    {
-        "python_version": version,
-        "python_full_version": f"{version}.0",
-        "platform_machine": machine,
-        "sys_platform": "linux",
-        "platform_system": "Linux",
-        "os_name": "posix",
-    }
+    {"python_version": version, "python_full_version": f"{version}.0", "platform_machine": machine}
+    | {"sys_platform": "linux", "platform_system": "Linux", "os_name": "posix"}
     for version in ("3.11", "3.12", "3.13")
     for machine in ("x86_64", "aarch64")
 )
@@ -73,11 +66,7 @@ class Verdict:
 
 
 def asked(constraints: Path, service: str) -> list[Package]:
-    """What a service answers about every line.
-
-    Raises:
-        PhalanxError: It does not answer.
-    """
+    """Ask a service about every line; PhalanxError: it does not answer."""
     command = [
         sys.executable,
         "-m",
@@ -88,10 +77,11 @@ def asked(constraints: Path, service: str) -> list[Package]:
         "--no-deps",
     ]
     command += ["--progress-spinner", "off", "--format", "json", "--vulnerability-service", service]
+    patience_s = 600.0
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
     except subprocess.TimeoutExpired as error:
-        raise PhalanxError(f"{service}: no answer within {_PATIENCE_S:g} s") from error
+        raise PhalanxError(f"{service}: no answer within {patience_s:g} s") from error
     try:
         return msgspec.json.decode(done.stdout, type=_Answer).dependencies
     except msgspec.MsgspecError as error:
@@ -100,13 +90,7 @@ def asked(constraints: Path, service: str) -> list[Package]:
 
 
 def judge(versions: dict[str, str], answered: Sequence[Package], who: dict[str, str]) -> Verdict:
-    """What the answers come to.
-
-    Args:
-        versions: What is locked: name -> version.
-        told: What was answered.
-        who: Name -> who needs it.
-    """
+    """Judge the answers; `versions`: locked, by name; `who`: name -> who needs it."""
     answers = {
         one.name: one for one in answered if not one.skip_reason and one.version == versions.get(one.name)
     }
@@ -151,11 +135,7 @@ def bill_of_materials(versions: dict[str, str], who: dict[str, str]) -> str:
 
 
 def locked(path: Path) -> dict[str, str]:
-    """Name -> version of every line.
-
-    Raises:
-        PhalanxError: A line does not name exactly one version, or a package twice.
-    """
+    """Name -> version of every line; PhalanxError: not exactly one version, or a package twice."""
     versions: dict[str, str] = {}
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         text = line.partition("#")[0].strip()

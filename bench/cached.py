@@ -5,21 +5,14 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-KEY = 12  # hexadecimal digits
-
 
 def key_of(inputs: str) -> str:
     """A short name of what a folder is made of: other inputs, another folder."""
-    return hashlib.sha256(inputs.encode()).hexdigest()[:KEY]
+    return hashlib.sha256(inputs.encode()).hexdigest()[:12]
 
 
 def made_once(place: Path, make: Callable[[Path], None]) -> Path:
-    """The folder `place`, made if it is not there.
-
-    Args:
-        place: Where it is kept.
-        make: Fills an empty folder; what it puts beside it, in the folder's own parent, goes away afterwards.
-    """
+    """Return the folder `place`; where it is absent, `make` fills an empty one, what it puts beside that goes."""
     if place.is_dir():
         return place
     place.parent.mkdir(parents=True, exist_ok=True)

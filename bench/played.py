@@ -1,6 +1,6 @@
 """A scene through the whole line in one process: rendered frames, real detector, real pipeline, exact truth.
 
-What the cameras of a rig would deliver live, without clocks and network, so that the same scene gives the same figures.
+Without clocks and network, so that the same scene gives the same figures.
 """
 
 from collections.abc import Sequence
@@ -23,20 +23,14 @@ from slave.markers.white_balance import Inline
 
 START_NS = 1_000_000_000  # scene time 0 on the clock of the messages
 HOLD_S, MOVE_S = 0.8, 0.7  # of a motion that holds poses
-_ROWS_S = 0.02  # a marker's row is exposed within this time after row 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldPoses:
-    """A motion that holds each of some states, then moves on to the next.
+    """A motion that holds each of some states, then moves on to the next."""
 
-    Attributes:
-        model: The hand.
-        held: Place (3,) [m], rotation vector (3,) [rad] and angles (5, 4) [rad] of each state.
-    """
-
-    model: HandModel
-    held: Sequence[tuple[Float, Float, Float]]
+    model: HandModel  # the hand
+    held: Sequence[tuple[Float, Float, Float]]  # place [m], rotation vector [rad], angles (5, 4)
     period_s: float = 1e6
 
     def at(self, t_s: float) -> HandState:
@@ -52,16 +46,12 @@ class HeldPoses:
 class Watched:
     """One camera over T frames of a scene.
 
-    Attributes:
-        messages: What its slave would send, frame by frame.
-        t_s: (T,) scene time of each frame's row 0 [s].
-        shown: (T, M) visible area of each marker, in discs of its cap's radius at its distance; a whole cap shows one
-            or more. For a marker that is no cap: visible share.
+    `shown`: visible area in discs of the cap's radius at its distance; of a marker that is no cap, its visible share.
     """
 
-    messages: tuple[MarkerDetections, ...]
-    t_s: Float
-    shown: Float
+    messages: tuple[MarkerDetections, ...]  # what its slave would send, frame by frame
+    t_s: Float  # (T,) scene time of each frame's row 0 [s]
+    shown: Float  # (T, M)
 
 
 def times_of(scene: Scene, camera: str, seconds: float, rate_hz: float, start_s: float = 0.0) -> Float:
@@ -115,7 +105,8 @@ def times_of_poses(poses: Sequence[HandPose]) -> Float:
 def _shown(scene: Scene, camera: str, renderer: Renderer, t_s: float) -> Float:
     view = renderer.markers(t_s)
     shown = view.visible.copy()
-    joints = scene.joints((t_s + _ROWS_S / 2,))
+    rows_s = 0.02  # a marker's row is exposed within this time after row 0
+    joints = scene.joints((t_s + rows_s / 2,))
     optics = scene.optics[camera]
     focal_px = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
     for m, name in enumerate(scene.rig.markers):

@@ -1,20 +1,10 @@
-"""What a pose costs the master, stage by stage: processor time of one thread, no socket; or in turns with other code.
+"""What a pose costs the master, stage by stage: processor time of one thread, no socket.
 
-    python -m bench pose_cost                    each rig, stage by stage; its figures as a line of JSON at the end
-    python -m bench pose_cost --functions desk   where in the code, by the profiler (its own cost is in it)
-    python -m bench pose_cost --against DIR      this code and that of another checkout, some poses each in turns
-
-A pose is all that the master does from sealed datagrams to the bytes that it publishes, gestures among it. What senders
-do for it is not counted.
-
-Times of a machine that does other things change from minute to minute. Two processes that take turns every few poses
-meet the same minutes, so the ratio of their times says what the figures themselves do not.
+A pose is all that the master does from sealed datagrams to the bytes that it publishes, gestures among it; what senders
+do for it is not counted. The figures come as a line of JSON at the end.
 """
 
-import argparse
-import cProfile
 import os
-import pstats
 import random
 import subprocess
 import sys
@@ -27,7 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from bench.both.shown import shown
+from bench.both.scene import shown
 from bench.report import ROOT, Row
 from bench.rigs.rooms import ROOM, detections, in_order, room
 from common.messages import ImuSample, encode
@@ -55,10 +45,10 @@ FIGURES = {
     "compile_cold_s": COLD,
     "start_warm_s": WARM,
 }
-_POSES, _TURN = 320, 10  # the first turn warms up
+_TURN = 10  # the first turn warms up
 _SCENE, _SEED = "grasp", 7
 _KEY, _MASTER, _BROADCAST = bytes(range(32)), ("10.0.0.1", 47801), ("10.0.0.255", 47800)
-_BEGIN_NS, _STEP_NS, _AFTER_NS, _START_NS = 10**12, 5_000_000, 2_000_000, 2 * 10**9
+_BEGIN_NS = 10**12
 # numba takes part of its time when it is imported, the rest where kernels are first called.
 _START = """
 from time import process_time
@@ -89,11 +79,7 @@ class Played:
     """The master of a rig and its senders, all in one thread. Holds them, and the time that they believe it is."""
 
     def __init__(self, setups: Sequence[RigSetup], stages: StageTimes) -> None:
-        """Join them, and let them find each other.
-
-        Raises:
-            RuntimeError: The start did not come within two simulated seconds.
-        """
+        """Join them, and let them find each other."""
         self._clock, source = _Clock(), random.Random(_SEED).randbytes
         cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
         imus = tuple(name for setup in setups for name in setup.imus)
@@ -104,23 +90,19 @@ class Played:
         self._address = {name: (f"10.0.1.{k}", 5) for k, name in enumerate(self._slaves)}
         self._world = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
         while not all(slave.started for slave in self._slaves.values()):
-            if self._clock.t_ns > _BEGIN_NS + _START_NS:
+            if self._clock.t_ns > _BEGIN_NS + 2 * 10**9:
                 raise RuntimeError("the master's start did not come within two simulated seconds")
-            self._clock.t_ns += _STEP_NS
+            self._clock.t_ns += 5_000_000
             self._keep()
         self._since_ns = self._clock.t_ns
 
     def sent(self, message: Any) -> tuple[bytes, tuple[str, int]]:
-        """What the sender of a message sends of it, and its address; times of messages are since the start.
-
-        Raises:
-            RuntimeError: The session has ended.
-        """
+        """What the sender of a message sends of it, and its address; times of messages are since the start."""
         name = message.source if isinstance(message, ImuSample) else message.camera
         slave, times = self._slaves[name], {"t_ns": self._since_ns + message.t_ns}
         if not isinstance(message, ImuSample):
             times["ready_t_ns"] = self._since_ns + message.ready_t_ns
-        self._clock.t_ns = max(self._clock.t_ns, max(times.values()) + _AFTER_NS)
+        self._clock.t_ns = max(self._clock.t_ns, max(times.values()) + 2_000_000)
         self._keep()
         sealed = slave.seal(replace(message, session=slave.process, **times))
         if sealed is None:
@@ -152,10 +134,11 @@ class Played:
 
 
 def played(rig: str, stages: StageTimes) -> tuple[Played, Sequence[Any]]:
-    """The master of a rig with its senders, and the messages of about `_POSES` poses."""
+    """The master of a rig with its senders, and the messages of some hundred poses."""
+    poses = 320
     if rig in ("fused", "wrist"):
         rate_hz = 60.0 if rig == "fused" else 30.0
-        both = shown(_SCENE, _POSES / rate_hz, _SEED)
+        both = shown(_SCENE, poses / rate_hz, _SEED)
         one = Played([both.both.fused if rig == "fused" else both.both.wrist], stages)
         first_ns = both.messages[0].t_ns
         messages = [m for m in both.messages if getattr(m, "source", getattr(m, "camera", "")) in one.senders]
@@ -163,7 +146,7 @@ def played(rig: str, stages: StageTimes) -> tuple[Played, Sequence[Any]]:
     cameras, rate_hz = (16, 90.0) if rig == "room" else (2, 60.0)
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
-    return Played(setups, stages), in_order(detections(setups[0], rate_hz))[: cameras * _POSES]
+    return Played(setups, stages), in_order(detections(setups[0], rate_hz))[: cameras * poses]
 
 
 def _since(message: Any, first_ns: int) -> Any:
@@ -201,81 +184,8 @@ def rows() -> Iterator[Row]:
 
 
 def _started_s(cache: str) -> float:
-    """Processor time [s] of numba and the kernels of rig desk in a new process.
-
-    `cache`: the folder of machine code, empty or filled by such a process.
-    """
+    """Processor time [s] of numba and the kernels of rig desk in a new process; `cache`: its folder of machine code."""
     environment = os.environ | {"NUMBA_CACHE_DIR": cache}
     command = [sys.executable, "-c", _START]
     run = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return float(run.stdout)
-
-
-def against(checkout: Path) -> None:
-    """Print the processor time of a pose of another checkout and of this one, and their ratio, in alternating turns."""
-    for rig, what in RIGS.items():
-        both = [_child(rig, root) for root in (checkout.resolve(), ROOT)]
-        each: list[tuple[float, float]] = []
-        while True:
-            order = both if len(each) % 2 else both[::-1]
-            said = {id(one): _next(one) for one in order}
-            spent = [said[id(one)] for one in both]
-            if "" in spent:
-                break
-            each.append((float(spent[0]), float(spent[1])))
-        for one in both:
-            one.kill()
-            one.wait()
-        then, now = np.array(each[1:]).T
-        print(f"{what}: {_spread(then)} -> {_spread(now)} ms a pose, ratio {_spread(now / then)}")
-
-
-def _child(rig: str, root: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-P", __file__, "--turns", rig]
-    environment = os.environ | {"PYTHONPATH": str(root)}
-    return subprocess.Popen(
-        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-
-
-def _next(child: subprocess.Popen[str]) -> str:
-    """What a pose of its next turn took [ms], empty at the end."""
-    assert child.stdin is not None
-    assert child.stdout is not None
-    child.stdin.write("\n")
-    child.stdin.flush()
-    return child.stdout.readline().strip()
-
-
-def _spread(values: Any) -> str:
-    low, middle, high = np.percentile(values, [25, 50, 75])
-    return f"{middle:.3f} ({low:.3f} to {high:.3f})"
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Compare with another checkout, or print functions."""
-    keep = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m bench pose_cost", description=__doc__, formatter_class=keep)
-    parser.add_argument("--functions", choices=RIGS)
-    parser.add_argument("--against", type=Path, metavar="DIR")
-    parser.add_argument("--turns", choices=RIGS, help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
-    if options.against is not None:
-        against(options.against)
-    elif options.turns is not None:
-        spent = turns(*played(options.turns, StageTimes()))
-        while sys.stdin.readline():
-            poses, ms = next(spent, (0, 0.0))
-            print(f"{ms / poses:.6f}" if poses else "", flush=True)
-            if not poses:
-                break
-    elif options.functions is not None:
-        one, messages = played(options.functions, StageTimes())
-        profile = cProfile.Profile(time.thread_time)
-        for message in messages:
-            profile.runcall(one.take, *one.sent(message))
-        pstats.Stats(profile).sort_stats("tottime").print_stats(50)
-
-
-if __name__ == "__main__":
-    main()

@@ -49,11 +49,7 @@ def rig_files(name: str) -> tuple[RigCalibration, dict[str, CameraCalibration], 
 
 
 def command(module: str, *arguments: object) -> None:
-    """Run a command of the project, for example `command("slave", "colours", ...)`.
-
-    Raises:
-        subprocess.CalledProcessError: It failed.
-    """
+    """Run a command of the project, for example `command("slave", "colours", ...)`."""
     words = [sys.executable, "-m", module, *map(str, arguments)]
     subprocess.run(words, check=True, capture_output=True, cwd=ROOT)
 

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,15 +14,13 @@ from bench.aarch64.guest import FIRST, LAST, MACHINE_CODE
 from bench.aarch64.sysroot import CACHE, PYTHON, ROOT, NotPossibleError, Sysroot
 
 CPU = "cortex-a53"  # Raspberry Pi 3 and Zero 2 W: the slowest that is meant
-AT_ONCE = 2  # runs side by side
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 
 
 class Counted(NamedTuple):
-    """Case -> instructions per frame; part -> (calls, instructions) per frame; case -> hash of what was detected."""
+    """Case -> instructions per frame; case -> hash of what was detected."""
 
     per_frame: dict[str, float]
-    parts: dict[str, tuple[float, float]]
     hashes: dict[str, str]
 
 
@@ -40,24 +37,21 @@ def counted(
 ) -> Counted:
     """Run `cases` under emulation, each in a process of its own: what ran before moves a count by some 1e-3.
 
-    `fast`: Folder of the wheels that cases of machine code need. One runs before they are counted, some minutes
-    the first time: what was compiled in the same process is not the code that every later start loads.
-
-    Raises:
-        NotPossibleError: The emulated program failed.
+    `fast`: folder of the wheels of machine code. One such case runs uncounted first: what was compiled in the same
+    process is not the code that every later start loads. NotPossibleError: the emulated program failed.
     """
     compiled = [case for case in cases if case in MACHINE_CODE]
     if compiled:
         _emulated(sysroot, frames, compiled[0], cpu, fast)
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    at_once = 2  # runs side by side
+    with ThreadPoolExecutor(at_once) as pool:
         running = {case: pool.submit(_emulated, sysroot, frames, case, cpu, fast) for case in cases}
         answers = {case: run.result() for case, run in running.items()}
     slopes: dict[str, float] = {}
     for case, (labels, counts, _) in answers.items():
         at = dict(zip(labels, counts, strict=True))
         slopes[case] = slope(at[f"{case} {FIRST}"], at[f"{case} {LAST}"])
-    parts = spans(answers["parts"].labels, answers["parts"].counts) if "parts" in answers else {}
-    return Counted(slopes, parts, {case: one.digest for case, one in answers.items()})
+    return Counted(slopes, {case: one.digest for case, one in answers.items()})
 
 
 def native(frames: Path, cases: Sequence[str]) -> dict[str, str]:
@@ -93,38 +87,6 @@ def slope(first: int, last: int) -> float:
     return (last - first) / (LAST - FIRST)
 
 
-def spans(labels: Sequence[str], counts: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Part -> (calls, instructions) per frame between the frames FIRST and LAST, what the marks cost taken off.
-
-    Args:
-        labels: `+name` at the begin of a call, `-name` at its end, properly nested; `parts N` at frame N.
-        counts: Instructions executed at each.
-    """
-    own = _cost_of_marks(labels, counts)
-    begin, end = labels.index(f"parts {FIRST}"), labels.index(f"parts {LAST}")
-    calls: defaultdict[str, int] = defaultdict(int)
-    spent: defaultdict[str, float] = defaultdict(float)
-    open_calls: list[tuple[str, int, int]] = []  # name, count at begin, marks before
-    for k in range(begin + 1, end):
-        sign, name = labels[k][0], labels[k][1:]
-        if sign == "+":
-            open_calls.append((name, counts[k], k))
-            continue
-        expected, began, at = open_calls.pop()
-        if expected != name:
-            raise ValueError(f"mark {k}: {name} ends inside {expected}")
-        calls[name] += 1
-        spent[name] += counts[k] - began - own * (k - at)
-    frames = LAST - FIRST
-    return {name: (calls[name] / frames, spent[name] / frames) for name in spent}
-
-
-def _cost_of_marks(labels: Sequence[str], counts: Sequence[int]) -> float:
-    """Instructions from one mark to the next around a part that does nothing."""
-    places = [k for k, label in enumerate(labels) if label in ("+nothing", "-nothing")]
-    return (counts[places[-1]] - counts[places[0]]) / (len(places) - 1)
-
-
 def _ask(
     command: Sequence[str], frames: Path, case: str, environment: Mapping[str, str]
 ) -> tuple[list[str], str]:
@@ -133,5 +95,5 @@ def _ask(
     result = subprocess.run(line, capture_output=True, text=True, env={**environment, **ONE_THREAD}, cwd=ROOT)
     if result.returncode != 0:
         raise NotPossibleError(f"{' '.join(line)} failed:\n{result.stderr.strip()}")
-    said = json.loads(result.stdout)
-    return said["labels"], said["hash"]
+    answer = json.loads(result.stdout)
+    return answer["labels"], answer["hash"]

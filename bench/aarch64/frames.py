@@ -59,11 +59,7 @@ class StrobedFrames(NamedTuple):
 
 
 def write(place: Path, frames: MarkedFrames) -> None:
-    """Write to the folder `place`: camera.json, names.json, and the frames as PNG.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Write to the folder `place`: camera.json, names.json, and the frames as PNG."""
     place.mkdir(parents=True, exist_ok=True)
     (place / "camera.json").write_bytes(msgspec.json.encode(frames.camera))
     (place / "names.json").write_bytes(msgspec.json.encode(frames.names))
@@ -71,22 +67,14 @@ def write(place: Path, frames: MarkedFrames) -> None:
 
 
 def read(place: Path) -> MarkedFrames:
-    """What `write` left in the folder `place`.
-
-    Raises:
-        FileNotFoundError: There are no frames.
-    """
+    """Read what `write` left in the folder `place`; FileNotFoundError: there are no frames."""
     images = _read_images(place, cv2.IMREAD_COLOR)
     names = msgspec.json.decode((place / "names.json").read_bytes(), type=tuple[str, ...])
     return MarkedFrames(load(place / "camera.json", CameraCalibration), names, images)
 
 
 def write_strobed(place: Path, frames: StrobedFrames) -> None:
-    """Write to the folder `place`: rig.json, camera.json, hand.json, and the frames as PNG.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Write to the folder `place`: rig.json, camera.json, hand.json, and the frames as PNG."""
     place.mkdir(parents=True, exist_ok=True)
     for name in ("rig", "camera", "hand"):
         (place / f"{name}.json").write_bytes(msgspec.json.encode(getattr(frames, name)))
@@ -94,11 +82,7 @@ def write_strobed(place: Path, frames: StrobedFrames) -> None:
 
 
 def read_strobed(place: Path) -> StrobedFrames:
-    """What `write_strobed` left in the folder `place`.
-
-    Raises:
-        FileNotFoundError: There are no frames.
-    """
+    """Read what `write_strobed` left in the folder `place`; FileNotFoundError: there are no frames."""
     images = _read_images(place, cv2.IMREAD_GRAYSCALE)
     rig, hand = load(place / "rig.json", RigCalibration), load(place / "hand.json", HandProfile)
     return StrobedFrames(rig, load(place / "camera.json", CameraCalibration), hand, images)

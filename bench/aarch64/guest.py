@@ -1,8 +1,8 @@
-"""The program that is counted: runs one case frame by frame, and marks where the count is to be read.
-
-The same file runs natively, for the hash of what was detected: it must be equal on both architectures.
+"""The program that is counted: runs one case frame by frame, and marks where the count is read.
 
     python -m bench.aarch64.guest FOLDER CASE     prints a line of JSON: labels of the marks, hash of what was found
+
+It also runs natively, for that hash: it must be equal on both architectures.
 """
 
 import hashlib
@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, read, read_strobed, without
-from bench.aarch64.parts import counted_parts
 from bench.markers import published
 from common.messages import Message, WristDetections, encode
 from master.run.link import MasterLink
@@ -37,9 +36,8 @@ from slave.wrist.led_image import WristView
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
 MACHINE_CODE = ("numba", "numba-windows", "wrist-numba")  # cases
 STROBED = ("wrist", "wrist-numba")
-STROBED_DECIMALS = 3  # compared: least squares of outlines differ in the last bit from processor to processor
 WINDOWS = ("windows", "search", "numba-windows")
-PUSHED = ("six", "twelve", "parts", "numba", *WINDOWS)
+PUSHED = ("six", "twelve", "numba", *WINDOWS)
 KEY = bytes(range(32))
 MASTER, SLAVE = ("10.0.0.1", 47801), ("10.0.0.2", 5)
 
@@ -153,8 +151,7 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
     detector.windows_only = case in WINDOWS
     found: list[Detections] = []
     if case in PUSHED:
-        with counted_parts(marks, case == "parts"):
-            each(lambda k: found.append(detector.push(frames.image(k), k * FRAME_NS)))
+        each(lambda k: found.append(detector.push(frames.image(k), k * FRAME_NS)))
     elif case == "lost":
         each(lambda k: found.append(detector.fresh().push(frames.image(k), 0)))
     elif case == "seed":
@@ -208,9 +205,10 @@ def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
 
     _each(marks, case, step)
     if len(messages) < LAST - FIRST:
-        raise RuntimeError(f"{len(messages)} of {LAST} triples were told")
+        raise RuntimeError(f"{len(messages)} of {LAST} triples gave messages")
     for one in messages:
-        digest.add(*(np.round(array, STROBED_DECIMALS) for array in arrays_of(one)))
+        # Least squares of outlines differ in the last bit from processor to processor.
+        digest.add(*(np.round(array, 3) for array in arrays_of(one)))
     return digest.hex()
 
 

@@ -17,11 +17,8 @@ from common.sim.wrist.scene import WristScene
 from slave.cameras.synthetic import STROBE
 
 OPEN_S = 20.0  # an open hand: all six markers in view
-FRAME_S = 1.0 / 60.0
-SEED = 7
 COUNT = 11  # forth and back a period of twenty frames
-CURL, CURL_S = "curl", 0.5  # begins where fingers bend
-SECOND_VALUE = 236  # HSV value from which a colour is the second hand's
+CURL = "curl"
 
 
 def rendered() -> dict[str, MarkedFrames]:
@@ -29,7 +26,7 @@ def rendered() -> dict[str, MarkedFrames]:
     rig, cameras, hand = rig_files("desk")
     name = rig.cameras[0]
     renderer = Renderer(Scene.standard(rig, cameras, hand), name)
-    images = [renderer.render(OPEN_S + FRAME_S * k) for k in range(COUNT)]
+    images = [renderer.render(OPEN_S + 1.0 / 60.0 * k) for k in range(COUNT)]
     six = MarkedFrames(cameras[name], rig.markers, images)
     return {SIX: six, TWELVE: with_second_hand(six)}
 
@@ -39,8 +36,9 @@ def strobed() -> StrobedFrames:
     rig, cameras, hand = rig_files("wrist")
     name = rig.cameras[0]
     camera = cameras[name]
-    renderer = WristRenderer(WristScene.by_name(CURL, rig, cameras, hand, SEED), name)
-    images = [renderer.render(CURL_S + k / camera.frame_rate_hz, STROBE[k % 3]) for k in range(3 * COUNT)]
+    renderer = WristRenderer(WristScene.by_name(CURL, rig, cameras, hand, 7), name)
+    curl_s = 0.5  # begins where fingers bend
+    images = [renderer.render(curl_s + k / camera.frame_rate_hz, STROBE[k % 3]) for k in range(3 * COUNT)]
     return StrobedFrames(rig, camera, hand, images)
 
 
@@ -59,8 +57,9 @@ def with_second_hand(six: MarkedFrames) -> MarkedFrames:
         low, high = ranges[name].hsv_low, ranges[name].hsv_high
         hue = (low[0] + high[0]) // 2 if low[0] <= high[0] else 0
         second[f"{name}2"] = (hue, 200, 250)
-        first_high = (high[0], 255, SECOND_VALUE - 1)
-        second_low = (low[0], low[1], SECOND_VALUE)
+        second_value = 236  # HSV value from which a colour is the second hand's
+        first_high = (high[0], 255, second_value - 1)
+        second_low = (low[0], low[1], second_value)
         ranges[f"{name}2"] = msgspec.structs.replace(ranges[name], hsv_low=second_low, hsv_high=high)
         ranges[name] = msgspec.structs.replace(ranges[name], hsv_high=first_high)
     camera = msgspec.structs.replace(six.camera, markers=ranges)

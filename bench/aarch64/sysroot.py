@@ -1,4 +1,4 @@
-"""What emulation needs, made once under out/aarch64: Debian's aarch64 Python, the pinned wheels, QEMU and its plugin.
+"""What emulation needs, made once under out/aarch64: Debian's aarch64 Python, wheels, QEMU, its plugin.
 
 Nothing is installed and nothing needs root: Debian's packages are unpacked, not set up. QEMU comes from the same
 suite, whatever the machine has: one version counts for all, and since Debian 13 qemu-user loads no plugins.
@@ -71,9 +71,7 @@ def missing() -> list[str]:
 def prepare(notify: Callable[[str], None]) -> Sysroot:
     """Make what is not there yet; of several that call at once, one makes it and the others wait.
 
-    Raises:
-        NoNetworkError: Debian's mirror or the registry of wheels cannot be reached.
-        NotPossibleError: A tool is missing, or fails.
+    NotPossibleError: a tool is missing or fails; NoNetworkError: a mirror or registry cannot be reached.
     """
     if absent := missing():
         raise NotPossibleError(
@@ -139,12 +137,7 @@ def _debian(architecture: str, packages: tuple[str, ...], notify: Callable[[str]
 
 
 def fast_wheels(notify: Callable[[str], None]) -> Path:
-    """The folder of the extra `fast`, 200 MB, made if it is not there; beside what `prepare` made.
-
-    Raises:
-        NoNetworkError: The registry of wheels cannot be reached.
-        NotPossibleError: A tool fails.
-    """
+    """Make the folder of the extra `fast` (200 MB) if it is not there; errors as of `prepare`."""
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         return _made(

@@ -1,40 +1,174 @@
-"""One hand of markers and wrist device against each sensor alone, and with either stream gone and back; exact truth.
+"""One hand of markers and wrist device against each sensor alone, on the same messages, by exact truth.
 
-The same messages go to three pipelines: of both, of the marker rig, of the wrist device. The latter knows no place: its
-hand is put where the wrist joint truly is, turned as the palm truly is. *Better* is the sensor with the smaller error,
-each compared over what it and the fused hand call valid (`bench.both.score`).
-
-    python -m bench fusion                              every scene, rendered and detected
-    python -m bench fusion grasp --seconds 13 --quick   some scenes, with messages made of truth
-    python -m bench fusion --picture docs/images/fusion.png
+Each scene is rendered and detected, and solved by three pipelines: of both sensors, of the marker rig, of the wrist
+device. The latter knows no place: its hand is put where the wrist joint truly is, turned as the palm truly is. *Better*
+is the sensor with the smaller error, each compared over what it and the fused hand call valid (`ratios`).
 """
 
-import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from bench.both.scene import SCENES, Both, Shown
-from bench.both.score import ABOUT_S, Figures, Ratios, Sighted, ratios
-from bench.both.shown import shown_of
-from bench.both.solved import RejectedPeer, Solved, solve
-from bench.both.watched import watched
-from bench.report import Row, figure, show
-from common.arrays import Float
-from common.hand.model import FINGERS
+from bench.both.scene import SCENES, Both, Shown, Solved, solve, watched
+from bench.report import REGION, Row
+from common.arrays import Bool, Float, Int
+from common.hand.model import CHAINS, FINGERS
 from master.rig.setup import RigSetup
+
+_FINGERS = 5
+_PALM_JOINTS = np.setdiff1d(np.arange(26), CHAINS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighted:
+    """What is truly in sight at the instants of poses (N,)."""
+
+    cameras: Int  # (N, M) marker cameras that have each marker in sight
+    worn: Bool  # (N, 5) whether the wrist device has laser line or tip of each finger in sight
+    hidden: Bool  # (N, 5) whether fewer than two cameras have the finger's marker in sight
+    oriented: Bool  # (N,) whether an IMU tells of the palm
+    strapped: bool  # there are no markers: the palm is where the device's strap has it
+    hand_over: Bool  # (N, 5) whether what is in sight of the finger changed within half a second
+
+    @classmethod
+    def of(cls, shown: Shown, solved: Solved) -> Self:
+        """Of a pipeline's poses: what its own sensors have in sight."""
+        t_s, sight = solved.t_s, shown.line_of_sight
+        about_s = 0.04  # a frame and a bit of every sensor: what was in sight then tells of a pose
+        seen = sight.cameras_of(t_s, about_s)
+        cameras = seen if solved.markers else np.zeros_like(seen)
+        worn = sight.worn(t_s, about_s) & solved.wrist
+        oriented = np.full(len(t_s), solved.wrist)
+        by = np.concatenate([cameras[:, :_FINGERS] >= 2, worn], axis=1)
+        changed = np.zeros(by.shape, np.int64)
+        changed[1:] = by[1:] != by[:-1]
+        total = np.concatenate([np.zeros((1, by.shape[1]), np.int64), np.cumsum(changed, axis=0)])
+        hand_over_s = 0.5
+        first, last = (np.searchsorted(t_s, t_s + way * hand_over_s) for way in (-1.0, 1.0))
+        near = total[last] > total[first]
+        over = near[:, :_FINGERS] | near[:, _FINGERS:]
+        return cls(cameras, worn, seen[:, :_FINGERS] < 2, oriented, not solved.markers, over)
+
+    @property
+    def observed(self) -> Bool:
+        """(N, 26) which joints something measures.
+
+        A finger's chain: its marker is in sight of a camera, or its laser line or tip of the wrist device. The palm's:
+        three markers are in sight of a camera, or the one on the back and another, or any and an IMU.
+        """
+        seen = self.cameras >= 1
+        count = seen.sum(axis=1)
+        out = np.zeros((len(seen), 26), np.bool_)
+        palm = (count >= 3) | (seen[:, _FINGERS] & (count >= 2)) | ((count >= 1) & self.oriented)
+        out[:, _PALM_JOINTS] = palm[:, None] | self.strapped
+        out[:, CHAINS] = (seen[:, :_FINGERS] | self.worn)[:, :, None]
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What a pipeline reached in a scene."""
+
+    joint_mm: float  # mean error of all valid joints
+    fingers_mm: float  # of those beyond the knuckles, were the palm where it truly is
+    pip_deg: tuple[float, ...]  # mean error of the PIP of thumb (its MCP) ... little, where valid
+    four_deg: float  # the same of the four fingers together
+    hidden_deg: float  # the same while the finger's marker is in sight of fewer than two cameras
+    valid: float  # share of joints
+    tracked: float  # share of joints
+    inside: float  # share of valid joints in their 95 % region
+    inside_hand_over: float  # the same of fingers near a hand-over
+    step_mm: float  # largest step beyond the truth's own
+    over_step: float  # steps of a pose's worst joint above 5 mm, per minute
+    false_tracked: float  # share of poses with a TRACKED bit that nothing measures, or that is 20 mm off
+    unseen: float  # share of tracked bits that nothing measures
+    off: float  # share of tracked bits that are 20 mm off
+    hz: float  # poses per second
+
+    @classmethod
+    def of(cls, solved: Solved, sighted: Sighted) -> Self:
+        """Reckon them."""
+        off, pip, joint_chi2, steps = solved.off_mm, solved.pip_deg, solved.joint_chi2, solved.steps_mm
+        tracked = solved.poses.tracked
+        unseen = tracked & ~sighted.observed
+        off_m = 0.020  # a joint that is tracked may not be farther off
+        far = tracked & (np.linalg.norm(solved.poses.position_m - solved.truth_m, axis=2) > off_m)
+        bits = max(int(tracked.sum()), 1)
+        near = np.zeros(joint_chi2.shape, np.bool_)
+        near[:, CHAINS - 1] = sighted.hand_over[:, :, None]
+        span_s = float(solved.t_s[-1] - solved.t_s[0])
+        worst = _most(steps)
+        step_mm = 5.0
+        return cls(
+            joint_mm=_mean(off),
+            fingers_mm=_mean(solved.fingers_mm),
+            pip_deg=tuple(_mean(pip[:, f]) for f in range(_FINGERS)),
+            four_deg=_mean(pip[:, 1:]),
+            hidden_deg=_mean(np.where(sighted.hidden, pip, np.nan)[:, 1:]),
+            valid=float(solved.poses.valid[:, 1:].mean()),
+            tracked=float(tracked[:, 1:].mean()),
+            inside=_inside(joint_chi2),
+            inside_hand_over=_inside(np.where(near, joint_chi2, np.nan)),
+            step_mm=float(worst.max(initial=0.0)),
+            over_step=60.0 * float((worst > step_mm).sum()) / span_s,
+            false_tracked=float((unseen | far).any(axis=1).mean()),
+            unseen=float(unseen.sum()) / bits,
+            off=float(far.sum()) / bits,
+            hz=(len(solved.t_s) - 1) / span_s,
+        )
+
+
+class Ratios(NamedTuple):
+    """Mean error of the fused hand by that of a sensor alone: joints, fingers in a true palm, PIP of four fingers."""
+
+    joints: float
+    fingers: float
+    pip: float
+
+
+def _mean(values: Float) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _inside(joint_chi2: Float) -> float:
+    known = joint_chi2[np.isfinite(joint_chi2)]
+    return float((known < REGION).mean()) if known.size else float("nan")
+
+
+def _most(steps_mm: Float) -> Float:
+    """(N,) the worst of each row; 0 where there is none."""
+    return np.nan_to_num(steps_mm, nan=0.0).max(axis=1, initial=0.0)
+
+
+def ratios(fused: Solved, alone: Solved) -> Ratios:
+    """Over the joints, fingers and instants that both call valid."""
+    place = np.clip(np.searchsorted(fused.poses.t_ns, alone.poses.t_ns), 1, len(fused.t_s) - 1)
+    before = fused.poses.t_ns[place] - alone.poses.t_ns > alone.poses.t_ns - fused.poses.t_ns[place - 1]
+    place = place - before
+    together_ns = 17_000_000  # poses of two pipelines are compared that are no farther apart
+    near = np.abs(fused.poses.t_ns[place] - alone.poses.t_ns) <= together_ns
+    return Ratios(
+        *(
+            _ratio(np.where(near[:, None], ours[place], np.nan), theirs)
+            for ours, theirs in (
+                (fused.off_mm, alone.off_mm),
+                (fused.fingers_mm, alone.fingers_mm),
+                (fused.pip_deg[:, 1:], alone.pip_deg[:, 1:]),
+            )
+        )
+    )
+
+
+def _ratio(ours: Float, theirs: Float) -> float:
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    return float(ours[both].mean() / theirs[both].mean()) if both.any() else float("nan")
+
 
 Kind = Literal["fused", "markers", "wrist"]
 KINDS: tuple[Kind, ...] = ("fused", "markers", "wrist")
-_SECONDS, _CUT_SECONDS, _SEED = 24.0, 60.0, 41
-_CUT = ("both-travel", "both-poses")
-_WORSE, _GAIN = 1.05, 0.25  # never worse than the better by more, and in the mean better by at least so much
-_COLOURS: dict[Kind, str] = {"fused": "#14507a", "markers": "#b0473a", "wrist": "#e0a030"}
-_ROUND_S = 14.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,16 +180,15 @@ class Outcome:
     figures: dict[Kind, Figures]
 
     @classmethod
-    def of(cls, shown: Shown, kinds: Sequence[Kind] = KINDS, away: RejectedPeer | None = None) -> "Outcome":
-        """Solve and judge the scene with these pipelines, with streams cut off if asked."""
+    def of(cls, shown: Shown) -> "Outcome":
+        """Solve and judge the scene with every pipeline."""
         both = shown.both
         setups: dict[Kind, RigSetup] = {"fused": both.fused, "markers": both.markers, "wrist": both.wrist}
-        messages = shown.messages if away is None else away.left(shown.messages)
         solved: dict[Kind, Solved] = {}
         figures: dict[Kind, Figures] = {}
-        for kind in kinds:
-            solved[kind] = Solved.of(both, solve(setups[kind], messages), setups[kind])
-            figures[kind] = Figures.of(solved[kind], Sighted.of(shown, solved[kind], away))
+        for kind in KINDS:
+            solved[kind] = Solved.of(both, solve(setups[kind], shown.messages), setups[kind])
+            figures[kind] = Figures.of(solved[kind], Sighted.of(shown, solved[kind]))
         return cls(shown, solved, figures)
 
     @property
@@ -65,41 +198,26 @@ class Outcome:
         return Ratios(*(float(max(pair)) for pair in zip(*each, strict=True)))
 
 
-def rows(
-    scenes: Sequence[str] = SCENES,
-    cut: Sequence[str] = _CUT,
-    seconds: float = _SECONDS,
-    seed: int = _SEED,
-    *,
-    quick: bool = False,
-) -> Iterator[Row]:
-    """Measure scenes, their comparison, and some with streams cut off."""
-    make = shown_of if quick else watched
+def rows() -> Iterator[Row]:
+    """Measure each scene, and the fused hand against the better sensor."""
     each: dict[str, Ratios] = {}
-    for name in scenes:
-        found = Outcome.of(make(Both.of(name, seed), seconds))
+    seconds, seed = 13.0, 41
+    for name in SCENES:
+        found = Outcome.of(watched(Both.of(name, seed), seconds))
         each[name] = found.ratios
         yield from _scene(name, found.figures)
-    for what, field in (("joints", "joints"), ("fingers", "fingers"), ("PIP", "pip")):
-        values = {name: cast(float, getattr(one, field)) for name, one in each.items()}
-        for name, value in values.items():
-            yield Row(f"{name}: fused / better alone, {what}", value, "x", f"goal {_WORSE} or less")
-        if values:
-            gain = 100.0 * (1.0 - float(np.mean(list(values.values()))))
-            note = f"goal {100 * _GAIN:.0f} or more"
-            yield Row(f"fused better than the better alone, {what}, mean", gain, "%", note)
-    for name in cut:
-        figures = Outcome.of(make(Both.of(name, seed), _CUT_SECONDS), KINDS[:1], RejectedPeer()).figures
-        yield from _scene(f"{name}, one of both cut off for a second, every two", figures)
+    for what, place in (("joints", 0), ("fingers", 1), ("PIP", 2)):
+        for name, one in each.items():
+            yield Row(f"{name}: fused / better alone, {what}", one[place], "x", "goal 1.05 or less")
+        gain = 100.0 * (1.0 - float(np.mean([one[place] for one in each.values()])))
+        yield Row(f"fused better than the better alone, {what}, mean", gain, "%", "goal 25 or more")
 
 
 def _scene(name: str, figures: Mapping[Kind, Figures]) -> Iterator[Row]:
     ours = figures["fused"]
 
     def row(what: str, field: str, unit: str, note: str = "", times: float = 1.0) -> Row:
-        alone = (
-            f"{kind} {times * getattr(figures[kind], field):.1f}" for kind in KINDS[1:] if kind in figures
-        )
+        alone = (f"{kind} {times * getattr(figures[kind], field):.1f}" for kind in KINDS[1:])
         return Row(
             what, times * getattr(ours, field), unit, "; ".join(filter(None, (", ".join(alone), note)))
         )
@@ -120,82 +238,3 @@ def _scene(name: str, figures: Mapping[Kind, Figures]) -> Iterator[Row]:
         "  largest step beyond the truth's", "step_mm", "mm", f"{ours.over_step:.1f} over 5 mm a minute"
     )
     yield row("  poses with a false TRACKED bit", "false_tracked", "%", why, 100.0)
-
-
-def picture(file: Path, seconds: float = _SECONDS) -> None:
-    """Draw errors of PIP and joints by scene, fused and alone, and a grasp in time."""
-    found = {name: Outcome.of(watched(Both.of(name, _SEED), seconds)) for name in SCENES}
-    made = figure(11.0, 6.4)
-    grid = made.add_gridspec(2, 2)
-    titles = {
-        "four_deg": "mean PIP error [°]",
-        "joint_mm": "mean joint error [mm]; wrist: placed by the truth",
-    }
-    for column, (field, title) in enumerate(titles.items()):
-        axes = made.add_subplot(grid[0, column])
-        for k, kind in enumerate(KINDS):
-            values = [cast(float, getattr(one.figures[kind], field)) for one in found.values()]
-            bars = axes.bar(np.arange(len(found)) + 0.27 * (k - 1), values, 0.25, color=_COLOURS[kind])
-            axes.bar_label(bars, fmt="%.1f", fontsize=7)
-        axes.set_xticks(np.arange(len(found)), list(found), fontsize=8)
-        axes.set_title(title, fontsize=9)
-        axes.spines[["top", "right"]].set_visible(False)
-    below = made.add_subplot(grid[1, :])
-    _course(below, found["grasp"])
-    made.legend(*below.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
-    made.savefig(file)
-
-
-def _course(axes: Axes, found: Outcome) -> None:
-    """Mean PIP error of the four fingers through the first round, and when no two cameras see them."""
-    until_s = min(_ROUND_S, found.shown.seconds)
-    for kind in reversed(KINDS):
-        one = found.solved[kind]
-        early = one.t_s < until_s
-        four = one.pip_deg[early, 1:]
-        known = np.isfinite(four)
-        mean = np.where(known, four, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        mean = np.where(known.any(axis=1), mean, np.nan)
-        name = kind if kind == "fused" else f"{kind} alone"
-        axes.plot(one.t_s[early], mean, color=_COLOURS[kind], linewidth=1.4, label=name)
-    t_s: Float = np.arange(0.0, until_s, 0.02)
-    hidden = (found.shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
-    shade = axes.twinx()
-    shade.fill_between(t_s, hidden, step="mid", color="#bbbbbb", alpha=0.4, linewidth=0.0)
-    shade.set_ylim(0.0, 1.0)
-    shade.set_yticks([0.0, 1.0], ["0", "all"], fontsize=8)
-    shade.set_ylabel("fingers that no two cameras see", fontsize=8)
-    axes.fill_between([], [], color="#bbbbbb", alpha=0.4, label="hidden from the cameras")
-    axes.set_zorder(shade.get_zorder() + 1)
-    axes.patch.set_visible(False)
-    axes.set_xlim(1.0, until_s)
-    axes.set_ylim(0.0, None)
-    axes.set_xlabel("grasp: reach, close, lift, turn, put back, release [s]", fontsize=9)
-    axes.set_ylabel("PIP error, mean of four fingers [°]", fontsize=8)
-    axes.grid(alpha=0.25)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Print the rows of some scenes."""
-    keep = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m bench fusion", description=__doc__, formatter_class=keep)
-    parser.add_argument(
-        "scenes", nargs="*", metavar="SCENE", help=f"default: {' '.join(SCENES)}, and both cuts"
-    )
-    parser.add_argument(
-        "--cut", nargs="*", default=[], metavar="SCENE", help="these with streams cut off as well"
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=_SECONDS, help="of the scenes; those cut off last a minute"
-    )
-    parser.add_argument("--seed", type=int, default=_SEED)
-    parser.add_argument(
-        "--quick", action="store_true", help="messages made of truth instead of rendered frames"
-    )
-    given = parser.parse_args(arguments)
-    scenes = given.scenes or (() if given.cut else SCENES)
-    show(
-        rows(
-            scenes, given.cut or (() if given.scenes else _CUT), given.seconds, given.seed, quick=given.quick
-        )
-    )

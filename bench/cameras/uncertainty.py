@@ -1,7 +1,6 @@
 """Do the covariances of markers hold? Rendered hands, the real detector and the whole line, against exact truth.
 
-The master's profile is not that of the rendered hand: each radius is off by a tenth (standard deviation), as a
-measured one would be.
+The master's profile has each radius off by a tenth (standard deviation), as a measured one would.
 """
 
 from collections.abc import Iterator
@@ -24,9 +23,6 @@ from master.rig.setup import RigSetup, load_setup
 from master.run.app import StageTimes
 from slave.markers.detector import MarkerDetector
 
-_WHOLE = 0.97  # of a cap visible in both cameras; less is partly hidden
-_SETTLED_S = 0.4  # after this a held hand is still for tracks and tracker too
-_RADIUS = 0.1
 STILL, SCENE, SIDEWAYS = "still", "standard scene", "sideways, 1 m/s"
 _SECONDS = {STILL: 12.0, SCENE: 15.0, SIDEWAYS: 2.0}
 _SEEDS = (11, 12, 13, 14, 15, 16)  # each is another hand, as far as radii go; settings were fitted to 1 to 8
@@ -68,13 +64,12 @@ class _Sideways:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scored:
-    """Triangulated markers: squared error in units of covariance (N,), error (N,) [m], marker (N,) row, visible
-    share (N,) in the camera that sees less of it."""
+    """Triangulated markers (N,)."""
 
-    nees: Float
+    nees: Float  # squared error in units of covariance
     error_m: Float
-    marker: Float
-    visible: Float
+    marker: Float  # row
+    visible: Float  # share in the camera that sees less of it
 
 
 def rows() -> Iterator[Row]:
@@ -84,7 +79,7 @@ def rows() -> Iterator[Row]:
     for kind in _SECONDS:
         found = _joined([scored(setup, profile, kind, seed) for seed in _SEEDS])
         every.append(found)
-        whole = found.visible > _WHOLE
+        whole = found.visible > 0.97  # in both cameras; less is partly hidden
         q50, q95 = np.quantile(found.nees, [0.5, 0.95])
         middle_mm = 1e3 * np.median(found.error_m[whole])
         note = f"chi square median {q50:.2g} (2.4), 95 % {q95:.3g} (7.8), error median {middle_mm:.2f} mm"
@@ -119,7 +114,8 @@ def scored(setup: RigSetup, profile: HandProfile, kind: str, seed: int) -> Score
     messages, visible = _seen(scene, _SECONDS[kind])
     poses = [solved.pose for message in messages for solved in pipeline.push(message)][5:]
     if kind == STILL:
-        poses = [p for p in poses if _SETTLED_S < p.t_ns * 1e-9 % (HOLD_S + MOVE_S) < HOLD_S - 0.05]
+        settled_s = 0.4  # after this a held hand is still for tracks and tracker too
+        poses = [p for p in poses if settled_s < p.t_ns * 1e-9 % (HOLD_S + MOVE_S) < HOLD_S - 0.05]
     return _compared(poses, scene, visible)
 
 
@@ -127,7 +123,7 @@ def _measured(profile: HandProfile, seed: int) -> HandModel:
     """The hand as somebody with a calliper has it."""
     rng, typical = np.random.default_rng(seed), HandModel.of(profile).radius_m[1:].tolist()
     radii = profile.radius_m or dict(zip(profile.rest_joints, typical, strict=True))
-    wrong = {name: float(r * rng.normal(1.0, _RADIUS)) for name, r in radii.items()}
+    wrong = {name: float(r * rng.normal(1.0, 0.1)) for name, r in radii.items()}
     return HandModel.of(msgspec.structs.replace(profile, radius_m=wrong))
 
 

@@ -1,53 +1,144 @@
 """Pinch, dial, taps and pointing of the scene `gestures`, and false ones of hands that make none; exact truth.
 
-Rendered frames of a marker rig go through the slaves' detectors and the master to the recogniser; `--exact` leaves out
-all of that and gives it the true hand, so that only the recogniser's own errors remain. An event is late by how long
-after the truth's (`bench.gestures.truth`) it is recognised, in frames of 60 Hz; one that nobody made is false. The
-recordings `leapjs` make no gesture; they are the truth, played by our hand. MARKER_RIG+WRIST_RIG is the fused hand.
-
-    python -m bench gestures --rigs desk-back3 desk4 --seeds 1 2 --seconds 75
-    python -m bench gestures --rigs desk-back3+wrist-back3 --seeds 7 --seconds 29
-    python -m bench gestures --exact --leap wave three-claps
-    python -m bench gestures --rigs wrist --seeds --leap wave three-claps    a wrist device alone, messages of truth
+Rendered frames of a marker rig go through the slaves' detectors and the master to the recogniser. The truth is the
+geometry of the true hand alone: a pinch or a touch is a gap between skins below a threshold; a knob is gripped while no
+tip is farther in or out than it may be from where it is when the knob begins to turn; a finger points while its true
+bends show it. Thresholds and holds are those of the settings. An event is late by how long after the truth's it is
+recognised, in frames of 60 Hz; one that nobody made is false. The recordings `leapjs` make no gesture; they are the
+truth, played by our hand, as they are and before a wrist device.
 """
 
-import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.both.scene import Both
-from bench.both.shown import shown_of
-from bench.both.solved import solve as solve_both
-from bench.both.watched import watched
-from bench.gestures.recognised import pose_of
-from bench.gestures.truth import GestureTruth
+from bench.both.scene import Both, shown_of, watched
+from bench.both.scene import solve as solve_both
+from bench.gestures.poses import pose_of
 from bench.played import START_NS, solve, times_of, watch
-from bench.report import CALIBRATION, Row, datasets, show
+from bench.report import CALIBRATION, Row, datasets
+from common.arrays import Bool, Float
 from common.calibration.gesture_settings import GestureSettings, default_gestures
 from common.geometry.transforms import matrix_to_quaternion
-from common.hand.model import HandModel
+from common.hand.model import CHAINS, FINGERS, TIPS, HandModel
+from common.hand.skin import TaperedCapsules, gaps_between
 from common.messages import Gesture, HandPose
-from common.sim.gestures import Gestures
+from common.sim.gestures import Annotation, Gestures
 from common.sim.motion import HandMotion
 from common.sim.scenes import scene_by_name
 from master.gestures.poses import GestureRecogniser
 from master.rig.setup import RigSetup, load_setup
 
+_FINE_HZ = 240.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrueEvent:
+    """One true event: kind and name as of a Gesture, and when it begins and ends [s]."""
+
+    kind: str
+    name: str
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GestureTruth:
+    """The true hand over T instants."""
+
+    motion: Gestures  # the scene's
+    t_s: Float  # (T,) [s]
+    joints_m: Float  # (T, 26, 3) [m]
+    pinch_m: Float  # (T, 4) [m] between the last segments of the thumb and each finger
+    key_m: Float  # (T, 4) [m] between the last segment of the thumb and the nearest of each finger
+    events: tuple[TrueEvent, ...]  # all within these times
+
+    @classmethod
+    def of(
+        cls, motion: Gestures, model: HandModel, settings: GestureSettings, seconds: float
+    ) -> "GestureTruth":
+        """The first `seconds` of a scene."""
+        t = np.arange(round(seconds * _FINE_HZ)) / _FINE_HZ
+        states = [motion.at(float(s)) for s in t]
+        joints = model.forward(
+            np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
+        ).position_m
+        capsules = TaperedCapsules.of_segments(joints, model.radius_m)
+        gap = gaps_between(
+            capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3))
+        ).gap_m
+        seen = cls(motion, t, joints, gap[..., 2], gap.min(axis=-1), ())
+        annotations = (seen._event(one, settings) for one in motion.annotations if one.stop_s < seconds - 1.0)
+        return cls(
+            motion, t, joints, seen.pinch_m, seen.key_m, tuple(one for one in annotations if one is not None)
+        )
+
+    def pinch_at(self, t_s: float, finger: str) -> float:
+        """The true gap [m] of a pinch of a finger."""
+        return float(np.interp(t_s, self.t_s, self.pinch_m[:, FINGERS.index(finger) - 1]))
+
+    def ray_at(self, t_s: float) -> Float:
+        """The true direction (3,) from the knuckle to the tip of the index finger."""
+        joints = self.joints_m[min(round(t_s * _FINE_HZ), len(self.t_s) - 1)]
+        way = joints[CHAINS[1, 3]] - joints[CHAINS[1, 0]]
+        return way / np.linalg.norm(way)
+
+    def _event(self, annotations: Annotation, settings: GestureSettings) -> TrueEvent | None:
+        inside = (self.t_s >= annotations.start_s) & (self.t_s <= annotations.stop_s)
+        before = after = 0.0
+        if annotations.kind == "pinch":
+            gap = self.pinch_m[:, FINGERS.index(annotations.name) - 1]
+            begun, going = gap <= settings.pinch.begin_gap_m, gap <= settings.pinch.end_gap_m
+        elif annotations.kind == "tap":
+            begun = going = self.key_m.min(axis=1) <= settings.tap.touch_gap_m
+        elif annotations.kind == "dial":
+            begun, going = self._gripped(annotations, settings)
+            before, after = settings.dial.hold_s, settings.dial.regrip_s
+        else:
+            begun, going = self._points(settings)
+            before = after = settings.point.hold_s
+        first, last = np.flatnonzero(begun & inside), np.flatnonzero(going & inside)
+        if not len(first) or not len(last):
+            return None
+        begin_s, end_s = float(self.t_s[first[0]]) + before, float(self.t_s[last[-1]]) + after
+        return TrueEvent(annotations.kind, annotations.name, begin_s, end_s)
+
+    def _gripped(self, annotations: Annotation, settings: GestureSettings) -> tuple[Bool, Bool]:
+        """Whether the tips are about the knob (T,), and whether they have not let it go (T,)."""
+        rotated = np.array([self.motion.dial_rad(float(t)) for t in self.t_s])
+        start = int(np.searchsorted(self.t_s, annotations.start_s))
+        rotations = start + int(np.argmax(np.abs(rotated[start:] - rotated[start]) > 1e-6))
+        tips = self.joints_m[:, TIPS]
+        away = np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=-1)
+        off = away - away[rotations]
+        held = np.abs(off).max(axis=1) <= settings.dial.still_m
+        across = np.linalg.norm(tips[:, 0] - tips[:, 1:].mean(axis=1), axis=-1)
+        return held, 0.5 * np.abs(across - across[rotations]) <= settings.dial.open_m
+
+    def _points(self, settings: GestureSettings) -> tuple[Bool, Bool]:
+        """Whether the index finger points (T,), and with the slack of one that has begun to (T,)."""
+        bone = np.diff(self.joints_m[:, CHAINS[1:]], axis=2)
+        bone = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+        bend = np.arccos(np.clip(np.vecdot(bone[:, :, :-1], bone[:, :, 1:]), -1.0, 1.0)).sum(axis=-1)
+        own = settings.point
+
+        def shape(slack: float) -> Bool:
+            return (bend[:, 0] <= own.stretched_rad + slack) & (bend[:, 1:] >= own.bent_rad - slack).all(
+                axis=1
+            )
+
+        return shape(0.0), shape(own.slack_rad)
+
+
 RATE_HZ = 60.0
-_FUSED, _WRIST_PEOPLE = "desk-back3+wrist-back3", "wrist"
 _SILENT = ("wave", "HandSplay-110fps", "rollAndPitchWithEntry", "three-claps", "confidence-demo")
-_NEAR_S = 0.3  # a recognised event farther from a true one is another
 _KINDS = ("pinch", "dial", "tap", "point")
 
 
 @dataclass(slots=True)
 class Score:
-    """Recognised gestures of one scene, or of several: late [frames] by kind and phase, errors, counts by kind.
-
-    `jitter_deg`: of the pointing ray from pose to pose, against the truth's.
-    """
+    """Recognised gestures of one scene or several: late [frames] by kind and phase, errors, counts by kind."""
 
     late: dict[str, list[float]] = field(default_factory=lambda: dict[str, list[float]]())
     made: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
@@ -56,6 +147,7 @@ class Score:
     pinch_mm: list[float] = field(default_factory=lambda: list[float]())
     dial_deg: list[float] = field(default_factory=lambda: list[float]())
     ray_deg: list[float] = field(default_factory=lambda: list[float]())
+    # Of the pointing ray from pose to pose.
     jitter_deg: list[float] = field(default_factory=lambda: list[float]())
 
     def add(self, found: Sequence[Gesture], truth: GestureTruth) -> None:
@@ -66,7 +158,7 @@ class Score:
             at_s = event.end_s if event.kind == "tap" else event.begin_s
             same = [one for one in free if (one.kind, one.name) == (event.kind, event.name)]
             first = min(same, key=lambda one: abs(_s(one.t_ns) - at_s), default=None)
-            if first is None or abs(_s(first.t_ns) - at_s) > _NEAR_S:
+            if first is None or abs(_s(first.t_ns) - at_s) > 0.3:  # farther away it is another
                 self.missed[event.kind] += 1
                 continue
             free.remove(first)
@@ -131,47 +223,38 @@ class Score:
 
 def rows() -> Iterator[Row]:
     """Measure two marker rigs, the fused hand, and the silent recordings, true and before a wrist device."""
-    for rig in ("desk-back3", "desk4"):
-        yield from scored(rig, (1,), 75.0, exact=False).rows(rig)
-    yield from scored(_FUSED, (7,), 29.0, exact=False).rows(_FUSED)
-    yield from silent(_SILENT, None, 60.0).rows("silent, true hands")
-    yield from silent(_SILENT, _WRIST_PEOPLE, 25.0).rows("silent, wrist device alone")
+    for marked in ("desk-back3", "desk4"):
+        yield from scored(marked, None, 1, 75.0).rows(marked)
+    yield from scored("desk-back3", "wrist-back3", 7, 29.0).rows("desk-back3+wrist-back3")
+    yield from silent(_SILENT, worn=False, seconds=60.0).rows("silent, true hands")
+    yield from silent(_SILENT, worn=True, seconds=25.0).rows("silent, wrist device alone")
 
 
-def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Score:
-    """Score the scene of several seeds before a marker rig, or MARKER_RIG+WRIST_RIG."""
-    settings, score = default_gestures(), Score()
-    for seed in seeds:
-        marked, _, worn = rig.partition("+")
-        setup = load_setup(CALIBRATION, marked)
-        scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, seed)
-        assert isinstance(scene.motion, Gestures)
-        truth = GestureTruth.of(scene.motion, scene.model, settings, min(seconds, scene.period_s))
-        if exact:
-            poses: Iterable[HandPose] = true_poses(scene.motion, scene.model, seconds)
-        elif worn:
-            shown = watched(Both.of("gestures", seed, rigs=(marked, worn)), seconds)
-            poses = solve_both(shown.both.fused, shown.messages)
-        else:
-            poses = seen_poses(setup, "gestures", seed, seconds)
-        score.add(recognised(poses, scene.model, settings), truth)
+def scored(marked: str, worn: str | None, seed: int, seconds: float) -> Score:
+    """Score the scene before a marker rig, and a wrist device if there is one."""
+    settings, score, setup = default_gestures(), Score(), load_setup(CALIBRATION, marked)
+    scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, seed)
+    assert isinstance(scene.motion, Gestures)
+    truth = GestureTruth.of(scene.motion, scene.model, settings, min(seconds, scene.period_s))
+    if worn is not None:
+        shown = watched(Both.of("gestures", seed, rigs=(marked, worn)), seconds)
+        poses = solve_both(shown.both.fused, shown.messages)
+    else:
+        poses = seen_poses(setup, "gestures", seed, seconds)
+    score.add(recognised(poses, scene.model, settings), truth)
     return score
 
 
-def silent(names: Sequence[str], rig: str | None, seconds: float) -> Score:
-    """Score recorded hands that make no gesture, each for so long: as they truly are, or before a rig."""
-    settings, score = default_gestures(), Score()
+def silent(names: Sequence[str], *, worn: bool, seconds: float) -> Score:
+    """Score recorded hands that make no gesture, each for so long: as they truly are, or before a wrist device."""
+    settings, score, setup = default_gestures(), Score(), load_setup(CALIBRATION, "desk-back3")
     for name in names:
-        setup = load_setup(CALIBRATION, "desk-back3" if rig in (None, _WRIST_PEOPLE) else rig)
         scene = f"leap:{datasets() / 'leapjs' / name}.npz"
         made = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, 1)
-        if rig is None:
-            poses: Iterable[HandPose] = true_poses(made.motion, made.model, seconds)
-        elif rig == _WRIST_PEOPLE:
+        poses: Iterable[HandPose] = true_poses(made.motion, made.model, seconds)
+        if worn:
             shown = shown_of(Both.of(scene, 1), seconds)
             poses = solve_both(shown.both.wrist, shown.messages)
-        else:
-            poses = seen_poses(setup, scene, 1, seconds)
         score.add_silent(recognised(poses, made.model, settings))
     return score
 
@@ -199,23 +282,3 @@ def true_poses(motion: HandMotion, model: HandModel, seconds: float) -> Iterator
 
 def _s(t_ns: int) -> float:
     return (t_ns - START_NS) * 1e-9
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Print the rows of some rigs and recordings."""
-    keep = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m bench gestures", description=__doc__, formatter_class=keep)
-    parser.add_argument("--rigs", nargs="*", default=["desk-back3"], metavar="RIG")
-    parser.add_argument("--seeds", nargs="*", type=int, default=[1], metavar="N")
-    parser.add_argument("--seconds", type=float, default=75.0)
-    parser.add_argument("--exact", action="store_true", help="the true hand instead of rendered frames")
-    parser.add_argument(
-        "--leap", nargs="*", default=[], metavar="NAME", help="recordings that make no gesture"
-    )
-    options = parser.parse_args(arguments)
-    for rig in options.rigs:
-        if options.seeds:
-            show(scored(rig, options.seeds, options.seconds, exact=options.exact).rows(rig))
-        if options.leap:
-            found = silent(options.leap, None if options.exact else rig, options.seconds)
-            show(found.rows(f"{rig}, silent"))

@@ -1,8 +1,7 @@
 """Do the covariances of joints hold? Exact motions, markers with the claimed noise, fingers hidden, hands lost.
 
-The 95 % region of a joint is where chi square with three degrees of freedom stays below 7.8. A joint counts as
-*visible* while its finger's marker is seen (those of the palm: while three markers are), as *hidden* for the first
-300 ms without, as *lost* after half a second, and a whole hand as *gone* while no marker is seen and it is still valid.
+A joint counts as *visible* while its finger's marker is seen (those of the palm: while three markers are), as *hidden*
+for the first 300 ms without, as *lost* after half a second; a hand as *gone* while no marker is seen and it is valid.
 """
 
 from collections.abc import Iterator
@@ -12,8 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bench.hands.draws import BACK, EDGE_ON, MARKERS
-from bench.hands.point_hand import TOWARDS, PointHand
+from bench.hands.draws import BACK, EDGE_ON, MARKERS, TOWARDS, PointHand
 from bench.played import HeldPoses, solve, times_of, times_of_poses, watch
 from bench.report import CALIBRATION, Row, datasets, inside, rms, skipped
 from common.arrays import Bool, Float
@@ -28,14 +26,10 @@ HAND = CALIBRATION / "hands/default-right.json"
 NOISE_M = {"1 mm": (1e-3, 1e-3, 1e-3), "depth 4.5 mm": (0.3e-3, 0.3e-3, 4.5e-3)}
 SEEDS = (11, 12, 13, 14, 15, 16)  # what was decided by looking, was decided by 1 to 8
 _CENTRE = np.array([0.0, 0.0, 0.5])
-_RATE_HZ, _SECONDS = 60.0, 16.0
-_CYCLE_S = 4.0
-_RENDERED_S = 12.0
+_RATE_HZ = 60.0
 _SETTLED_S = 0.5
-_SHORT_S, _LONG_S = 0.3, 0.5
-_PALM_JOINTS = np.setdiff1d(
-    np.arange(1, 26), CHAINS[:, 1:]
-)  # knuckles and the thumb's root move with the palm
+# Knuckles and the thumb's root move with the palm.
+_PALM_JOINTS = np.setdiff1d(np.arange(1, 26), CHAINS[:, 1:])
 _DIP_OFF = np.radians(8.0)
 _TURN = np.radians(45.0)
 
@@ -56,14 +50,13 @@ def random_poses(model: HandModel, centre_m: Float, seed: int) -> HeldPoses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """Joints with what was claimed of them: chi square (N,), error (N,) [m], claimed sigma (N,) [m] (root of the mean
-    variance), time hidden (N,) [s] (0: visible), whether the whole hand was gone (N,), joint (N,)."""
+    """Joints (N,) with what was claimed of them."""
 
-    chi_2: Float
+    chi_2: Float  # by the claimed covariance; 95 % lie below 7.8
     error_m: Float
-    sigma_m: Float
-    hidden_s: Float
-    gone: Float
+    sigma_m: Float  # claimed: root of the mean variance
+    hidden_s: Float  # 0: visible
+    gone: Float  # whether the whole hand was
     joint: Float
 
     def only(self, which: Bool) -> "Coverage":
@@ -101,7 +94,8 @@ def seen_by(seed: int, times_s: Float) -> Bool:
     """(T, M) which markers are seen: each cycle hides one to three fingers briefly, others for long, and then all."""
     rng = np.random.default_rng([seed, 5])
     seen = np.ones((len(times_s), len(MARKERS)), dtype=bool)
-    for start in np.arange(0.5, times_s[-1], _CYCLE_S):
+    cycle_s = 4.0
+    for start in np.arange(0.5, times_s[-1], cycle_s):
         for after_s, lasts_s, count in ((0.0, 0.4, 3), (0.9, 1.2, 3), (2.7, 0.5, 0)):
             begin = start + after_s + rng.uniform(0.0, 0.4)
             hidden = (
@@ -117,7 +111,8 @@ def seen_by(seed: int, times_s: Float) -> Bool:
 def compared(model: HandModel, motion: HandMotion, sigma_m: tuple[float, ...], seed: int) -> Coverage:
     """One motion pushed through the estimator, against its truth."""
     rng = np.random.default_rng([seed, 6])
-    times = np.arange(round(_SECONDS * _RATE_HZ)) / _RATE_HZ
+    seconds = 16.0
+    times = np.arange(round(seconds * _RATE_HZ)) / _RATE_HZ
     begin_s = float(rng.uniform(0.0, min(motion.period_s, 60.0)))
     seen = seen_by(seed, times)
     cov = np.repeat(np.diag(np.square(sigma_m))[None], len(MARKERS), axis=0)
@@ -143,8 +138,9 @@ def compared(model: HandModel, motion: HandMotion, sigma_m: tuple[float, ...], s
 def rendered(setup: RigSetup, profile: HandProfile, seed: int) -> Coverage:
     """The six study poses before one pair of cameras: drawn, detected and solved by the whole line."""
     scene = scene_by_name("poses", setup.rig, setup.cameras, profile, seed)
+    rendered_s = 12.0
     watched = [
-        watch(scene, name, times_of(scene, name, _RENDERED_S, setup.cameras[name].frame_rate_hz))
+        watch(scene, name, times_of(scene, name, rendered_s, setup.cameras[name].frame_rate_hz))
         for name in setup.rig.cameras
     ]
     poses, _ = solve(setup, watched)
@@ -182,11 +178,12 @@ def kinds(found: Coverage) -> Iterator[tuple[str, Coverage]]:
     yield "visible", found.only(here & visible)
     yield "  of these the palm's", found.only(here & visible & palm)
     yield "  of these the fingers'", found.only(here & visible & ~palm)
-    yield "hidden up to 300 ms", found.only(here & ~visible & (found.hidden_s <= _SHORT_S + step))
-    yield "hidden for 300 ms", found.only(here & (np.abs(found.hidden_s - _SHORT_S) < step))
-    yield "lost for longer than 0.5 s", found.only(here & (found.hidden_s > _LONG_S + step))
+    short_s, long_s = 0.3, 0.5
+    yield "hidden up to 300 ms", found.only(here & ~visible & (found.hidden_s <= short_s + step))
+    yield "hidden for 300 ms", found.only(here & (np.abs(found.hidden_s - short_s) < step))
+    yield "lost for longer than 0.5 s", found.only(here & (found.hidden_s > long_s + step))
     yield "whole hand gone, up to 0.5 s", found.only(~here)
-    yield "  for 300 ms", found.only(~here & (np.abs(found.hidden_s - _SHORT_S) < step))
+    yield "  for 300 ms", found.only(~here & (np.abs(found.hidden_s - short_s) < step))
 
 
 def rows() -> Iterator[Row]:

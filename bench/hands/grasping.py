@@ -1,11 +1,11 @@
 """Real hands before ideal markers: grasping by motion capture that you bring, and a glove of six markers.
 
 **Grasping** (`PHALANX_MOTION`, a folder of BVH files of one hand each, perhaps with the `joints.json` of `--joints`):
-joints are read as `calibrate hand --from` reads them, tips and back are the markers, known to 1 mm and without noise. A
-file without tips gets them, 0.75 of the bone before ahead; which hand it is, geometry says. The profile is fitted to
-the first half of a motion and to all of it; what is scored is the second half. Figures of this project are from
-ManipNet (He Zhang, Yuting Ye, Takaaki Shiratori, Taku Komura, SIGGRAPH 2021; CC BY-NC; `cghezhang/ManipNet`), 16 of its
-files, with `{"thumb-metacarpal": "THUMB_CMC_AA"}`.
+joints are read as by `calibrate hand --from`; tips and back are the markers, known to 1 mm and without noise. A file
+without tips gets them, 0.75 of the bone before ahead. The profile is fitted to the first half of a motion and to all
+of it; the second half is scored. Figures of this project are from ManipNet (He Zhang, Yuting Ye, Takaaki Shiratori,
+Taku Komura, SIGGRAPH 2021; CC BY-NC; `cghezhang/ManipNet`), 16 of its files, with `{"thumb-metacarpal":
+"THUMB_CMC_AA"}`.
 
 **Glove** (`real_mocap`, `PHALANX_DATASETS`): six markers of an optical motion capture. Each tip in turn is hidden for
 0.3 s and 0.5 s every 2 s. Its hand was never measured: a generated one of 210 mm with noise of 0.7 mm.
@@ -22,9 +22,8 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from bench.hands.draws import EDGE_ON, MARKERS
+from bench.hands.draws import EDGE_ON, MARKERS, PointHand
 from bench.hands.motion import SIGMA_M, pip_deg
-from bench.hands.point_hand import PointHand
 from bench.report import Row, datasets, inside, rms
 from common.arrays import Bool, Float, Int
 from common.calibration import HandProfile, MarkerMount
@@ -37,35 +36,23 @@ from master.calibrate.hand.motion import find_palm
 from master.mocap.compare import joint_track
 from master.mocap.read import Reading, read_motion
 
-_RATE_HZ = 60.0
-_DISTAL = 0.75  # of the bone before, where a file has no tips
-_FALSE_DEG = 20.0
 _MORE_BACKS_M = ((0.025, 0.0, 0.02), (-0.025, 0.0, 0.02))
-_GLOVE_M, _GLOVE_AHEAD_M, _GLOVE_NOISE_M = 0.21, 0.005, 7e-4
-_EVERY_S = 2.0
 BINS_DEG = (0.0, 6.0, 9.0, 12.0, 16.0, 25.0, 90.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grasped:
-    """One motion before ideal markers.
+    """One motion before ideal markers."""
 
-    Attributes:
-        pip_deg, sigma_deg: (T, 4) error of the PIPs of index ... little, and its standard deviation as stated.
-        joint_m: (T, 20) error of the joints of the chains.
-        chi2: (T, 5, 4) of these joints.
-        tracked: (T, 4) fingers whose tip is TRACKED.
-    """
-
-    pip_deg: Float
-    sigma_deg: Float
-    joint_m: Float
-    chi2: Float
-    tracked: Bool
+    pip_deg: Float  # (T, 4) error of the PIPs of index ... little
+    sigma_deg: Float  # (T, 4) its standard deviation as stated
+    joint_m: Float  # (T, 20) error of the joints of the chains
+    chi2: Float  # (T, 5, 4) of these joints
+    tracked: Bool  # (T, 4) fingers whose tip is TRACKED
 
 
 def rows() -> Iterator[Row]:
-    """Both parts; a row that says so where data are absent."""
+    """Measure both parts; a row names absent data."""
     if files := motion_files():
         for backs in (1, 3):
             for half in (True, False):
@@ -103,7 +90,7 @@ def _grasp_rows(motions: list[Grasped], backs: int, half: bool) -> Iterator[Row]
     )
     who = f"grasping, {backs} on the back, hand of {'the first half' if half else 'the same motion'}"
     off = np.abs(pip)
-    wrong = 100.0 * (off > _FALSE_DEG)[tracked].mean()
+    wrong = 100.0 * (off > 20.0)[tracked].mean()
     yield Row(f"{who}: PIP", float(off.mean()), "deg", f"goal 8.5; joints {1e3 * joint.mean():.1f} mm")
     yield Row(f"{who}: PIP joint in its 95 % region", inside(chi2[:, 1:, 1]), "%", "goal 90")
     note = f"goal 2; {100 * tracked.mean():.0f} % TRACKED"
@@ -114,12 +101,7 @@ def _grasp_rows(motions: list[Grasped], backs: int, half: bool) -> Iterator[Row]
 
 
 def grasped(path: Path, backs: int, half: bool) -> Grasped:
-    """The second half of a motion, by a hand of the first half or of all of it.
-
-    Raises:
-        RecordingError: The file is no motion of a hand.
-        FitError: Its palm is not found.
-    """
+    """Score the second half of a motion by a hand of its first half or of all; FitError: no palm is found."""
     t_ns, joints, side, local = _joints(path)
     count = len(joints)
     profile = profile_from_joints("grasping", side, local[: count // 2] if half else local)
@@ -165,7 +147,8 @@ def _joints(path: Path) -> tuple[Int, Float, str, Float]:
         motion = read_motion(whole, Reading(joints=names if names.is_file() else None))
     joints = joint_track(motion).position_m
     palm = find_palm(joints, None, str(path))
-    step = max(1, round(1e9 / _RATE_HZ / float(np.median(np.diff(motion.t_ns)))))
+    rate_hz = 60.0
+    step = max(1, round(1e9 / rate_hz / float(np.median(np.diff(motion.t_ns)))))
     good = np.flatnonzero(~palm.outlier & np.isfinite(palm.chains_m).all(axis=(1, 2, 3)))[::step]
     return motion.t_ns[good], joints[good], palm.side, palm.chains_m[good]
 
@@ -178,7 +161,7 @@ def _with_tips(text: str) -> str:
         nonlocal last
         lead, numbers = found.group(1), found.group(2).split()
         if "End" in lead and not any(float(number) for number in numbers):
-            numbers = [f"{_DISTAL * float(number):.6f}" for number in last]
+            numbers = [f"{0.75 * float(number):.6f}" for number in last]
         last = numbers
         return f"{lead}{' '.join(numbers)}"
 
@@ -208,23 +191,21 @@ def _glove_rows(t_ns: Int, points_m: Float) -> Iterator[Row]:
 
 
 def hidden_tip(t_ns: Int, points_m: Float, finger: int, hidden_s: float) -> tuple[Float, Float, Float]:
-    """Errors [m] of a tip that is hidden now and then, its chi squares, and those of all tips that are seen.
+    """Errors [m] of a tip that is hidden for `hidden_s` every 2 s, its chi squares, and those of all seen tips.
 
-    Args:
-        t_ns: (T,) times.
-        points_m: (T, 6, 3) [m] markers; NaN: not seen.
-        finger: Which.
-        hidden_s: How long, every 2 s.
+    Of times (T,) [ns] and markers (T, 6, 3) [m]; NaN: not seen.
     """
-    profile = generated_profile("glove", "right", _GLOVE_M)
+    glove_m, glove_ahead_m, glove_noise_m = 0.21, 0.005, 7e-4
+    profile = generated_profile("glove", "right", glove_m)
     x, y, z = profile.markers["back"].offset_m
-    mount = replace(profile.markers["back"], offset_m=(x, y, z + _GLOVE_AHEAD_M))
+    mount = replace(profile.markers["back"], offset_m=(x, y, z + glove_ahead_m))
     model = HandModel.of(replace(profile, markers=profile.markers | {"back": mount}))
-    noise = np.random.default_rng(7).normal(0.0, _GLOVE_NOISE_M, points_m.shape)
+    noise = np.random.default_rng(7).normal(0.0, glove_noise_m, points_m.shape)
     truth = points_m - np.nanmean(points_m[:, 5], axis=0)
     shown = truth + noise
     towards = _dorsal(points_m)
-    hidden = (1e-9 * (t_ns - t_ns[0])) % _EVERY_S > _EVERY_S - hidden_s
+    every_s = 2.0
+    hidden = (1e-9 * (t_ns - t_ns[0])) % every_s > every_s - hidden_s
     solver = PointHand(model, MARKERS)
     off: list[float] = []
     chi2: list[float] = []
@@ -233,7 +214,7 @@ def hidden_tip(t_ns: Int, points_m: Float, finger: int, hidden_s: float) -> tupl
         now = shown[k].copy()
         if hidden[k]:
             now[finger] = np.nan
-        cov = np.where(np.isfinite(now[:, :1, None]), _GLOVE_NOISE_M**2 * np.eye(3), np.nan)
+        cov = np.where(np.isfinite(now[:, :1, None]), glove_noise_m**2 * np.eye(3), np.nan)
         hand = solver.push(int(t_ns[k]), now, cov, towards).solution
         if hand is None:
             continue

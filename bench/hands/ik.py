@@ -1,4 +1,4 @@
-"""One finger at a time, the palm known: our solvers and others on the same targets, all of them reachable.
+"""One finger at a time, the palm known: our solvers and others on the same reachable targets.
 
 Targets are the caps of hands whose angles are independent and uniform within the limits, the DIP coupled exactly.
 The papers' way begins at its last pose, which is another random one, scipy amid the limits.
@@ -10,14 +10,19 @@ from functools import partial
 
 import numpy as np
 
-from bench.hands.draws import MARKERS, Draw, Score, bench_model, draw, score
-from bench.hands.peers import (
+from bench.hands.draws import (
+    MARKERS,
     Angles,
+    Draw,
     Fingers,
     PaperFingers,
+    Score,
+    bench_model,
     closed_form,
+    draw,
     finger_solvers,
     scipy_finger,
+    score,
     tips_in_palm,
 )
 from bench.report import Row, rms
@@ -26,18 +31,16 @@ from master.fabrik.fabrik import Fabrik
 from master.fabrik.linear_algebra import Vector
 from master.fabrik.solver import Finger, FingerSolver
 
-HANDS = 2000
 CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
-_SEED, _PARTS = 2, 10
 _FROM_REST, _RESTARTED = "FABRIK, from rest", "FABRIK, from rest, restarts"
 _SLOW = {PAPER: 10, _FROM_REST: 10, _RESTARTED: 20, "scipy": 40}  # one hand in so many
 _STRICT_MM = {CLOSED: 1e-3, WARM_STARTED: 0.1}  # by how much these two may miss
 
 
-def rows(hands: int = HANDS) -> list[Row]:
+def rows(hands: int = 2000) -> list[Row]:
     """Return time per hand of five fingers, targets missed, limits passed and error of the PIP of each way."""
     model = bench_model()
-    truth = draw(model, _SEED, hands, coupling_off_rad=0.0)
+    truth = draw(model, 2, hands, coupling_off_rad=0.0)
     out: list[Row] = []
     for name, way in ways(model).items():
         found, us = timed(model, way, truth.every(_SLOW.get(name, 1)))
@@ -91,7 +94,8 @@ def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float]:
     targets = [tips_in_palm(T, caps) for T, caps in zip(truth.T_rig_palm, truth.caps_m, strict=True)]
     found: list[Angles] = []
     times: list[float] = []
-    size = max(1, len(targets) // _PARTS)
+    parts = 10
+    size = max(1, len(targets) // parts)
     for k in range(0, len(targets), size):
         start = time.thread_time()
         found += [way(tips) for tips in targets[k : k + size]]

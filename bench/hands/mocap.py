@@ -1,8 +1,8 @@
 """Motion capture in another frame and clock: what fitting these does to the figures of a comparison.
 
-Poses of the estimator in scenes with exact truth (`bench.both.shown`). The truth at 120 Hz, turned by a large angle,
-moved by metres, on a clock that is 11.5 s late and with 0.3 mm of noise, is written as a table, read, aligned and
-compared; beside it the same comparison with frame and clock known.
+The truth of scenes (`bench.both.scene`) at 120 Hz, turned by a large angle, moved by metres, 11.5 s late and with
+0.3 mm of noise, is written as a table, read, aligned and compared with the estimator's poses; beside it the same
+comparison with frame and clock known.
 """
 
 import tempfile
@@ -12,8 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from bench.both.shown import shown
-from bench.both.solved import solve
+from bench.both.scene import shown, solve
 from bench.report import Row
 from common.arrays import Float
 from common.geometry.transforms import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
@@ -22,12 +21,10 @@ from master.mocap.read import Reading
 from master.outputs.poses import PosesFile
 from master.recording.export.truth import Wanted, compare_source
 
-SECONDS = 10.0
 CASES = (("standard", 7), ("standard", 23), ("grasp", 7), ("grasp", 22), ("both-travel", 21))
 """Scene and seed. Seeds above 20 were not looked at while it was decided which joints frame and clock are fitted by."""
 _TURN = rotation_vector_to_matrix(np.array([0.9, -1.7, 0.4]))
 _SHIFT_M = np.array([1.0, -2.0, 0.3])
-_LATE_S, _NOISE_M, _RATE_HZ = 11.5, 3e-4, 120.0
 
 
 def rows() -> Iterator[Row]:
@@ -37,20 +34,22 @@ def rows() -> Iterator[Row]:
 
 
 def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
-    made = shown(scene, SECONDS, seed)
+    seconds = 10.0
+    made = shown(scene, seconds, seed)
     poses = [pose for pose in solve(made.both.markers, made.messages) if pose.valid.any()]
+    late_s, noise_m, rate_hz = 11.5, 3e-4, 120.0
     with tempfile.TemporaryDirectory(prefix="phalanx-") as folder:
         source, begin_ns = Path(folder) / "poses.npz", poses[0].t_ns
         file = PosesFile(source, poses[0].hand, len(poses[0].markers_m))
         for pose in poses:
             file.write(pose)
         file.close()
-        t_ns = begin_ns + np.arange(0, poses[-1].t_ns - begin_ns, round(1e9 / _RATE_HZ))
+        t_ns = begin_ns + np.arange(0, poses[-1].t_ns - begin_ns, round(1e9 / rate_hz))
         exact = np.stack([made.both.truth(t).joints.position_m for t in t_ns.tolist()])
         t_s = np.asarray(1e-9 * t_ns, np.float64)
         plain = _table(Path(folder) / "plain.csv", t_s, exact)
-        noise = np.random.default_rng(seed).normal(0.0, _NOISE_M, exact.shape)
-        far = _table(Path(folder) / "far.csv", t_s + _LATE_S, (exact + noise) @ _TURN.T + _SHIFT_M)
+        noise = np.random.default_rng(seed).normal(0.0, noise_m, exact.shape)
+        far = _table(Path(folder) / "far.csv", t_s + late_s, (exact + noise) @ _TURN.T + _SHIFT_M)
         known, fitted = (
             cast(
                 dict[str, Any],
@@ -68,7 +67,7 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
         ("coverage_95_percent", "in 95 % regions, frame and clock fitted", "%"),
     ):
         yield Row(at + name, fitted[key], unit, f"known: {known[key]:.2f}")
-    late_ms = 1e-6 * (how["offset_ns"] + 1e9 * _LATE_S)
+    late_ms = 1e-6 * (how["offset_ns"] + 1e9 * late_s)
     yield Row(at + "clock that is found, late", late_ms, "ms", f"stated ± {how['offset_sigma_ms']:.1f}")
     yield Row(
         at + "frame that is found, turned", rotation_deg, "deg", f"± {how['rotation_sigma_deg']:.2f} stated"

@@ -2,10 +2,9 @@
 
 **Motion**: the joints that the Leap recorded (`leapjs/*.npz`, model-based: bones are constant, the DIP bends as the
 PIP) are the truth. A profile is made from the same joints (`common.hand.fitting`), its DIP coupled 1 : 1, its limits D,
-widened for fingers bent back up to 30 degrees, thumbs 20, and for 30 degrees of abduction (the little finger 45). Caps
-on the five tips and one on the back, 1 mm of noise, go through estimator and filter at the recorded times. The cameras
-see the back of the hand in the mean; the cap there is hidden beyond 75 degrees. Wrist and metacarpals were not
-recorded; the error is the mean over the 20 recorded joints. A recording is cut where its hand changes its size.
+widened (`wide_limits`). Caps on the five tips and one on the back, 1 mm of noise, go through estimator and filter at
+the recorded times. The cameras see the back of the hand in the mean; the cap there is hidden beyond 75 degrees. Wrist
+and metacarpals were not recorded; the error is the mean over the 20 recorded joints.
 
 **Held**: generated hands, 1 mm of noise, 60 frames a second; what is left after the filter, over time.
 """
@@ -17,8 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
-from bench.hands.draws import EDGE_ON, FACING_ROTATION, MARKERS
-from bench.hands.point_hand import TOWARDS, PointHand
+from bench.hands.draws import EDGE_ON, FACING_ROTATION, MARKERS, TOWARDS, PointHand
 from bench.report import Row, datasets, skipped
 from common.arrays import Float, Int
 from common.calibration import Couplings, FilterCalibration, FingerLimits, Limits
@@ -33,29 +31,17 @@ from master.estimator.smoothing import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
 
 SIGMA_M = 1e-3
-PERIOD_NS = 16_666_667
-_SIZE_M = 1e-4  # bones that differ by more belong to another hand
-_SHORTEST_S = 0.5
-_FIXED = 40  # frames per recording in which the profile is judged without noise
-_SEEDS, _FRAMES, _SETTLED = 5, 300, 60  # of held hands
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """One hand in motion.
-
-    Attributes:
-        name, side: Of the recording.
-        t_ns: (T,) times.
-        T_rig_palm: (T, 4, 4); the origin is level with the thumb's root.
-        fingers_m: (T, 5, 4, 3) [m] joints of `CHAINS`, palm frame.
-    """
+    """One hand in motion."""
 
     name: str
     side: str
-    t_ns: Int
-    T_rig_palm: Float
-    fingers_m: Float
+    t_ns: Int  # (T,) times
+    T_rig_palm: Float  # (T, 4, 4); the origin is level with the thumb's root
+    fingers_m: Float  # (T, 5, 4, 3) [m] joints of `CHAINS`, palm frame
 
     def model(self) -> HandModel:
         """Return the recorded hand."""
@@ -128,9 +114,10 @@ def recordings(folder: Path) -> Iterator[Recorded]:
         wrist = np.array([0.0, 0.0, float(np.median(local[:, 0, 0, 2]))])
         poses = np.array([rigid(r, p + r @ wrist) for r, p in zip(R, palm[known], strict=True)])
         size = np.linalg.norm(np.diff(chains, axis=2), axis=3).sum(axis=(1, 2))
-        changes: list[int] = (np.flatnonzero(np.abs(np.diff(size)) > _SIZE_M) + 1).tolist()
+        size_m = 1e-4  # bones that differ by more belong to another hand
+        changes: list[int] = (np.flatnonzero(np.abs(np.diff(size)) > size_m) + 1).tolist()
         for a, b in zip([0, *changes], [*changes, len(t)], strict=True):
-            if t[b - 1] - t[a] >= _SHORTEST_S:
+            if t[b - 1] - t[a] >= 0.5:
                 when: Int = np.asarray(np.round((t[a:b] - t[a]) * 1e9), np.int64)
                 name = path.stem + (f" from {t[a] - t[0]:.0f} s" if a else "")
                 yield Recorded(name, str(data["hand0_type"]), when, poses[a:b], local[a:b] - wrist)
@@ -154,7 +141,8 @@ def floor_m(recorded: Recorded, model: HandModel) -> Float:
     """Return how far the profile's joints are from the recorded ones at best (N, 20) [m]: palm known, angles free."""
     out: list[Float] = []
     start = np.zeros(20)
-    for fingers in recorded.fingers_m[:: max(1, len(recorded.fingers_m) // _FIXED)]:
+    fixed = 40  # frames per recording in which the profile is judged without noise
+    for fingers in recorded.fingers_m[:: max(1, len(recorded.fingers_m) // fixed)]:
 
         def off(x: Float, fingers: Float = fingers) -> Float:
             return (1e3 * (model.chains(x.reshape(5, 4)).position_m - fingers)).ravel()
@@ -242,15 +230,17 @@ def jitter(hands: list[FittedHand]) -> tuple[float, float, float]:
 
 def _held_rows() -> Iterator[Row]:
     model = HandModel.of(generated_profile("held", "right"))
-    T, t_ns = rigid(FACING_ROTATION, np.array([0.03, 0.08, 0.5])), PERIOD_NS * np.arange(_FRAMES)
+    period_ns = 16_666_667
+    seeds, frames, settled = 5, 300, 60  # of held hands
+    T, t_ns = rigid(FACING_ROTATION, np.array([0.03, 0.08, 0.5])), period_ns * np.arange(frames)
     for name, angles in held_poses(model).items():
         caps = model.marker_points(model.forward(T, angles), MARKERS)
-        noise = [np.random.default_rng(s).normal(0.0, SIGMA_M, (_FRAMES, 6, 3)) for s in range(_SEEDS)]
+        noise = [np.random.default_rng(s).normal(0.0, SIGMA_M, (frames, 6, 3)) for s in range(seeds)]
         runs = [track(model, t_ns, caps + one) for one in noise]
-        before, after = (np.array([jitter(run[k][_SETTLED:]) for run in runs]) for k in (0, 1))
+        before, after = (np.array([jitter(run[k][settled:]) for run in runs]) for k in (0, 1))
         for k, (what, unit, goal) in enumerate(
             (("joints", "mm", 0.5), ("angles", "deg", 1.0), ("orientations", "deg", 1.0))
         ):
             worst, raw = after[:, k].max(), before[:, k].mean()
-            note = f"goal {goal}; worst of {_SEEDS} seeds {worst:.2f}, before the filter {raw:.2f}"
+            note = f"goal {goal}; worst of {seeds} seeds {worst:.2f}, before the filter {raw:.2f}"
             yield Row(f"held, {name}: jitter of {what}", float(after[:, k].mean()), unit, note)

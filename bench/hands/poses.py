@@ -1,7 +1,7 @@
 """Random poses of independent joints, palm turned by up to 45 degrees: the whole-hand fit, and the papers' way.
 
 Three kinds of noise: 1 mm in every direction; the same with the palm's orientation known to 2 degrees about each axis
-(a sensor on the back of the hand); that of stereo, 4.5 mm in depth and 0.3 mm across. Every hand is solved afresh, and
+(a sensor on the back of the hand); that of stereo, 4.5 mm in depth and 0.3 mm across. Every hand is solved anew, and
 every solver gets the same caps. `python -m bench hand_poses 10000` takes all poses.
 """
 
@@ -15,14 +15,28 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.hands.draws import FACING_ROTATION, MARKERS, Noise, Score, bench_model, draw, score, seen
-from bench.hands.peers import Fingers, PaperFingers, closed_form, finger_solvers, fixed_palm, tips_in_palm
-from bench.hands.point_hand import PointHand
+from bench.hands.draws import (
+    FACING_ROTATION,
+    MARKERS,
+    Fingers,
+    Noise,
+    PaperFingers,
+    PointHand,
+    Score,
+    bench_model,
+    closed_form,
+    draw,
+    finger_solvers,
+    fixed_palm,
+    score,
+    seen,
+    tips_in_palm,
+)
 from bench.report import Row, show
 from common.arrays import Float
 from common.hand.model import HandModel
 
-POSES, BATCHES, _FIRST_SEED = 2000, 10, 1
+POSES, BATCHES = 2000, 10
 WHOLE, PAPER, CLOSED = "whole hand", "papers' way", "closed form"
 
 
@@ -44,7 +58,8 @@ SCENARIOS = {
 
 def rows(poses: int = POSES) -> list[Row]:
     """Return errors of every way in every scenario; `poses` in ten batches of their own seeds, over all cores."""
-    jobs = [(name, _FIRST_SEED + k) for name in SCENARIOS for k in range(BATCHES)]
+    first_seed = 1
+    jobs = [(name, first_seed + k) for name in SCENARIOS for k in range(BATCHES)]
     # Fresh interpreters: a fork would take along threads of a benchmark that ran before.
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
         results = list(workers.map(partial(_batch, count=max(1, poses // BATCHES)), jobs))

@@ -1,10 +1,10 @@
 """One painted cap as a camera forms it: drawn in linear light, averaged over pixel area and exposure, truth exact.
 
-A pixel integrates light over its area and over the exposure, so everything here is drawn on a fine grid in linear
-light and box-averaged. A cap is an ellipse of paint on skin (a finger that goes on to one side, or a round patch).
-In the frame of its unit circle, x = centre + A q with |q| <= 1, it is shaded like a sphere segment (Lambert), has a
-white highlight, and may lose the segment {q . n > h} to an edge in front of it. The centroid of the rest is known
-in closed form: a segment of half angle t = acos(h) has area t - h sin t and its centroid at 2/3 sin^3 t / area.
+Everything is drawn on a fine grid in linear light and box-averaged over pixels and exposure. A cap is an ellipse of
+paint on skin (a finger that goes on to one side, or a round patch). In the frame of its unit circle, x = centre + A q
+with |q| <= 1, it is shaded like a sphere segment (Lambert), has a white highlight, and may lose the segment {q . n > h}
+to an edge in front of it. The centroid of the rest is known in closed form: a segment of half angle t = acos(h) has
+area t - h sin t and its centroid at 2/3 sin^3 t / area.
 """
 
 import math
@@ -20,31 +20,20 @@ from common.arrays import Float
 Light: TypeAlias = npt.NDArray[np.float32]
 Rgb: TypeAlias = tuple[float, float, float]
 
-FINE = 8  # sub-pixels per pixel and axis where there is paint
-COARSE = 2  # where there is only skin
 PAD = 2  # px around the paint that are drawn finely
 AMBIENT = 0.38
-STEP = 0.25  # px of motion between two drawn instants of the exposure
 
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """The skin under a cap: a capsule from `start` on, moving with the cap; length 0 is a round patch.
+    """The skin under a cap: a capsule from `start` on, moving with the cap; length 0 is a round patch."""
 
-    Attributes:
-        start: Where its axis begins, from the cap's centre [px].
-        angle: Direction of its axis [rad].
-        length, half_width: [px].
-        colour: Linear RGB.
-        round_: Shaded like a cylinder; else flat.
-    """
-
-    start: tuple[float, float]
-    angle: float
-    length: float
-    half_width: float
-    colour: Rgb
-    round_: bool
+    start: tuple[float, float]  # where its axis begins, from the cap's centre [px]
+    angle: float  # direction of its axis [rad]
+    length: float  # [px]
+    half_width: float  # [px]
+    colour: Rgb  # linear RGB
+    round_: bool  # shaded like a cylinder; else flat
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,24 +66,15 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Cap:
-    """One cap at mid exposure.
+    """One cap at mid exposure."""
 
-    Attributes:
-        u, v: Centre of the whole ellipse [px], (0, 0) = centre of the top-left pixel.
-        a, b: Semi-axes [px].
-        angle: Direction of the axis a [rad].
-        paint: Linear RGB reflectance.
-        bulge: Sine of the angle between the normals of rim and centre; 0 is flat.
-        support, highlight, occluder: What is under, on and before it.
-    """
-
-    u: float
+    u: float  # centre of the whole ellipse [px], (0, 0) = centre of the top-left pixel
     v: float
-    a: float
+    a: float  # semi-axes [px]
     b: float
-    angle: float
-    marker_colour: Rgb
-    bulge: float
+    angle: float  # direction of the axis a [rad]
+    marker_colour: Rgb  # linear RGB reflectance
+    bulge: float  # sine of the angle between the normals of rim and centre; 0 is flat
     support: Support | None = None
     highlight: Highlight | None = None
     occluder: Occluder | None = None
@@ -151,11 +131,10 @@ def segment(height: float) -> tuple[float, float]:
     return area, (2.0 / 3.0 * math.sin(t) ** 3 / area if area > 1e-12 else 1.0)
 
 
-def draw(cap: Cap, to_light: Float, motion: tuple[float, float] = (0.0, 0.0), fine: int = FINE) -> Patch:
+def draw(cap: Cap, to_light: Float, motion: tuple[float, float] = (0.0, 0.0), fine: int = 8) -> Patch:
     """The cap with its support, box-averaged over pixels and exposure.
 
     Args:
-        cap: What to draw.
         to_light: Unit vector (3,) to the light: right, down, towards the camera.
         motion: Way (du, dv) [px] during the exposure, symmetric about `cap`.
         fine: Sub-pixels per pixel and axis where there is paint.
@@ -163,7 +142,7 @@ def draw(cap: Cap, to_light: Float, motion: tuple[float, float] = (0.0, 0.0), fi
     reach = max(cap.a, cap.b) + PAD
     near = _box(cap, reach, motion)
     far = _box(cap, _reach(cap), motion)
-    patch = _exposed(cap, to_light, motion, far, COARSE)
+    patch = _exposed(cap, to_light, motion, far, 2)  # where there is only skin
     detail = _exposed(cap, to_light, motion, near, fine)
     x, y = near[0] - far[0], near[1] - far[1]
     patch[y : y + detail.shape[0], x : x + detail.shape[1]] = detail
@@ -192,7 +171,8 @@ def _exposed(
     """Premultiplied light and coverage (H, W, 4) of the box, averaged over exposure and pixels."""
     left, top, width, height = box
     way = math.hypot(*motion)
-    steps = 1 if way == 0.0 else math.ceil(way / STEP)
+    step = 0.25  # px of motion between two drawn instants of the exposure
+    steps = 1 if way == 0.0 else math.ceil(way / step)
     pad = math.ceil(0.5 * max(abs(motion[0]), abs(motion[1]))) + 1 if steps > 1 else 0
     x = (np.arange(-pad * fine, (width + pad) * fine) + 0.5) / fine - 0.5 + left - cap.u
     y = (np.arange(-pad * fine, (height + pad) * fine) + 0.5) / fine - 0.5 + top - cap.v

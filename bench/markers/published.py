@@ -16,12 +16,7 @@ KERNEL = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
 
 
 def detect(image: Image, ranges: Sequence[HsvRange]) -> Float:
-    """Centroids (M, 2) [px] of the largest blob of each colour; NaN where there is none.
-
-    Args:
-        image: (H, W, 3) BGR.
-        ranges: HSV range of each marker; none wraps.
-    """
+    """Centroids (M, 2) [px] of the largest blob of each colour in (H, W, 3) BGR, NaN: none; no range wraps."""
     uv = np.full((len(ranges), 2), np.nan)
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
     for m, colour in enumerate(ranges):

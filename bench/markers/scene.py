@@ -1,20 +1,149 @@
-"""Scenes for marker detectors: caps spread like those of a hand, on skin, over a table, drawn at random once.
+"""Frames with painted caps and exact truth, from fixed seeds, kind by kind: what detectors are measured on.
 
-Distributions are uniform and physical: radii, aspect, shading, light, highlights, skin, table tops, lens blur. None
-of them is fitted to a detector.
+HSV ranges follow the rule of a person who calibrates with care: hue half-way to the neighbours and to skin, saturation
+down to that of a half covered pixel, value down to the shadow side; fixed here, so that a change of the colour
+calibration does not move the scale. Scenes are drawn at random once: radii, aspect, shading, light, highlights, skin,
+table tops and lens blur are uniform and physical, none is fitted to a detector. A sequence is one scene for a few
+frames: the caps move a little from frame to frame, as a tracker needs it. Then a camera follows: shot and read noise,
+ten linear bits, sRGB bytes.
 """
 
+import colorsys
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final, cast
 
 import cv2
+import msgspec
 import numpy as np
 
 from bench.markers.cap_image import Cap, Highlight, Light, Occluder, Rgb, Support, draw
-from bench.markers.kinds import Kind, paints
-from common.arrays import Float
-from common.sim.light import CARD_LINEAR_RGB, DESK_LINEAR_RGB, SKIN_LINEAR_RGB
+from common.arrays import Float, Image
+from common.calibration import CameraCalibration, HsvRange
+from common.sim.light import (
+    CARD_LINEAR_RGB,
+    DESK_LINEAR_RGB,
+    MARKER_LINEAR_RGB,
+    SKIN_LINEAR_RGB,
+    bgr_bytes,
+    to_linear,
+    to_srgb,
+)
+
+MORE_HUES: Final = (30, 55, 80, 102, 124, 150)  # between those of the six
+MANY_HUES: Final = (27.0, 168.0)  # evenly from yellow to red, skin in the gap
+
+
+def paints(count: int) -> dict[str, Rgb]:
+    """Marker -> linear RGB reflectance; ValueError: not 6, 12 or 24 markers."""
+    if count == 6:
+        return dict(MARKER_LINEAR_RGB)
+    if count == 12:
+        return dict(MARKER_LINEAR_RGB) | {f"hue_{h}": _of_hsv(h, 0.8, 0.72) for h in MORE_HUES}
+    if count == 24:
+        return {f"hue_{h:.0f}": _of_hsv(h, 0.85, 0.75) for h in np.linspace(*MANY_HUES, count)}
+    raise ValueError(f"{count} paints: there are sets of 6, 12 and 24")
+
+
+def camera_file(count: int, size: tuple[int, int]) -> CameraCalibration:
+    """The camera of `size` (width, height) [px] with the ranges of `count` markers."""
+    named = paints(count)
+    hsv = {name: _hsv(colour) for name, colour in named.items()}
+    return CameraCalibration(
+        version=1,
+        name=f"bench{count}",
+        width_px=size[0],
+        height_px=size[1],
+        frame_rate_hz=60.0,
+        exposure_us=5000.0,
+        analogue_gain=1.0,
+        colour_gains=(1.0, 1.0),
+        row_time_us=20.0,
+        markers={
+            name: _range(own, [h for other, (h, _, _) in hsv.items() if other != name])
+            for name, own in hsv.items()
+        },
+    )
+
+
+def _range(own: tuple[int, int, int], others: list[int]) -> HsvRange:
+    hue, saturation, value = own
+    obstacles = [*others, 11]  # skin
+    below = min(((hue - h) % 180) / 2.0 for h in obstacles)
+    above = min(((h - hue) % 180) / 2.0 for h in obstacles)
+    hue_margin = 14
+    low = (hue - int(min(hue_margin, below - 0.5))) % 180
+    high = (hue + int(min(hue_margin, above - 0.5))) % 180
+    least, dark = round(max(50, 0.45 * saturation)), round(max(25, 0.3 * value))
+    return HsvRange(hsv_low=(low, least, dark), hsv_high=(high, 255, 255))
+
+
+def _hsv(colour: Rgb) -> tuple[int, int, int]:
+    pixel = np.array([[bgr_bytes(np.array(colour))]], np.uint8)
+    h, s, v = (int(c) for c in np.asarray(cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV))[0, 0])
+    return h, s, v
+
+
+def _of_hsv(hue: float, saturation: float, value: float) -> Rgb:
+    r, g, b = to_linear(np.array(colorsys.hsv_to_rgb(hue / 180.0, saturation, value)))
+    return float(r), float(g), float(b)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What the frames of one kind show; lengths are for 640 px of image width and scale with it."""
+
+    name: str  # its name
+    finger: bool = True  # caps at finger ends with a highlight; else matt ones on skin, its edge, the table
+    clicked: bool = False  # a click in the first frame: on a bare table a cap looks like any other object
+    blur_px: float = 0.0  # way during the exposure
+    hidden: float = 0.0  # share of the paint that an edge hides, in the frames after `whole_frames`
+    noise: float = 1.0  # times the usual noise
+    objects: int = 0  # things of the markers' colours on the table: mugs and pens
+    count: int = 6  # markers
+    size: tuple[int, int] = (640, 480)  # width, height [px]
+    whole_frames: int = 0  # frames before those that are judged
+    frames: int = 4  # judged frames of one sequence
+
+    @property
+    def camera(self) -> CameraCalibration:
+        """The camera file of these frames."""
+        still = camera_file(self.count, self.size)
+        # Blurred caps move by the way of one frame: such a camera exposes from frame to frame.
+        return (
+            msgspec.structs.replace(still, exposure_us=1e6 / still.frame_rate_hz) if self.blur_px else still
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The markers, in the order of every array."""
+        return tuple(paints(self.count))
+
+    @property
+    def scale(self) -> float:
+        """Of all lengths."""
+        return self.size[0] / 640.0
+
+
+KINDS: Final = {
+    kind.name: kind
+    for kind in (
+        Kind("base", finger=False, clicked=True),
+        Kind("finger_end"),
+        Kind("blur3", blur_px=3.0),
+        Kind("blur6", blur_px=6.0),
+        Kind("occluded15", hidden=0.15, whole_frames=6, frames=2),
+        Kind("noise", finger=False, clicked=True, noise=2.0),
+        Kind("clutter", objects=3),
+        Kind("twelve", count=12),
+        Kind("twentyfour", count=24),
+        Kind("320x240", size=(320, 240)),
+        Kind("1280x960", size=(1280, 960)),
+        Kind("1456x1088", size=(1456, 1088)),
+    )
+}
+
 
 RADIUS: Final = (4.0, 12.0)  # px, of caps
 LARGEST: Final = {6: 12.0, 12: 8.0, 24: 7.0}  # px, of a hand's typical cap: so that all hands have room
@@ -30,29 +159,17 @@ TABLE_TOPS: Final[tuple[Rgb, ...]] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What stays the same during a sequence.
+    """What stays the same during a sequence."""
 
-    Attributes:
-        kind: Its kind.
-        caps: One per marker, at the first frame, without occluders.
-        occluders: One per marker.
-        table: (H, W, 3) linear light without caps.
-        to_light: (3,) unit vector.
-        brightness: Of the light.
-        lens_px: Standard deviation of the lens blur.
-        velocity: (2,) of the hand [px per frame].
-        wander_px: Standard deviation of each cap's own step from frame to frame.
-    """
-
-    kind: Kind
-    caps: tuple[Cap, ...]
-    occluders: tuple[Occluder, ...]
-    table: Light
-    to_light: Float
-    brightness: float
-    lens_px: float
-    velocity: Float
-    wander_px: float
+    kind: Kind  # its kind
+    caps: tuple[Cap, ...]  # one per marker, at the first frame, without occluders
+    occluders: tuple[Occluder, ...]  # one per marker
+    table: Light  # (H, W, 3) linear light without caps
+    to_light: Float  # (3,) unit vector
+    brightness: float  # of the light
+    lens_px: float  # standard deviation of the lens blur
+    velocity: Float  # (2,) of the hand [px per frame]
+    wander_px: float  # standard deviation of each cap's own step from frame to frame
 
     def light(self, caps: tuple[Cap, ...]) -> Light:
         """Linear light (H, W, 3) that a noiseless sensor would count, RGB."""
@@ -249,3 +366,79 @@ def _past(x: float, y: float, c: float, s: float, half: float) -> float:
 
 def _times(colour: Rgb, factor: float) -> Rgb:
     return colour[0] * factor, colour[1] * factor, colour[2] * factor
+
+
+STEP_NS: Final = 16_666_667
+BITS: Final = 1023
+ENCODED: Final = np.rint(255.0 * to_srgb(np.arange(BITS + 1) / BITS)).astype(np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerFrame:
+    """One frame and its truth, M markers in the order of `Kind.names`."""
+
+    image: Image  # (H, W, 3) BGR
+    t_ns: int  # mid-exposure time
+    uv: Float  # (M, 2) centroid of the visible paint, mean over the exposure [px]
+    whole_uv: Float  # (M, 2) centroid of the paint as if nothing hid it [px]
+    area: Float  # (M,) visible area [px^2]
+    visible: Float  # (M,) visible share
+    radius: Float  # (M,) sqrt(a b) of the whole ellipse [px]
+    judged: bool  # whether it counts; frames that only let a tracker learn do not
+
+
+def sequences(kind: Kind, count: int, seed: int = 1) -> Iterator[Iterator[MarkerFrame]]:
+    """`count` sequences; the k-th depends on kind, seed and k alone, so a shorter run is a part of a longer one."""
+    for k in range(count):
+        yield frames_of(kind, generator(kind, k, seed))
+
+
+def generator(kind: Kind, k: int, seed: int = 1) -> np.random.Generator:
+    """The generator from which the k-th sequence is drawn."""
+    return np.random.default_rng([seed, k, *kind.name.encode()])
+
+
+def frames_of(kind: Kind, rng: np.random.Generator) -> Iterator[MarkerFrame]:
+    """The frames of one sequence."""
+    scene = make_scene(kind, rng)
+    caps = scene.caps
+    for k in range(kind.whole_frames + kind.frames):
+        if k > 0:
+            steps = scene.velocity + rng.normal(0.0, scene.wander_px, (len(caps), 2))
+            caps = tuple(cap.moved(du, dv) for cap, (du, dv) in zip(caps, steps.tolist(), strict=True))
+        judged = k >= kind.whole_frames
+        shown = caps
+        if judged and kind.hidden:
+            shown = tuple(replace(c, occluder=o) for c, o in zip(caps, scene.occluders, strict=True))
+        yield frame_of(scene, shown, k, rng, judged=judged)
+
+
+def frame_of(
+    scene: Scene, caps: tuple[Cap, ...], k: int, rng: np.random.Generator, *, judged: bool = True
+) -> MarkerFrame:
+    """The k-th frame of a scene, its caps as given, and the truth of the scene's own caps."""
+    seen = np.array([cap.visible for cap in caps])
+    return MarkerFrame(
+        image=expose(scene.light(caps), scene.kind.noise, rng),
+        t_ns=k * STEP_NS,
+        uv=seen[:, :2],
+        whole_uv=np.array([cap.whole for cap in caps]),
+        area=seen[:, 2],
+        visible=np.array([1.0 - c.occluder.share if c.occluder else 1.0 for c in caps]),
+        radius=np.array([math.sqrt(cap.a * cap.b) for cap in caps]),
+        judged=judged,
+    )
+
+
+def variance(light: Light, noise: float) -> Light:
+    """Variance of the sensor's noise at each level of linear light."""
+    full_well = 6000.0  # electrons at white: shot noise
+    read_noise = 0.002  # of white: together 1.7 grey levels at mid grey
+    return np.float32(noise**2) * (light / np.float32(full_well) + np.float32(read_noise**2))
+
+
+def expose(light: Light, noise: float, rng: np.random.Generator) -> Image:
+    """What the camera delivers for linear light (H, W, 3) RGB: noise, ten linear bits, sRGB bytes, BGR."""
+    signal = light + np.sqrt(variance(light, noise)) * rng.standard_normal(light.shape, np.float32)
+    codes = np.clip(signal * np.float32(BITS) + np.float32(0.5), 0, BITS).astype(np.uint16)
+    return np.ascontiguousarray(ENCODED[codes[..., ::-1]])

@@ -1,8 +1,8 @@
-"""Where tracked objects are: rendered frames, detectors of the slaves, line of the master, exact truth of the scene.
+"""Where tracked objects are: rendered frames, detectors of the slaves, line of the master, exact truth.
 
-The scene is `object` (`common/sim/travel`): the object wanders and turns, goes to and fro, turns wholly, and is partly
-hidden by a card and by a hand. Seeds are others than served to tune it. What a feature shows is the renderer's own
-truth; a feature *faces* a camera where it lies in its image, turned to it and large enough to be found nearly always.
+The scene `object` (`common/sim/travel`): the object wanders and turns, goes to and fro, turns wholly, and is partly
+hidden by a card and by a hand. Seeds are others than served to tune it. A feature *faces* a camera where it lies in its
+image, turned to it and large enough to be found nearly always.
 """
 
 from collections.abc import Iterable
@@ -30,7 +30,7 @@ from slave.tags.finder import TagFinder
 OBJECTS = {"wand": "beads", "cube": "tags"}
 SEEDS = (11, 12)
 PARTS = {"seen": ((2.0, 4.0), (16.0, 4.0), (24.0, 4.0)), "partly hidden": ((38.5, 3.0), (47.0, 3.0))}
-_HIDDEN, _WHOLE = 0.5, 0.93  # share that a feature shows which is hidden, and which is not at all
+_HIDDEN = 0.5  # share that a hidden feature shows at most
 Seen = dict[str, list[tuple[int, Float]]]
 """Camera -> when its rows were exposed [ns] and which shares of the features (F,) it sees."""
 
@@ -130,7 +130,7 @@ def _judged(
             for camera, model in models.items()
         ]
         least = float(np.min(shares))
-        if least < _HIDDEN or least > _WHOLE:
+        if least < _HIDDEN or least > 0.93:  # shown in part: neither
             flags[least < _HIDDEN][0] += pose.occluded
             flags[least < _HIDDEN][1] += 1
         if not pose.tracked:

@@ -1,8 +1,8 @@
 """Where a tracking system lies in the rig and its device on an object, from twelve seconds that cameras see, too.
 
-Cameras: truth with noise (`bench.objects.views`) through the line of the running
-master; the tracker is a simulated one (`common/sim/tracker`) in a frame of its own, with clocks apart, lost for half a
-second now and then. Errors are those of the object's pose by the tracker at poses that the motion never had.
+Cameras: truth with noise (`bench.objects.views`) through the line of the running master; the tracker is a simulated one
+in a frame of its own, with clocks apart, lost for half a second now and then. Errors are those of the object's pose by
+the tracker at poses that the motion never had.
 """
 
 from collections.abc import Iterable, Iterator
@@ -32,10 +32,8 @@ from master.objects.line import ObjectLine
 
 RIGS = {"cube of tags": "desk-cube", "wand of beads": "desk-wand"}
 SEEDS = (31, 32, 33, 34)  # 1 and 2 served to tune it
-SECONDS, TRACKER_HZ = 12.0, 100.0
-WAY_M, ROTATION_RAD = 0.11, np.radians(40.0)
-LOST_S, LOST_EVERY_S = 0.5, 5.0
-HIDDEN_S, HIDDEN_EVERY_S = 0.7, 6.1
+SECONDS = 12.0
+ROTATION_RAD = np.radians(40.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +100,7 @@ def moved(seed: int, centre_m: Float, axes: tuple[float, float, float]) -> Where
     def where(t_s: float) -> Float:
         way = np.sin(rate * t_s + phase)
         rotated = first @ rotation_vector_to_matrix(ROTATION_RAD * way[0] * np.array(axes))
-        return rigid(rotated, centre_m + WAY_M * way[1])
+        return rigid(rotated, centre_m + 0.11 * way[1])
 
     return where
 
@@ -118,7 +116,7 @@ def seen(
     """What the master makes of the cameras; a part of it is hidden now and then."""
 
     def hidden(camera: str, feature: int, t_s: float) -> bool:
-        return feature % 2 == 0 and t_s % HIDDEN_EVERY_S < HIDDEN_S
+        return feature % 2 == 0 and t_s % 6.1 < 0.7
 
     for message in detections(profile, rig.markers, models, where, SECONDS, seed, hides=hidden):
         yield from (one.pose for one in line.push(message))
@@ -131,12 +129,13 @@ def tracked(where: Where, X: Float, Y: Float, late_s: float, seed: int) -> Itera
     back, off = np.linalg.inv(X), np.zeros(6)
     size = np.repeat([WANDER_M, WANDER_RAD], 3)
     white = np.repeat([WHITE_M, WHITE_RAD], 3)
-    for k, t_s in enumerate(np.arange(-0.5, SECONDS + 0.5, 1.0 / TRACKER_HZ).tolist()):
+    tracker_hz = 100.0
+    for k, t_s in enumerate(np.arange(-0.5, SECONDS + 0.5, 1.0 / tracker_hz).tolist()):
         off = 0.9 * off + np.sqrt(1.0 - 0.9**2) * size * rng.normal(size=6)
         T = back @ where(t_s) @ Y
         error = off + white * rng.normal(size=6)
         place, rotation = T[:3, 3] + error[:3], rotation_vector_to_matrix(error[3:]) @ T[:3, :3]
-        lost = t_s % LOST_EVERY_S < LOST_S
+        lost = t_s % 5.0 < 0.5
         nowhere = np.full(4, np.nan)
         yield TrackerPose(
             "tracker",

@@ -16,7 +16,6 @@ Where = Callable[[float], Float]
 """Time [s] -> `T_rig_object` (4, 4)."""
 HIDES = Callable[[str, int, float], bool]
 """Camera, feature, time [s] -> whether something is before it."""
-PERIOD_S = 1.0 / 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +63,10 @@ def detections(
     rng = np.random.default_rng([seed, 7])
     features = Features.of(profile, markers)
     stays = {name: rng.normal(0.0, noise.correlated_px, (len(features.points), 2)) for name in models}
-    for seq in range(int(seconds / PERIOD_S)):
+    period_s = 1.0 / 60.0
+    for seq in range(int(seconds / period_s)):
         for c, (name, model) in enumerate(models.items()):
-            t_s = seq * PERIOD_S + c * offset_s
+            t_s = seq * period_s + c * offset_s
             uv, shown = _seen(features, model, where, t_s)
             uv = uv + stays[name] + rng.normal(0.0, noise.independent_px, uv.shape)
             hidden = [k for k in range(features.count) if hides(name, k, t_s)]

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from bench.oracle.compare import compare, plain, table
-from bench.oracle.freeze import Piece, freeze
-from bench.oracle.truth import FROZEN, sets_of
+from bench.oracle.score import compare, plain, table
+from bench.oracle.truth import FROZEN, Piece, freeze, sets_of
 from bench.report import ROOT, datasets
 from common.errors import PhalanxError
 
@@ -91,11 +90,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _chosen(out: Path, wanted: str | None) -> list[str]:
-    """The sets to solve.
-
-    Raises:
-        PhalanxError: There is none, or not that one.
-    """
+    """The sets to solve; PhalanxError: there is none, or not that one."""
     there = sets_of(out)
     if not there:
         raise PhalanxError(f"{out / FROZEN}: nothing is frozen here: python -m bench oracle freeze")
@@ -106,11 +101,7 @@ def _chosen(out: Path, wanted: str | None) -> list[str]:
 
 
 def _freeze(out: Path, wanted: str | None) -> int:
-    """Make the recordings.
-
-    Raises:
-        PhalanxError: There is no such set, or it cannot be written.
-    """
+    """Make the recordings; PhalanxError: there is no such set, or it cannot be written."""
     data = datasets()
     simulated, of_data = _makers(data)
     there = (data / "stereo").is_dir() and (data / "leapjs").is_dir()
@@ -133,28 +124,20 @@ def _absent(data: Path) -> str:
 
 def _makers(data: Path) -> tuple[dict[str, Maker], dict[str, Maker]]:
     """What makes each set: those of simulation, and those of the data folder."""
-    from bench.oracle import recorded, scenes, wrist  # only to freeze: these draw pictures
+    from bench.oracle import sets  # only to freeze: these draw pictures
 
-    simulated: dict[str, Maker] = {name: partial(scenes.scenes, name) for name in scenes.SCENES}
-    simulated |= {"held": scenes.held, "room": scenes.in_room}
-    simulated |= {name: partial(wrist.fused, name) for name in wrist.FUSED | wrist.RENDERED}
+    simulated: dict[str, Maker] = {name: partial(sets.scenes, name) for name in sets.SCENES}
+    simulated |= {"held": sets.held, "room": sets.in_room}
+    simulated |= {name: partial(sets.fused, name) for name in sets.FUSED | sets.RENDERED}
     of_data: dict[str, Maker] = {
-        name: partial(recorded.rendered, data, names) for name, names in recorded.RENDERED.items()
+        name: partial(sets.stereo, data, names) for name, names in sets.STEREO.items()
     }
-    of_data |= {"leap": partial(recorded.leap, data)}
-    of_data |= {
-        "wrist": partial(wrist.recorded, data),
-        "wrist_mesh": partial(wrist.meshes, data),
-    }
+    of_data |= {"leap": partial(sets.leap, data), "wrist": partial(sets.worn, data)}
     return simulated, of_data
 
 
 def solve(out: Path, runners: Sequence[Runner], sets: Sequence[str]) -> None:
-    """Make the runs, each by a process of its own, in alternating turns.
-
-    Raises:
-        PhalanxError: One of them failed; it has said why.
-    """
+    """Make the runs, each by a process of its own, in alternating turns; PhalanxError: one of them failed."""
     children = [_child(out.resolve(), one, sets) for one in runners]
     at, ended = "", False
     order = children

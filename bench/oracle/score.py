@@ -1,26 +1,18 @@
-"""How good the poses of a run are against exact truth: what each set adds, and the figures of one set or of all."""
+"""Figures of a run against exact truth; two runs side by side: the table, and whether the new one is as good."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from math import inf, isfinite, isnan
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.oracle.truth import STEP_NS, Truth
+from bench.oracle.truth import STEP_NS, Truth, truths_of
 from common.arrays import Bool, Float, Int
 from common.hand.model import FINGER_JOINTS
 from common.recording.recorded_files import read_npz
 
-CHI2_95 = 7.814727903
-"""95 % of a chi-square of 3 degrees of freedom."""
-_FLOOR_M2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
-_FALSE_MM, _FALSE_DEG = 15.0, 20.0  # from there on a TRACKED joint is a false one
-_REST_MM = 0.05  # of the fastest joint from instant to instant: the hand rests
-_FOLLOWS_NS = 60_000_000  # longer apart, two instants are no step
-_SAME_NS = 4_000_000  # poses of two runs at most so far apart are of one instant
-_FAST_M_S = 0.2  # of a joint: slower, its lag is less than its other errors
-_LONG_NS = 300_000_000  # of motion in which a lag can be seen
 LAGS_NS = 1_000_000 * np.arange(-20, 61)
 _OF_FINGER = np.zeros((26, 5), np.bool_)
 for _finger, _joints in enumerate(FINGER_JOINTS):
@@ -29,31 +21,20 @@ for _finger, _joints in enumerate(FINGER_JOINTS):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """The poses of one run of one set, T of all its recordings one after another.
+    """The poses of one run of one set, T of all its recordings one after another."""
 
-    Attributes:
-        piece: (T,) name of the recording.
-        t_ns: (T,) instants.
-        position_m: (T, 26, 3), angles_rad: (T, 5, 4), cov_m2: (T, 26, 3, 3), valid, tracked: (T, 26).
-        spent_us: (T,) processor time [us].
-    """
-
-    piece: npt.NDArray[np.str_]
-    t_ns: Int
-    position_m: Float
+    piece: npt.NDArray[np.str_]  # (T,) name of the recording
+    t_ns: Int  # (T,) instants
+    position_m: Float  # (T, 26, 3), angles_rad: (T, 5, 4), cov_m2: (T, 26, 3, 3), valid, tracked: (T, 26)
     angles_rad: Float
     cov_m2: Float
     valid: Bool
     tracked: Bool
-    spent_us: Float
+    spent_us: Float  # (T,) processor time [us]
 
     @classmethod
     def load(cls, path: Path) -> "Solved":
-        """Read out/NAME/SET.npz.
-
-        Raises:
-            RecordingError: It is not there, or broken.
-        """
+        """Read out/NAME/SET.npz; RecordingError: absent or broken."""
         names = [one.name for one in fields(cls)]
         data = read_npz(path, names, "run it again")
         return cls(
@@ -85,53 +66,29 @@ class Samples:
         joint_mm, tracked, inside: (N,) of each valid joint its error, whether it is TRACKED, and whether its 95 %
             region holds the truth; a joint without a covariance has no region.
         false: (N,) whether it is off by 15 mm, or the PIP of its finger by 20 degrees.
-        pip_deg: (P,) error of each PIP, `hidden_deg` (H,) of those of hidden fingers.
-        thumb_deg: (S,) error of each MCP of a thumb.
-        rest_mm: (R,) length of a step that a joint makes while the truth rests.
-        wanted: How many joints there are in truth, at all instants.
-        instants, without, ghosts: With a hand in truth, those of them without one in the run, and the reverse.
-        spent_us: (T,) processor time of each pose.
-        misfit: (L,) sum of squares [m^2] between TRACKED joints that move fast and truth delayed by each of `LAGS_NS`.
+        lag_m2: (L,) sum of squares [m^2] between fast TRACKED joints and truth delayed by each of `LAGS_NS`.
     """
 
     joint_mm: Float = field(default_factory=_nothing)
     tracked: Float = field(default_factory=_nothing)
     inside: Float = field(default_factory=_nothing)
     false: Float = field(default_factory=_nothing)
-    pip_deg: Float = field(default_factory=_nothing)
-    hidden_deg: Float = field(default_factory=_nothing)
-    thumb_deg: Float = field(default_factory=_nothing)
-    rest_mm: Float = field(default_factory=_nothing)
-    spent_us: Float = field(default_factory=_nothing)
-    misfit: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
-    wanted: int = 0
-    epochs: int = 0
-    without: int = 0
-    ghosts: int = 0
+    pip_deg: Float = field(default_factory=_nothing)  # (P,) error of each PIP
+    hidden_deg: Float = field(default_factory=_nothing)  # (H,) of those of hidden fingers
+    thumb_deg: Float = field(default_factory=_nothing)  # (S,) error of each MCP of a thumb
+    rest_mm: Float = field(default_factory=_nothing)  # (R,) a joint's step while the truth rests
+    spent_us: Float = field(default_factory=_nothing)  # (T,) processor time of each pose
+    lag_m2: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
+    wanted: int = 0  # how many joints there are in truth, at all instants
+    epochs: int = 0  # with a hand in truth
+    without: int = 0  # of them without one in the run
+    ghosts: int = 0  # with a hand in the run alone
 
     def joined(self, other: "Samples") -> "Samples":
         """Both together."""
-        return Samples(
-            *(
-                np.concatenate([getattr(self, name), getattr(other, name)])
-                for name in (
-                    "joint_mm",
-                    "tracked",
-                    "inside",
-                    "false",
-                    "pip_deg",
-                    "hidden_deg",
-                    "thumb_deg",
-                    "rest_mm",
-                    "spent_us",
-                )
-            ),
-            misfit=self.misfit + other.misfit,
-            wanted=self.wanted + other.wanted,
-            epochs=self.epochs + other.epochs,
-            without=self.without + other.without,
-            ghosts=self.ghosts + other.ghosts,
-        )
+        parts = ((one.name, getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        added = ("lag_m2", "wanted", "epochs", "without", "ghosts")
+        return Samples(**{name: a + b if name in added else np.concatenate([a, b]) for name, a, b in parts})
 
 
 def samples_of(run: Solved, truths: Mapping[str, Truth], other: Solved | None = None) -> Samples:
@@ -155,20 +112,21 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
     thumb_deg = np.where(shown, pip_deg, np.nan)[:, 0]
     pip_deg = np.where(shown & (np.arange(5) > 0), pip_deg, np.nan)  # of the thumb it is another joint
     hidden_deg = pip_deg[truth.hidden_at(run.t_ns)]
-    bent_wrong = ((pip_deg > _FALSE_DEG)[:, None, :] & _OF_FINGER).any(axis=2)
+    false_mm, false_deg = 15.0, 20.0  # from there on a TRACKED joint is a false one
+    bent_wrong = ((pip_deg > false_deg)[:, None, :] & _OF_FINGER).any(axis=2)
     missed = _missing(run.t_ns, other_ns, truth)
     exists = np.asarray(known.any(axis=1), np.bool_)
     return Samples(
         joint_mm=mm[scored],
         tracked=run.tracked[scored].astype(np.float64),
         inside=_inside(off_m[scored], run.cov_m2[scored]),
-        false=((mm > _FALSE_MM) | bent_wrong)[scored].astype(np.float64),
+        false=((mm > false_mm) | bent_wrong)[scored].astype(np.float64),
         pip_deg=pip_deg[np.isfinite(pip_deg)],
         hidden_deg=hidden_deg[np.isfinite(hidden_deg)],
         thumb_deg=thumb_deg[np.isfinite(thumb_deg)],
         rest_mm=_rest_mm(run, truth, valid),
         spent_us=run.spent_us,
-        misfit=_misfit(run, truth, scored & run.tracked),  # others are off by more than they lag
+        lag_m2=_lag_m2(run, truth, scored & run.tracked),  # others are off by more than they lag
         wanted=int(known.sum()) + missed * int(known.any(axis=0).sum()),
         epochs=int(exists.sum()) + missed,
         without=int((exists & ~scored.any(axis=1)).sum()) + missed,
@@ -185,16 +143,18 @@ def _missing(t_ns: Int, other_ns: Int, truth: Truth) -> int:
         near = np.minimum(
             np.abs(t_ns[after - 1] - other_ns), np.abs(t_ns[np.minimum(after, len(t_ns) - 1)] - other_ns)
         )
-        other_ns = other_ns[near > _SAME_NS]
+        same_ns = 4_000_000  # poses of two runs at most so far apart are of one instant
+        other_ns = other_ns[near > same_ns]
     return int(np.isfinite(truth.at(other_ns)[0]).any(axis=(1, 2)).sum())
 
 
 def _inside(off_m: Float, cov_m2: Float) -> Float:
     """(N,) whether errors (N, 3) are within the 95 % regions of covariances (N, 3, 3); without one: 0."""
     known = np.asarray(np.isfinite(cov_m2).all(axis=(1, 2)), np.bool_)
-    cov = np.where(known[:, None, None], cov_m2, np.eye(3)) + _FLOOR_M2 * np.eye(3)
+    floor_m2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
+    cov = np.where(known[:, None, None], cov_m2, np.eye(3)) + floor_m2 * np.eye(3)
     chi2 = (off_m * np.linalg.solve(cov, off_m[:, :, None])[:, :, 0]).sum(axis=1)
-    return (known & (chi2 <= CHI2_95)).astype(np.float64)
+    return (known & (chi2 <= 7.814727903)).astype(np.float64)  # of three degrees of freedom
 
 
 def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
@@ -205,13 +165,15 @@ def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
     moved_m = np.diff(exact, axis=0)
     known = np.asarray(np.isfinite(moved_m).all(axis=2), np.bool_)
     length = 1e3 * np.linalg.norm(moved_m, axis=2)
-    rests = known.any(axis=1) & (np.where(known, length, 0.0).max(axis=1) < _REST_MM)
-    rests &= np.diff(run.t_ns) < _FOLLOWS_NS
+    rest_mm = 0.05  # of the fastest joint from instant to instant: the hand rests
+    rests = known.any(axis=1) & (np.where(known, length, 0.0).max(axis=1) < rest_mm)
+    follows_ns = 60_000_000  # longer apart, two instants are no step
+    rests &= np.diff(run.t_ns) < follows_ns
     step = 1e3 * np.linalg.norm(np.diff(run.position_m, axis=0) - moved_m, axis=2)
     return step[rests[:, None] & known & valid[1:] & valid[:-1]]
 
 
-def _misfit(run: Solved, truth: Truth, scored: Bool) -> Float:
+def _lag_m2(run: Solved, truth: Truth, scored: Bool) -> Float:
     """(L,) sum over joints of the squares of what differs in motion, each joint's mean error left out."""
     out = np.zeros(len(LAGS_NS))
     if not truth.continuous:
@@ -219,10 +181,12 @@ def _misfit(run: Solved, truth: Truth, scored: Bool) -> Float:
     whole = np.asarray(scored.any(axis=1), np.bool_)
     for lag in (LAGS_NS[0], LAGS_NS[-1]):  # the same instants for all lags
         whole &= np.isfinite(truth.at(run.t_ns - lag)[0]).any(axis=(1, 2))
-    if whole.sum() < 2 or np.ptp(run.t_ns[whole]) < _LONG_NS:
+    long_ns = 300_000_000  # of motion in which a lag can be seen
+    if whole.sum() < 2 or np.ptp(run.t_ns[whole]) < long_ns:
         return out
     step_m = truth.at(run.t_ns + STEP_NS)[0] - truth.at(run.t_ns - STEP_NS)[0]
-    fast = np.linalg.norm(step_m, axis=2) > _FAST_M_S * 2e-9 * STEP_NS
+    fast_m_s = 0.2  # of a joint: slower, its lag is less than its other errors
+    fast = np.linalg.norm(step_m, axis=2) > fast_m_s * 2e-9 * STEP_NS
     used = scored & whole[:, None] & fast
     count = np.maximum(used.sum(axis=0), 1)[:, None]
     for k, lag in enumerate(LAGS_NS):
@@ -249,7 +213,7 @@ def figures(samples: Samples) -> dict[str, float]:
         "TRACKED %": 100.0 * float(tracked.sum()) / samples.wanted if samples.wanted else np.nan,
         "false TRACKED %": 100.0 * _mean(samples.false[tracked]),
         "jitter mm": float(np.sqrt(_mean(samples.rest_mm**2))),
-        "lag ms": _lag_ms(samples.misfit),
+        "lag ms": _lag_ms(samples.lag_m2),
         "pose us": _percentile(samples.spent_us, 50.0),
         "poses": float(len(samples.spent_us)),
         "no hand": float(samples.without),
@@ -265,11 +229,142 @@ def _percentile(values: Float, share: float) -> float:
     return float(np.percentile(values, share)) if len(values) else np.nan
 
 
-def _lag_ms(misfit: Float) -> float:
+def _lag_ms(lag_m2: Float) -> float:
     """Where it is least, by a parabola through three; NaN where nothing moves, or at an end."""
-    k = int(misfit.argmin())
-    if not misfit.any() or k in (0, len(misfit) - 1):
+    k = int(lag_m2.argmin())
+    if not lag_m2.any() or k in (0, len(lag_m2) - 1):
         return np.nan
-    before, at, after = misfit[k - 1 : k + 2]
+    before, at, after = lag_m2[k - 1 : k + 2]
     bend = before - 2.0 * at + after
     return float(1e-6 * LAGS_NS[k] + (0.5 * (before - after) / bend if bend > 0.0 else 0.0))
+
+
+ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """What a figure of the new run must keep to."""
+
+    figure: str  # which
+    most_times: float | None = None  # against that of the old run
+    least_times: float | None = None
+    most: float | None = None  # by itself
+    least: float | None = None
+    of: str = "both"  # sets it holds for: each "set", "all" together, or "both"
+
+
+RULES = (
+    Rule("joint mm", most_times=1.02),
+    Rule("99 % mm", most_times=1.1),
+    Rule("cover %", least=90.0, of="set"),
+    Rule("cover %", least=93.0, most=98.0, of=ALL),
+    Rule("false TRACKED %", most=2.0),
+    Rule("jitter mm", most_times=1.0),
+    Rule("valid %", least_times=0.98),
+    Rule("ghosts", most_times=1.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One set, or all."""
+
+    name: str  # of the set
+    old: Mapping[str, float]
+    new: Mapping[str, float]
+    fails: tuple[str, ...]  # what of the new one breaks a rule, and by how much
+
+
+def compare(out: Path, old: str, new: str, sets: Sequence[str]) -> list[Compared]:
+    """Each set, then all of them together; RecordingError: a run lacks a set."""
+    found: list[Compared] = []
+    totals = Samples(), Samples()
+    for name in sets:
+        truths = truths_of(out, name)
+        runs = [Solved.load(out / run / f"{name}.npz") for run in (old, new)]
+        both = samples_of(runs[0], truths, runs[1]), samples_of(runs[1], truths, runs[0])
+        found.append(judged(name, figures(both[0]), figures(both[1])))
+        totals = totals[0].joined(both[0]), totals[1].joined(both[1])
+    return [*found, judged(ALL, figures(totals[0]), figures(totals[1]))]
+
+
+def judged(name: str, old: Mapping[str, float], new: Mapping[str, float]) -> Compared:
+    """By the rules; a figure that neither run has is not judged, one that only the old has breaks its rule."""
+    kind = ALL if name == ALL else "set"
+    fails = [text for rule in RULES if rule.of in ("both", kind) for text in _broken(rule, old, new)]
+    return Compared(name, old, new, tuple(fails))
+
+
+def _broken(rule: Rule, old: Mapping[str, float], new: Mapping[str, float]) -> Iterator[str]:
+    was, now = old[rule.figure], new[rule.figure]
+    if isnan(now):
+        if not isnan(was):
+            yield f"{rule.figure}: nothing to measure, was {was:.2f}"
+        return
+    for most, least, what, base in (
+        (rule.most_times, rule.least_times, " x", was),
+        (rule.most, rule.least, "", 1.0),
+    ):
+        if isnan(base):
+            continue
+        value = now if not what else _ratio(was, now)
+        rounding = 1e-9
+        if most is not None and now > most * base + rounding:
+            yield f"{rule.figure} {value:.3g}{what}, at most {most:g}{what}" + _too(rule, old)
+        if least is not None and now < least * base - rounding:
+            yield f"{rule.figure} {value:.3g}{what}, at least {least:g}{what}" + _too(rule, old)
+
+
+def _too(rule: Rule, old: Mapping[str, float]) -> str:
+    """Says it where the old run breaks a rule of its own figure as well."""
+    was = old[rule.figure]
+    broken = (rule.most is not None and was > rule.most) or (rule.least is not None and was < rule.least)
+    return f" (old: {was:.3g})" if broken else ""
+
+
+def _ratio(old: float, new: float) -> float:
+    if old == new:
+        return 1.0
+    return new / old if old else inf
+
+
+def table(compared: Sequence[Compared]) -> str:
+    """Figures by column, old, new and ratio of each set by row; then the verdicts."""
+    names = list(compared[0].new)
+    width = max(len(one.name) for one in compared)
+    lines = [" " * (width + 7) + " ".join(f"{name:>{_width(name)}s}" for name in names)]
+    for one in compared:
+        ratio = {name: _ratio(one.old[name], one.new[name]) for name in names}
+        for label, row in (("old", one.old), ("new", one.new), ("ratio", ratio)):
+            cells = " ".join(f"{_cell(row[name], label):>{_width(name)}s}" for name in names)
+            lines.append(f"{one.name if label == 'old' else '':{width}s} {label:5s} {cells}")
+    lines.append("")
+    lines += [
+        f"{one.name:{width}s} {'FAILS: ' + '; '.join(one.fails) if one.fails else 'ok'}" for one in compared
+    ]
+    return "\n".join(lines)
+
+
+def _width(name: str) -> int:
+    return max(len(name), 7)
+
+
+def _cell(value: float, label: str) -> str:
+    if isnan(value):
+        return "-"
+    if label == "ratio" or not isfinite(value):
+        return f"{value:.3f}"
+    return f"{value:.0f}" if abs(value) >= 1000.0 or value == int(value) else f"{value:.2f}"
+
+
+def plain(compared: Sequence[Compared]) -> dict[str, object]:
+    """For JSON, which has no number for what could not be measured."""
+
+    def numbers(row: Mapping[str, float]) -> dict[str, float | None]:
+        return {name: value if isfinite(value) else None for name, value in row.items()}
+
+    return {
+        one.name: {"old": numbers(one.old), "new": numbers(one.new), "fails": list(one.fails)}
+        for one in compared
+    }

@@ -25,7 +25,6 @@ from master.run.app import StageTimes
 
 FROZEN = "frozen"
 KEPT = ("position_m", "angles_rad", "cov_m2", "valid", "tracked", "source")
-_TURN_S = 0.25  # of a recording
 
 
 def solved(path: Path, solver: str | None) -> Iterator[tuple[HandPose, float] | None]:
@@ -58,7 +57,7 @@ def solved(path: Path, solver: str | None) -> Iterator[tuple[HandPose, float] | 
             yield one.pose, 1e-3 * spent_ns / len(poses)
         if poses:
             spent_ns = 0
-        if message is not None and message.t_ns - turn_ns > _TURN_S * 1e9:
+        if message is not None and message.t_ns - turn_ns > 250_000_000:
             turn_ns = message.t_ns
             yield None
 

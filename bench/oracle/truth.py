@@ -1,37 +1,32 @@
-"""Exact truth of a frozen recording over time, and where the recordings of one place lie."""
+"""Frozen recordings: messages as slaves send them, with files of calibration, and exact truth over time beside them."""
 
+import json
+import shutil
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
+from common.messages import ImuSample, MarkerDetections, WristDetections
+from common.recording.messages import MessageWriter
 from common.recording.recorded_files import read_npz, write_npz
 
 FROZEN = "frozen"
-_MATCH_NS = 1_000_000
-_STILL_NS = 50_000_000  # a pose of an unrelated frame holds at its first row or at its middle one
 STEP_NS = 2_000_000
 """Between two rows of a truth that is read by linear interpolation: at 10 m/s^2 that errs by 5 um."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The hand at T moments, in the rig frame.
+    """The hand at T moments, in the rig frame."""
 
-    Attributes:
-        t_ns: (T,) increasing, on the clock of the messages.
-        joints_m: (T, 26, 3) in the order of a hand's joints; NaN: not known.
-        angles_rad: (T, 5, 4) in the order of `HandPose.angles_rad`; NaN: not known.
-        continuous: The hand moves from row to row; False: rows are unrelated poses.
-        hidden: (T, 5) of which fingers the sensors that show them best see nothing; None: of none.
-    """
-
-    t_ns: Int
-    joints_m: Float
-    angles_rad: Float
-    continuous: bool = True
-    hidden: Bool | None = None
+    t_ns: Int  # (T,) increasing, on the clock of the messages
+    joints_m: Float  # (T, 26, 3) in the order of a hand's joints; NaN: not known
+    angles_rad: Float  # (T, 5, 4) in the order of `HandPose.angles_rad`; NaN: not known
+    continuous: bool = True  # the hand moves from row to row; False: rows are unrelated poses
+    hidden: Bool | None = None  # (T, 5) fingers of which the sensors that show them best see nothing
 
     def at(self, t_ns: Int) -> tuple[Float, Float]:
         """Joints (N, 26, 3) and angles (N, 5, 4) at instants (N,); NaN where there is no truth."""
@@ -54,12 +49,14 @@ class Truth:
         before = self.t_ns[after - 1]
         share = ((t_ns - before) / (self.t_ns[after] - before))[:, None]
         found = (1.0 - share) * rows[after - 1] + share * rows[after]
-        inside = (t_ns >= self.t_ns[0] - _MATCH_NS) & (t_ns <= self.t_ns[-1] + _MATCH_NS)
+        match_ns = 1_000_000
+        inside = (t_ns >= self.t_ns[0] - match_ns) & (t_ns <= self.t_ns[-1] + match_ns)
         return np.where(inside[:, None], found, np.nan)
 
     def _still(self, rows: Float, t_ns: Int) -> Float:
         nearest = np.abs(self.t_ns - t_ns[:, None]).argmin(axis=1)
-        near = np.abs(self.t_ns[nearest] - t_ns) <= _STILL_NS
+        still_ns = 50_000_000  # a pose of an unrelated frame holds at its first row or at its middle one
+        near = np.abs(self.t_ns[nearest] - t_ns) <= still_ns
         return np.where(near[:, None], rows[nearest], np.nan)
 
     def save(self, path: Path) -> None:
@@ -70,11 +67,7 @@ class Truth:
 
     @classmethod
     def load(cls, path: Path) -> "Truth":
-        """Read it.
-
-        Raises:
-            RecordingError: It is not there, or broken.
-        """
+        """Read it; RecordingError: absent or broken."""
         names = ("t_ns", "joints_m", "angles_rad", "continuous")
         data = read_npz(path, names, "freeze it again", also=("hidden",))
         t_ns, hidden = data["t_ns"].astype(np.int64), data.get("hidden")
@@ -88,9 +81,40 @@ def sets_of(out: Path) -> list[str]:
 
 
 def truths_of(out: Path, name: str) -> dict[str, Truth]:
-    """Truth of each recording of one set, by its name.
-
-    Raises:
-        RecordingError: As of `Truth.load`.
-    """
+    """Truth of each recording of one set, by its name; RecordingError: absent or broken."""
     return {path.stem: Truth.load(path) for path in sorted((out / FROZEN / name).glob("*.npz"))}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """One recording of a set."""
+
+    name: str  # of the recording in its set
+    rigs: tuple[str, ...]  # the rig that is solved, or those of one hand
+    files: dict[str, bytes]  # files of calibration, by their path in a calibration tree
+    messages: Sequence[MarkerDetections | WristDetections | ImuSample]  # as solved
+    truth: Truth  # exact
+
+
+def calibration_files(tree: Path, rig: str) -> dict[str, bytes]:
+    """The files of one rig of a calibration tree, by their path in it."""
+    names = [f"rigs/{rig}.json"]
+    about = json.loads((tree / names[0]).read_text())
+    names += [f"cameras/{camera}.json" for camera in about["cameras"]]
+    names.append(f"hands/{about['hand']}.json")
+    return {name: (tree / name).read_bytes() for name in names}
+
+
+def freeze(out: Path, set_name: str, pieces: Iterable[Piece]) -> None:
+    """Write recordings and truths of one set; what it had before goes."""
+    folder = out / FROZEN / set_name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for piece in pieces:
+        about = {"rigs": json.dumps(piece.rigs), "continuous": json.dumps(piece.truth.continuous)}
+        writer = MessageWriter(folder / f"{piece.name}.mcap", piece.files, about)
+        for message in piece.messages:
+            writer.write("taken", message, getattr(message, "ready_t_ns", message.t_ns))
+        writer.close()
+        piece.truth.save(folder / f"{piece.name}.npz")
+        print(f"{set_name}/{piece.name}: {len(piece.messages)} messages", flush=True)

@@ -17,28 +17,124 @@ import os
 import signal
 import statistics
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from bench.rigs.local import UP_S, Lag, Rig, RigError, until
-from bench.rigs.poses import Pace, Poses, pace_of, steady_from
 from bench.rigs.relay import Impairment, UdpRelay
-from bench.rigs.rooms import DESK, slower
+from bench.rigs.rooms import DESK, slower, standard_scene
+from bench.rigs.sender import WAY_S, scene_s
+from common.arrays import Float
 from common.errors import BusError
-from common.messages import WIRE_VERSION, Checklist
+from common.messages import WIRE_VERSION, Checklist, HandPose
 from common.messages.streams import MASTER
+
+_GRID_HZ = 200.0
+_GAP_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One pose."""
+
+    came_s: float  # when, `time.monotonic`
+    age_s: float  # how old it was then, by its own time
+    worst_mm: float  # error of the worst TRACKED joint; NaN: none is tracked
+    beyond: float  # worst error of a valid joint, in its own standard deviations
+
+    @property
+    def false(self) -> bool:
+        """Whether it is sure of a joint and wrong about it."""
+        false_sigmas = 6.0  # of a valid joint, in its own standard deviations
+        # Of a TRACKED joint: so far off only where its covariance makes that likely.
+        false_mm, likely_sigmas = 60.0, 3.5
+        return self.beyond > false_sigmas or (self.worst_mm > false_mm and self.beyond > likely_sigmas)
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How poses come: so many a second, with gaps no longer than this [s]."""
+
+    rate_hz: float
+    gap_s: float = _GAP_S
+
+
+class Poses:
+    """All poses of one hand, judged by the scene of `bench.rigs.sender --way`. Holds them, and a table of the scene."""
+
+    def __init__(self, epoch_ns: int) -> None:
+        """Of the scene that began then."""
+        self._epoch_ns, self._lock, self._judged = epoch_ns, threading.Lock(), list[Judged]()
+        scene, count = standard_scene(), round(WAY_S * _GRID_HZ) + 2
+        self._table: Float = np.stack([scene.truth(k / _GRID_HZ).joints.position_m for k in range(count)])
+
+    def take(self, message: object, came_ns: int) -> None:
+        """Judge a pose that came at `came_ns`; other messages are ignored."""
+        if isinstance(message, HandPose):
+            judged = self.judged(message, came_ns)
+            with self._lock:
+                self._judged.append(judged)
+
+    def since(self, moment_s: float, until_s: float = float("inf")) -> list[Judged]:
+        """Return those that came in between, `time.monotonic`."""
+        with self._lock:
+            return [one for one in self._judged if moment_s <= one.came_s < until_s]
+
+    def judged(self, pose: HandPose, came_ns: int) -> Judged:
+        """Compare a pose with the truth."""
+        at = scene_s((pose.t_ns - self._epoch_ns) * 1e-9) * _GRID_HZ
+        k = int(at)
+        truth = self._table[k] + (at - k) * (self._table[k + 1] - self._table[k])
+        error = np.linalg.norm(pose.position_m - truth, axis=1)
+        sigma = np.sqrt(np.trace(pose.cov_m2, axis1=1, axis2=2))
+        beyond = float(np.max(error / sigma, where=pose.valid, initial=0.0))
+        worst_mm = 1e3 * float(error[pose.tracked].max(initial=-np.inf))
+        return Judged(
+            came_ns * 1e-9,
+            (came_ns - pose.t_ns) * 1e-9,
+            worst_mm if np.isfinite(worst_mm) else np.nan,
+            beyond,
+        )
+
+
+def pace_of(judged: list[Judged], began_s: float, ended_s: float, rate_hz: float) -> Pace:
+    """Return the pace from `began_s` to `ended_s`: at most `rate_hz`; gaps half as long again as the longest."""
+    came = [began_s, *(one.came_s for one in judged), ended_s]
+    longest_s = max(b - a for a, b in pairwise(came))
+    return Pace(min(rate_hz, len(judged) / (ended_s - began_s)), max(_GAP_S, 1.5 * longest_s))
+
+
+def steady_from(judged: list[Judged], moment_s: float, pace: Pace) -> float | None:
+    """Return when, after `moment_s`, poses came steadily and were right for half a second; None: not yet.
+
+    Steady: four fifths of the number of the pace, no gap above its own, no TRACKED joint off by more than 20 mm.
+    """
+    came = [one for one in judged if one.came_s >= moment_s]
+    steady_s, steady_share = 0.5, 0.8
+    sane_mm = 20.0  # of a TRACKED joint; the scene's hand is 180 mm long
+    for k, first in enumerate(came):
+        window = [one for one in came[k:] if one.came_s < first.came_s + steady_s]
+        if came[-1].came_s < first.came_s + steady_s:
+            return None
+        gaps = [b.came_s - a.came_s for a, b in pairwise(window)]
+        enough = len(window) >= steady_share * steady_s * pace.rate_hz and max(gaps, default=9.0) < pace.gap_s
+        if enough and all(one.worst_mm < sane_mm for one in window):
+            return first.came_s
+    return None
+
 
 CAMERAS = ("left", "right")
 RATE_HZ = 30.0
 LEAST_HZ = 6.0  # with fewer poses before any fault this machine can show nothing
 _CLOCK_S = {"left": 3.0, "right": -5.0}
-_CUT_S, _STOPPED_S, _CRASHES, _RESTART_S, _STEP_S = 5.0, 3.0, 4, 1.0, 10.0
-_GOAL_S, _AFTER_S, _BEHIND_S = 2.0, 1.0, 0.05  # behind: so late is a sleep where a machine has other work
-_FOLLOWING = 20  # steps until all is well: hello, answer, echoes, frames, an epoch, a pose
+_CUT_S, _STOPPED_S, _CRASHES, _RESTART_S = 5.0, 3.0, 4, 1.0
+_BEHIND_S = 0.05  # so late is a sleep where a machine has other work
 HEAD = (
     "| fault | expected | back after (median, slowest) | poses during it | worst tracked joint | false | oldest pose"
     " | counted | checklist |\n|---|---|--:|--:|--:|--:|--:|---|---|"
@@ -48,26 +144,16 @@ HEAD = (
 class FaultRig(Rig):
     """Two simulated cameras, a relay, a master, and a program on its bus.
 
-    Attributes:
-        relay: Between the cameras and the master.
-        poses: All that came.
-        pace: What is steady for this rig: nominal, or its own where a machine has other work (`own_pace`).
+    `pace`: what is steady for this rig: nominal, or its own where a machine has other work (`own_pace`).
     """
 
     def __init__(self, folder: Path, master_options: Sequence[str] = ()) -> None:
-        """Start everything and wait until it tracks.
-
-        Raises:
-            RigError: It does not in time.
-        """
+        """Start everything and wait until it tracks; RigError: it does not in time."""
         super().__init__(folder)
         self.tree = slower(folder, dict.fromkeys(CAMERAS, RATE_HZ))
         self.pace, self.epoch_ns, self._options = Pace(RATE_HZ), time.monotonic_ns(), tuple(master_options)
-        self.relay, self.poses, self.codes = (
-            UdpRelay(self.beacon_port, seed=11),
-            Poses(self.epoch_ns),
-            set[str](),
-        )
+        self.relay, self.poses = UdpRelay(self.beacon_port, seed=11), Poses(self.epoch_ns)
+        self.codes = set[str]()
         self.closing.append(self.relay.close)
         try:
             self.begin_master()
@@ -127,31 +213,22 @@ class FaultRig(Rig):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault.
+    """One fault; `bring` brings it about, waits while it lasts, takes it away, returns when its cause had ended."""
 
-    Attributes:
-        name: For the command line.
-        what, expected: What is done, and what is to happen besides coming back within two seconds.
-        bring: Brings it about, waits for as long as it lasts, takes it away; returns when its cause had ended.
-        counts: The master's counts of it: at least one rises. None named: nothing need.
-        listed: Codes of the checklist meanwhile.
-        tracks: Poses go on during it at this share of the nominal rate at least.
-        restarts: The master is a new process afterwards: its counts begin at 0.
-    """
-
-    name: str
+    name: str  # for the command line
     what: str
     expected: str
     bring: Callable[[FaultRig], float]
-    counts: tuple[str, ...] = ()
-    listed: tuple[str, ...] = ()
-    tracks: float = 0.0
-    restarts: bool = False
+    counts: tuple[str, ...] = ()  # the master's counts of it: at least one rises. None named: nothing need
+    listed: tuple[str, ...] = ()  # codes of the checklist meanwhile
+    tracks: float = 0.0  # poses go on during it at this share of the nominal rate at least
+    restarts: bool = False  # the master is a new process afterwards: its counts begin at 0
 
 
 def of_links(seconds: float = 4.0) -> list[Fault]:
     """Return all of them; those that only change a number last so long."""
     s = seconds
+    step_s = 10.0
     return [
         Fault("loss", "20 % of all datagrams lost", "tracks on; lost ones counted", _way(s, loss=0.2),
               ("left.lost", "right.lost"), ("packet_loss",), tracks=0.7),
@@ -167,9 +244,9 @@ def of_links(seconds: float = 4.0) -> list[Fault]:
               _master_again, restarts=True),
         Fault("slave_crashes", f"kill -9 of a slave, {_CRASHES} times, begun again after {_RESTART_S:g} s",
               "each new process replaces the last", _crash_loop, ("left.restarts",), ("camera_absent",)),
-        Fault("step_ahead", f"a slave's clock jumps {_STEP_S:g} s ahead", "frames of the future are refused; clock"
-              " measured anew", _step(_STEP_S), ("left.clock_steps",)),
-        Fault("step_back", f"a slave's clock jumps {_STEP_S:g} s back", "clock measured anew", _step(-_STEP_S),
+        Fault("step_ahead", f"a slave's clock jumps {step_s:g} s ahead", "frames of the future are refused; clock"
+              " measured anew", _step(step_s), ("left.clock_steps",)),
+        Fault("step_back", f"a slave's clock jumps {step_s:g} s back", "clock measured anew", _step(-step_s),
               ("left.clock_steps",)),
         Fault("slave_stopped", f"SIGSTOP of a slave for {_STOPPED_S:g} s", "one camera alone: tracked for 0.4 s,"
               " then depth is unsure", _stopped("left"), ("left.lost", "left.skipped"), ("camera_absent",)),
@@ -258,36 +335,24 @@ def _duplicate(rig: FaultRig) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run of a fault.
+    """One run of a fault."""
 
-    Attributes:
-        recovery_s: From the end of its cause to steady, right poses [s]; None: never.
-        share: Poses during it, of as many as came before it.
-        worst_mm: Worst error of a TRACKED joint from its beginning to a second after; NaN: none was tracked.
-        beyond: Worst error of a valid joint, in its own standard deviations.
-        false: Poses that are sure and wrong.
-        oldest_s: Age of the oldest pose that came, by its own time.
-        counts: Rise of the master's counts of it.
-        listed: Codes of the checklist meanwhile.
-        grown_mb: Memory of the master afterwards, against before.
-        lag_s: Worst delay of the machine [s].
-    """
-
-    recovery_s: float | None
-    share: float
-    worst_mm: float
-    beyond: float
-    false: int
-    oldest_s: float
-    counts: dict[str, int] = field(default_factory=dict[str, int])
-    listed: frozenset[str] = frozenset()
-    grown_mb: float = 0.0
-    lag_s: float = 0.0
+    recovery_s: float | None  # from the end of its cause to steady, right poses [s]; None: never
+    share: float  # poses during it, of as many as came before it
+    worst_mm: float  # of TRACKED joints, from its beginning to a second after; NaN: none was tracked
+    beyond: float  # worst error of a valid joint, in its own standard deviations
+    false: int  # poses that are sure and wrong
+    oldest_s: float  # age of the oldest pose that came, by its own time
+    counts: dict[str, int] = field(default_factory=dict[str, int])  # rise of the master's counts of it
+    listed: frozenset[str] = frozenset()  # codes of the checklist meanwhile
+    grown_mb: float = 0.0  # memory of the master afterwards, against before
+    lag_s: float = 0.0  # worst delay of the machine [s]
 
     @property
     def allowed_s(self) -> float:
         """Within what all has to be well: two seconds, and more where the machine was behind."""
-        return _GOAL_S + (_FOLLOWING * self.lag_s if self.lag_s > _BEHIND_S else 0.0)
+        following = 20  # steps until all is well: hello, answer, echoes, frames, an epoch, a pose
+        return 2.0 + (following * self.lag_s if self.lag_s > _BEHIND_S else 0.0)
 
     @property
     def over(self) -> bool:
@@ -324,9 +389,10 @@ def _measured(rig: FaultRig, fault: Fault) -> Run:
     began = time.monotonic()
     ended = fault.bring(rig)
     recovery_s = rig.steady_after(ended)
-    time.sleep(_AFTER_S)
+    after_s = 1.0
+    time.sleep(after_s)
     lag.close()
-    judged = rig.poses.since(began, ended + max(recovery_s or 0.0, _AFTER_S))
+    judged = rig.poses.since(began, ended + max(recovery_s or 0.0, after_s))
     during, after = [one for one in judged if one.came_s < ended], counts_of(rig)
     base = {} if fault.restarts else before
     return Run(

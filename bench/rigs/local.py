@@ -23,7 +23,6 @@ from common.messages.streams import MASTER
 
 UP_S = 90.0
 _PORTS = range(15_000, 32_000)  # below those that Linux assigns by itself (32768 to 60999)
-_TRIES = 100
 _TICKS = os.sysconf("SC_CLK_TCK")
 _ROLLED = {"Rss": "rss_mb", "Pss": "pss_mb", "Anonymous": "anonymous_mb"}
 _KB = re.compile(r"^(\w+):\s+(\d+)", re.MULTILINE)
@@ -35,27 +34,21 @@ class RigError(PhalanxError):
 
 
 def free_port(kind: int) -> int:
-    """Return a free port of this machine, for `socket.SOCK_DGRAM` or `socket.SOCK_STREAM`.
+    """Return a free port of this machine, for `socket.SOCK_DGRAM` or `socket.SOCK_STREAM`; OSError: none is.
 
     It is none of those that a system assigns by itself: nobody else gets it before its own process has it.
-
-    Raises:
-        OSError: None is free.
     """
-    for _ in range(_TRIES):
+    tries = 100
+    for _ in range(tries):
         port = _PORTS.start + secrets.randbelow(len(_PORTS))
         with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
             probe.bind(("0.0.0.0", port))
             return port
-    raise OSError(f"of {_TRIES} ports from {_PORTS.start} to {_PORTS.stop - 1} none was free")
+    raise OSError(f"of {tries} ports from {_PORTS.start} to {_PORTS.stop - 1} none was free")
 
 
 def join_bus(endpoint: str, patience_s: float, environment: Mapping[str, str] = os.environ) -> ZenohBus:
-    """Join the bus of a master that is about to listen at `endpoint`.
-
-    Raises:
-        BusError: It did not within `patience_s`.
-    """
+    """Join the bus of a master that is about to listen at `endpoint`; BusError: it did not within `patience_s`."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
@@ -78,32 +71,19 @@ def until(condition: Callable[[], bool], timeout_s: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """A process at a moment (Linux, /proc).
+    """A process at a moment (Linux, /proc)."""
 
-    Attributes:
-        rss_mb: Resident memory [MB = 1e6 bytes], pages that it shares with others included.
-        pss_mb: The same, each shared page divided by those that share it.
-        uss_mb: Pages that nobody shares.
-        anonymous_mb: Pages that are no file's: heap, stacks, arrays.
-        cpu_s: Processor time since it began, user and system.
-        threads, files: How many it has.
-    """
-
-    rss_mb: float
-    pss_mb: float
-    uss_mb: float
-    anonymous_mb: float
-    cpu_s: float
+    rss_mb: float  # resident memory [MB = 1e6 bytes], pages that it shares with others included
+    pss_mb: float  # the same, each shared page divided by those that share it
+    uss_mb: float  # pages that nobody shares
+    anonymous_mb: float  # pages that are no file's: heap, stacks, arrays
+    cpu_s: float  # processor time since it began, user and system
     threads: int
     files: int
 
 
 def footprint(pid: int) -> Footprint:
-    """Read the footprint of a process.
-
-    Raises:
-        OSError: There is no such process, or it belongs to somebody else.
-    """
+    """Read the footprint of a process; OSError: there is none, or it belongs to somebody else."""
     folder = Path(f"/proc/{pid}")
     rolled, status = (
         {k: int(v) for k, v in _KB.findall((folder / f).read_text())} for f in ("smaps_rollup", "status")
@@ -115,11 +95,7 @@ def footprint(pid: int) -> Footprint:
 
 
 def cpu_s(pid: int, task: str = "") -> float:
-    """Return the processor time of a process since it began [s], user and system; of one thread: `task/TID`.
-
-    Raises:
-        OSError: There is no such process.
-    """
+    """Return the processor time of a process since it began [s], user and system; of one thread: `task/TID`."""
     fields = (Path(f"/proc/{pid}") / task / "stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
@@ -174,10 +150,7 @@ class Rig:
     """Processes of one rig with its own key, ports and logs. Close it in any case.
 
     Attributes:
-        folder: For logs, keys and files.
         key: Rig key, hexadecimal.
-        beacon_port, master_port, bus_port: Of the beacons, the master's data, its bus.
-        environment: Of every process.
         processes: Name -> process, alive or not.
         closing: Called by `close`, the last first.
     """
@@ -203,10 +176,9 @@ class Rig:
         self.closing: list[Callable[[], None]] = []
 
     def start(self, name: str, *words: str, ready: str = "", **environment: str) -> None:
-        """Start `python -m WORDS`, in place of an earlier process of that name; wait until its log says `ready` again.
+        """Start `python -m WORDS`, in place of an earlier process of that name; wait until its log has `ready` again.
 
-        Raises:
-            RigError: It ended at once, or is not ready in time.
+        RigError: it ended at once, or is not ready in time.
         """
         if (old := self.processes.get(name)) is not None:
             end(old)
@@ -231,33 +203,21 @@ class Rig:
     def start_master(
         self, tree: Path, rigs: Sequence[str], *options: str, beacon: str = "", **env: str
     ) -> None:
-        """Start the master, with beacons to `beacon` (default: to slaves of this machine); wait until it listens.
-
-        Raises:
-            RigError: It does not.
-        """
+        """Start the master, with beacons to `beacon` (default: to slaves of this machine); wait until it listens."""
         place = [*(word for rig in rigs for word in ("--rig", rig)), "--calibration", str(tree)]
         link = ["--beacon", beacon or f"127.255.255.255:{self.beacon_port}"]
         link += ["--bind", f"127.0.0.1:{self.master_port}", "--bus", self.endpoint]
         self.start(MASTER, "master", "run", *place, *link, *options, ready="listening on", **env)
 
     def join(self) -> None:
-        """Join the master's bus.
-
-        Raises:
-            BusError: It does not come up.
-        """
+        """Join the master's bus; BusError: it does not come up."""
         self.bus = join_bus(self.endpoint, UP_S, self.environment)
         self.closing.append(self.bus.close)
 
     def ask(
         self, target: str = MASTER, verb: str = "report", body: str = "", timeout_s: float = 20.0
     ) -> Health:
-        """Command a process.
-
-        Raises:
-            BusError: It refuses, or does not answer.
-        """
+        """Command a process; BusError: it refuses, or does not answer."""
         return self.bus.ask(Command(target, verb, body), timeout_s)
 
     def counts(self) -> dict[str, int]:

@@ -17,28 +17,18 @@ from dataclasses import dataclass
 from common.link.datagram import Address
 
 _BROADCAST = "127.255.255.255"
-_LONGEST = 8192
 
 
 @dataclass(slots=True)
 class Impairment:
-    """What happens to each datagram, on each way alike. May be changed at any time.
+    """What happens to each datagram, on each way alike. May be changed at any time."""
 
-    Attributes:
-        loss: Probability of being lost.
-        delay_s: Every datagram is this late [s].
-        jitter_s: And up to this much more, evenly [s].
-        reorder: Probability of being held back by `held_s`, so that others overtake.
-        held_s: How long a held datagram waits [s].
-        duplicate: Probability of coming twice, each independently delayed.
-    """
-
-    loss: float = 0.0
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    reorder: float = 0.0
-    held_s: float = 0.02
-    duplicate: float = 0.0
+    loss: float = 0.0  # probability of being lost
+    delay_s: float = 0.0  # every datagram is this late [s]
+    jitter_s: float = 0.0  # and up to this much more, evenly [s]
+    reorder: float = 0.0  # probability of being held back by `held_s`, so that others overtake
+    held_s: float = 0.02  # how long a held datagram waits [s]
+    duplicate: float = 0.0  # probability of coming twice, each independently delayed
 
     @property
     def late(self) -> bool:
@@ -49,11 +39,7 @@ class Impairment:
 class UdpRelay:
     """Forwards between one master and its slaves until closed. Holds sockets, a thread, what waits.
 
-    Attributes:
-        way: What happens to datagrams.
-        cut: Nothing goes through: a cable is out.
-        forwarded, lost: Datagrams.
-        seen: Called with every datagram, and whether it was for the master.
+    `cut`: nothing goes through. `seen` is called with every datagram, and whether it was for the master.
     """
 
     def __init__(self, slave_beacon_port: int, seed: int = 1, way: Impairment | None = None) -> None:
@@ -101,7 +87,7 @@ class UdpRelay:
                 wait_s = min(wait_s, max(0.0, self._waiting[0][0] - time.monotonic()))
             readable, _, _ = select.select([self._inlet, self._front, *self._backs.values()], [], [], wait_s)
             for one in readable:
-                self._route(one, *one.recvfrom(_LONGEST))
+                self._route(one, *one.recvfrom(8192))
             while self._waiting and self._waiting[0][0] <= time.monotonic():
                 _, _, one, datagram, to = heapq.heappop(self._waiting)
                 self._send(one, datagram, to)

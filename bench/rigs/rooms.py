@@ -19,19 +19,11 @@ from master.rig.setup import RigSetup
 
 ROOM, DESK = "room", "desk"
 LOOP_S = 10.0  # of the scene, then the same again
-NOISE_PX, UNSEEN = 0.08, 0.05
 _RADIUS_M, _CONE_RAD, _GOLDEN_RAD = 0.62, np.radians(60.0), np.pi * (3.0 - np.sqrt(5.0))
-_CAP_M = 0.007
-_SEED = 12
 
 
 def room(folder: Path, cameras: int, rate_hz: float) -> Path:
-    """Write a calib_json tree with the rig `room` of so many cameras; return it.
-
-    Raises:
-        OSError: It cannot be written.
-        ValueError: Fewer than two cameras.
-    """
+    """Write a calib_json tree with the rig `room` of so many cameras; return it. ValueError: fewer than two cameras."""
     if cameras < 2:
         raise ValueError(f"cameras={cameras}: two or more are needed")
     tree = folder / f"room{cameras}"
@@ -96,20 +88,17 @@ def detections(
     *,
     loop_s: float = LOOP_S,
     phases_s: Mapping[str, float] | None = None,
-    unseen: float = UNSEEN,
+    unseen: float = 0.05,
     scene_s: Callable[[float], float] = lambda t_s: t_s,
 ) -> dict[str, list[MarkerDetections]]:
     """Return the messages of each camera of `loop_s` of the standard scene; times are since its beginning.
 
     Args:
-        setup: The rig.
-        rate_hz: Of each camera.
-        loop_s: How long.
         phases_s: Of the cameras; None: random.
         unseen: Share of markers that a camera does not see.
         scene_s: Scene time at a time since the beginning [s].
     """
-    scene, rng = standard_scene(), np.random.default_rng(_SEED)
+    scene, rng = standard_scene(), np.random.default_rng(12)
     to_rig = np.zeros(3)
     if setup.rig.name == ROOM:  # the dome's centre is its first camera's distance ahead, the scene's another
         to_rig[2] = _RADIUS_M - HAND_DEPTH_M
@@ -122,10 +111,10 @@ def detections(
         for seq in range(round(loop_s * rate_hz)):
             t_s = seq / rate_hz + phase_s
             caps = scene.truth(scene_s(t_s)).markers_m + to_rig
-            uv = model.project(caps) + rng.normal(size=(count, 2)) * NOISE_PX
+            uv = model.project(caps) + rng.normal(size=(count, 2)) * 0.08
             uv[rng.uniform(size=count) < unseen] = np.nan
             away = np.linalg.norm(caps - model.centre, axis=1)
-            area = np.where(np.isfinite(uv[:, 0]), np.pi * (_CAP_M * model.matrix[0, 0] / away) ** 2, np.nan)
+            area = np.where(np.isfinite(uv[:, 0]), np.pi * (0.007 * model.matrix[0, 0] / away) ** 2, np.nan)
             seen = np.where(np.isfinite(uv[:, 0]), 1.0, np.nan)
             t_ns = round(1e9 * t_s)
             out[name].append(

@@ -33,8 +33,6 @@ from slave.uplink import Uplink
 
 WAY_S = 10.0  # of the scene, forth and back with `--way`: nothing ever leaps
 LATE_S = {"left": 0.0, "right": 0.005}  # phases of the cameras with `--way`
-_BUFFERS = 4  # frames that a camera keeps while nobody reads it; older ones are gone
-_LEAD_S = 0.05
 
 
 def scene_s(t_s: float) -> float:
@@ -63,11 +61,12 @@ def send(cameras: Sequence[Camera], clock: SkewedClock, epoch_ns: int, stop: thr
     true, late_s = SystemClock(), list[float]()
     for one in cameras:
         period_ns = one.loop_ns / len(one.frames)
-        one.seq = max(0, round((true.now_ns() + 1e9 * _LEAD_S - epoch_ns) / period_ns))
+        one.seq = max(0, round((true.now_ns() + 0.05e9 - epoch_ns) / period_ns))
+    buffers = 4  # frames that a camera keeps while nobody reads it; older ones are gone
     while not stop.is_set():
         camera = min(cameras, key=lambda one: one.due_ns(epoch_ns))
         due_ns, period_ns = camera.due_ns(epoch_ns), camera.loop_ns / len(camera.frames)
-        if (gone := int((true.now_ns() - due_ns) // period_ns) - _BUFFERS) > 0:
+        if (gone := int((true.now_ns() - due_ns) // period_ns) - buffers) > 0:
             camera.seq += gone
             continue
         while (left_ns := due_ns - true.now_ns()) > 0:

@@ -43,9 +43,6 @@ RIGS = ("desk", "wrist")
 DEVICES = {"left": "desk", "right": "desk", "wrist": "wrist", "imu": "wrist"}  # -> rig
 SCENE = "both-poses"  # closed: it can go on for ever; slow enough for three frames of a triple at a low rate
 DRIFT_PPM = {"left": 20.0, "right": -35.0, "wrist": 50.0, "imu": 8.0}
-_LEAD_S = 6.0  # until the hand begins to move
-_DEPTH = 4096
-_LISTEN_S, _MINUTE_S = 0.5, 60.0
 _GREY = "#777777"
 
 
@@ -58,7 +55,8 @@ class SoakRig(Rig):
         tree = slower(folder, {"left": marker_hz, "right": marker_hz, "wrist": wrist_hz})
         try:
             self.start_master(tree, RIGS)
-            epoch_ns = time.monotonic_ns() + round(1e9 * _LEAD_S)
+            lead_s = 6.0  # until the hand begins to move
+            epoch_ns = time.monotonic_ns() + round(1e9 * lead_s)
             for name, rig in DEVICES.items():
                 kind = "--imu" if name == "imu" else "--camera"
                 place = ["--name", name, "--rig", rig, "--calibration", str(tree), "--bind", "127.0.0.1"]
@@ -68,15 +66,14 @@ class SoakRig(Rig):
             self.join()
             self._latency_ms, self._health = list[float](), dict[str, Health]()
             self._lock = threading.Lock()
-            self.read("hand", self._keep, depth=_DEPTH)
-            self.read("health", self._keep, depth=_DEPTH)
+            depth = 4096
+            self.read("hand", self._keep, depth=depth)
+            self.read("health", self._keep, depth=depth)
         except BaseException:
             self.close()
             raise
-        self.course, self._start_s = (
-            SoakHistory(footprints={name: [] for name in self.processes}),
-            time.monotonic(),
-        )
+        self.course = SoakHistory(footprints={name: [] for name in self.processes})
+        self._start_s = time.monotonic()
         self._since_s, self._cpu_s, self._mapped = 0.0, self._spent_s(), self._maps()
 
     @property
@@ -89,21 +86,13 @@ class SoakRig(Rig):
         return [name for name in self.processes if not self.alive(name)]
 
     def measure(self) -> None:
-        """Read the memory of all processes.
-
-        Raises:
-            OSError: One of them has ended.
-        """
+        """Read the memory of all processes; OSError: one of them has ended."""
         self.course.times_s.append(self.now_s)
         for name in self.processes:
             self.course.footprints[name].append(self.footprint(name))
 
     def end_minute(self) -> Minute:
-        """Sum up what came since the last call.
-
-        Raises:
-            OSError: A process has ended.
-        """
+        """Sum up what came since the last call; OSError: a process has ended."""
         with self._lock:
             latency_ms, health = self._latency_ms, dict(self._health)
             self._latency_ms = []
@@ -148,14 +137,10 @@ def _ending(metrics: dict[str, float], end: str) -> dict[str, float]:
 
 
 def draw(course: SoakHistory, title: str, file: Path) -> None:
-    """Draw memory, latency, poses and clocks over the minutes.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    made = figure(11.0, 8.4)
-    axes = made.subplots(3, 2, sharex=True)
-    for panel, at in zip((_memory, _growth, _latency, _poses, _clocks, _cores), axes.flat, strict=True):
+    """Draw memory, latency, poses and clocks over the minutes."""
+    made = figure(11.0, 5.8)
+    axes = made.subplots(2, 2, sharex=True)
+    for panel, at in zip((_growth, _latency, _poses, _clocks), axes.flat, strict=True):
         panel(at, course)
     warm = warm_up_s(course.times_s[-1]) / 60.0 if course.times_s else 0.0
     for panel in axes.flat:
@@ -164,19 +149,10 @@ def draw(course: SoakHistory, title: str, file: Path) -> None:
         panel.margins(x=0.01)
         if panel.get_legend_handles_labels()[0]:
             panel.legend(fontsize=8, ncols=3)
-    for panel in axes[2]:
+    for panel in axes[1]:
         panel.set_xlabel("minutes (grey: warm-up, not judged)")
     made.suptitle(title, fontsize=11)
     made.savefig(file)
-
-
-def _memory(axes: Axes, course: SoakHistory) -> None:
-    minutes = np.array(course.times_s) / 60.0
-    for colour, name in zip(COLOURS, course.footprints, strict=False):
-        axes.plot(minutes, course.series(name, "rss_mb"), color=colour, label=name, linewidth=1.5)
-        axes.plot(minutes, course.series(name, "uss_mb"), color=colour, linewidth=0.9, linestyle=":")
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("memory [MB]\nresident; dotted: not shared")
 
 
 def _growth(axes: Axes, course: SoakHistory) -> None:
@@ -236,22 +212,15 @@ def _clocks(axes: Axes, course: SoakHistory) -> None:
     axes.set_ylabel("clock, without its\nstraight line [us]")
 
 
-def _cores(axes: Axes, course: SoakHistory) -> None:
-    minutes = [one.t_s / 60.0 for one in course.minutes]
-    for colour, name in zip(COLOURS, course.footprints, strict=False):
-        axes.plot(minutes, [one.cores.get(name, 0.0) for one in course.minutes], color=colour, label=name)
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("processor [cores]")
-
-
 def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistory, list[str]]:
     """Run for the time asked for, or until `stop`; return what was measured, and who ended by himself."""
     rig = SoakRig(options.out, options.marker_hz, options.wrist_hz)
     try:
         names = ", ".join(f"{name} (pid {one.pid})" for name, one in rig.processes.items())
         print(f"started {names}; logs in {options.out}", flush=True)
-        next_s, next_minute_s = 0.0, _MINUTE_S
-        while not stop.wait(_LISTEN_S) and rig.now_s < _MINUTE_S * options.minutes:
+        listen_s, minute_s = 0.5, 60.0
+        next_s, next_minute_s = 0.0, minute_s
+        while not stop.wait(listen_s) and rig.now_s < minute_s * options.minutes:
             if gone := rig.gone():
                 return rig.course, gone
             if rig.now_s >= next_s:
@@ -260,7 +229,7 @@ def _run(options: argparse.Namespace, stop: threading.Event) -> tuple[SoakHistor
             if rig.now_s >= next_minute_s:
                 _show(rig.end_minute(), rig.course)
                 _save(options, rig.course)
-                next_minute_s += _MINUTE_S
+                next_minute_s += minute_s
         rig.end_minute()
         return rig.course, []
     finally:

@@ -20,48 +20,27 @@ import numpy as np
 from bench.rigs.local import Footprint
 from common.arrays import Float
 
-MB_PER_H = 1.0
-GROWS_MS, GROWS_SHARE = (
-    1.0,
-    0.05,
-)  # latency that grew by less over the run, or by less of itself, did not grow
-WARM_UP_S, WARM_UP_SHARE = 300.0, 1.0 / 6.0
-BLOCK_S, QUIET_MINUTES = 60.0, 5
+# Latency that grew by less over the run, or by less of itself, did not grow.
+GROWS_MS, GROWS_SHARE = 1.0, 0.05
+BLOCK_S = 60.0
 LEAST_S = 600.0  # after the warm-up; a shorter run cannot tell 1 MB/h from the last arenas that are filled
-_Z95 = 1.96
 _FEWEST = 4
 STEP_MB = 2.0
-LEAST_MINUTES = 3
-_SHOWN_MB = 0.5
-_MOST_SHOWN = 3
-_KIB = 1024
 
 
 @dataclass(frozen=True, slots=True)
 class Minute:
-    """What a minute was like.
+    """What a minute was like."""
 
-    Attributes:
-        t_s: Its end, since the start of the soak.
-        poses_hz: Poses of hands.
-        p50_ms, p99_ms: Latency: from the hand-over of the last frame that contributed to publication.
-        load: Load average of the machine, which others may use as well.
-        cores: Process -> processor time in seconds a second.
-        counts: What the master counted since the start: lost, skipped, dropped, refused, blocked.
-        clock_offset_us: Sender -> by how much its clock is ahead of the master's.
-        clock_sigma_us: Sender -> how sure the master is of that.
-        grown: Process -> mapping -> by how much that one has grown in this minute [MB].
-    """
-
-    t_s: float
-    poses_hz: float
-    p50_ms: float
+    t_s: float  # its end, since the start of the soak
+    poses_hz: float  # poses of hands
+    p50_ms: float  # latency: from the hand-over of the last frame that contributed to publication
     p99_ms: float
-    load: float
-    cores: dict[str, float]
-    counts: dict[str, int]
-    clock_offset_us: dict[str, float]
-    clock_sigma_us: dict[str, float]
+    load: float  # load average of the machine, which others may use as well
+    cores: dict[str, float]  # process -> processor time in seconds a second
+    counts: dict[str, int]  # of the master since the start: lost, skipped, dropped, refused, blocked
+    clock_offset_us: dict[str, float]  # sender -> by how much its clock is ahead of the master's
+    clock_sigma_us: dict[str, float]  # sender -> how sure the master is of that
     grown: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
@@ -108,19 +87,15 @@ class Mapping:
 
 
 def steps_of(times_s: Sequence[float] | Float, mb: Sequence[float] | Float) -> list[Step] | None:
-    """Return rises of more than `STEP_MB` from the median of one minute to that of the next; None: too short to say.
+    """Return rises of more than `STEP_MB` from the median of one minute to that of the next; None: too short.
 
-    Rises in minutes that follow each other are one step. In the first minute files are read and tables filled: the
-    second is held against the most that it had.
-
-    Args:
-        times_s: (N,) readings [s].
-        mb: (N,) resident memory [MB].
+    Of readings `mb` (N,) at times (N,) [s]. Rises in minutes that follow each other are one step. In the first minute
+    files are read and tables filled: the second is held against the most that it had.
     """
     times, values = np.asarray(times_s, np.float64), np.asarray(mb, np.float64)
     block = (times // BLOCK_S).astype(np.int64)
     minutes = [int(k) for k in np.unique(block)]
-    if len(minutes) < LEAST_MINUTES:
+    if len(minutes) < 3:
         return None
     medians = [float(np.median(values[block == k])) for k in minutes]
     medians[0] = float(values[block == minutes[0]].max())
@@ -137,11 +112,7 @@ def steps_of(times_s: Sequence[float] | Float, mb: Sequence[float] | Float) -> l
 
 
 def mapped(pid: int) -> list[Mapping]:
-    """Return what a process has mapped, and how much of each is resident.
-
-    Raises:
-        OSError: There is no such process, or it belongs to somebody else.
-    """
+    """Return what a process has mapped, and how much of each is resident."""
     found: list[Mapping] = []
     for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
         first, _, rest = line.partition(" ")
@@ -151,7 +122,7 @@ def mapped(pid: int) -> list[Mapping]:
             name = Path(fields[4]).name if len(fields) > 4 else "anonymous"
             found.append(Mapping(int(start, 16), int(end, 16), f"{start} {name}", 0.0))
         elif first == "Rss:":
-            found[-1] = replace(found[-1], mb=float(rest.split()[0]) * _KIB * 1e-6)
+            found[-1] = replace(found[-1], mb=float(rest.split()[0]) * 1024 * 1e-6)
     return found
 
 
@@ -164,8 +135,8 @@ def grown(before: Sequence[Mapping], after: Sequence[Mapping]) -> dict[str, floa
         one.name: one.mb - sum(old.mb for old in before if old.start < one.end and one.start < old.end)
         for one in after
     }
-    kept = sorted((one for one in more.items() if one[1] > _SHOWN_MB), key=lambda one: -one[1])
-    return dict(kept[:_MOST_SHOWN])
+    kept = sorted((one for one in more.items() if one[1] > 0.5), key=lambda one: -one[1])
+    return dict(kept[:3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +173,8 @@ def slope(times_s: Sequence[float] | Float, values: Sequence[float] | Float) -> 
     power = float(left @ left)
     r = float(left[1:] @ left[:-1]) / power if power > 0 else 0.0
     wider = sqrt((1.0 + max(r, 0.0)) / (1.0 - min(max(r, 0.0), 0.95)))
-    spread = _Z95 * wider * sqrt(n * (n - 1) * (2 * n + 5) / 18.0)
+    z95 = 1.96
+    spread = z95 * wider * sqrt(n * (n - 1) * (2 * n + 5) / 18.0)
     low = round((len(pairs) - spread) / 2.0)
     high = round((len(pairs) + spread) / 2.0)
     return Slope(middle, float(pairs[max(low, 0)]), float(pairs[min(high, len(pairs) - 1)]))
@@ -210,7 +182,7 @@ def slope(times_s: Sequence[float] | Float, values: Sequence[float] | Float) -> 
 
 def warm_up_s(length_s: float) -> float:
     """What is left out at the beginning of a run: files are read, tables and rings filled, learners settle."""
-    return min(WARM_UP_S, WARM_UP_SHARE * length_s)
+    return min(300.0, 1.0 / 6.0 * length_s)
 
 
 def memory_slope(course: SoakHistory, process: str, quantity: str = "rss_mb") -> Slope:
@@ -233,7 +205,8 @@ def latency_slope(minutes: Sequence[Minute], quantity: str) -> Slope:
     if not minutes or minutes[-1].t_s - warm_up_s(minutes[-1].t_s) < LEAST_S:
         return Slope(nan, nan, nan)
     late = [one for one in minutes if one.t_s > warm_up_s(minutes[-1].t_s)]
-    size = QUIET_MINUTES if len(late) >= _FEWEST * QUIET_MINUTES else 1
+    quiet_minutes = 5
+    size = quiet_minutes if len(late) >= _FEWEST * quiet_minutes else 1
     groups = [late[k : k + size] for k in range(0, len(late) - size + 1, size)]
     least = [min(group, key=lambda one: getattr(one, quantity)) for group in groups]
     return slope([one.t_s for one in least], [getattr(one, quantity) for one in least])
@@ -244,14 +217,15 @@ def judge(course: SoakHistory, ended: Sequence[str]) -> list[Finding]:
     findings = [Finding("processes that ended", ", ".join(ended) or "none", "none", not ended)]
     for process in course.footprints:
         found = memory_slope(course, process)
+        mb_per_h = 1.0
         findings.append(
             Finding(
                 f"memory of {process}",
                 "too short to say"
                 if np.isnan(found.per_h)
                 else f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})",
-                f"{MB_PER_H:g} MB/h",
-                None if np.isnan(found.per_h) else found.per_h <= MB_PER_H,
+                f"{mb_per_h:g} MB/h",
+                None if np.isnan(found.per_h) else found.per_h <= mb_per_h,
             )
         )
     findings += [_steps(course, process) for process in course.footprints]

@@ -5,7 +5,7 @@ Each participant does the guided motion of the calibration, then the poses in ra
 participants did, so its figures stand beside ours and are not the same measurement.
 
     python -m bench study                          12 people, 3 blocks; about an hour on two cores
-    python -m bench study --participants 2 --blocks 2 --known all
+    python -m bench study --participants 2 --blocks 2
     python -m bench study --picture docs/images/study.png
 """
 
@@ -19,13 +19,11 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
 from bench.report import COLOURS, figure, rig_files
-from bench.study.people import Known
-from bench.study.trials import SolverMode, Task, Trial, performed, trials_of
+from bench.study.trials import Task, Trial, performed, trials_of
 from common.arrays import Bool, Float, Int
 from common.hand.model import FINGERS
 from common.sim.motion import POSES
@@ -34,26 +32,18 @@ from common.sim.motion import POSES
 _MEAN_LIMIT_DEG, _MEAN_RANGE_DEG = 9.0, {"index": (1.8, 2.9), "little": (3.8, 7.3)}
 _PAPER_ICC = {"thumb": 0.74, "index": 0.88, "middle": 0.84, "ring": 0.81, "little": 0.66}
 _ICC_GOAL = 0.8  # ours, for every finger
-_DRAWS = 40  # of pairs of blocks, as in the paper
-_FEWEST_TARGETS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One finger in one pose.
-
-    Attributes:
-        trials, reached: How many there were, and in how many of them the finger was tracked.
-        blind: In how many it was tracked although neither laser line nor tip was in sight; they count in the error.
-        mean_deg, sd_deg: Of the absolute error of the PIP over the trials that were reached; NaN: not reached.
-    """
+    """One finger in one pose."""
 
     finger: str
     pose: str
     trials: int
-    reached: int
-    blind: int
-    mean_deg: float
+    reached: int  # trials in which the finger was tracked
+    blind: int  # tracked although neither laser line nor tip was in sight; they count in the error
+    mean_deg: float  # of the absolute error of the PIP over trials that were reached; NaN: not reached
     sd_deg: float
 
     @property
@@ -86,18 +76,16 @@ def cells_of(trials: Sequence[Trial]) -> list[Cell]:
             own = [one for one in trials if one.pose == pose]
             tracked: Bool = np.array([one.tracked[f] for one in own], np.bool_)
             error = np.abs([one.pip_deg[f] - one.truth_deg[f] for one in own])[tracked]
-            blind, shown = (
-                sum(bool(one.tracked[f] and not one.seen[f]) for one in own),
-                2 * len(error) >= len(own),
-            )
+            blind = sum(bool(one.tracked[f] and not one.seen[f]) for one in own)
+            shown = 2 * len(error) >= len(own)
             mean = float(error.mean()) if shown and len(error) else float("nan")
             sd = float(error.std(ddof=1)) if shown and len(error) > 1 else float("nan")
             out.append(Cell(finger, pose, len(own), len(error), blind, mean, sd))
     return out
 
 
-def repeated(trials: Sequence[Trial], seed: int, draws: int = _DRAWS) -> list[Repeated]:
-    """Return the ICC of every finger between two random blocks of each participant.
+def repeated(trials: Sequence[Trial], seed: int, draws: int = 40) -> list[Repeated]:
+    """Return the ICC of every finger between two random blocks of each participant, 40 draws as in the paper.
 
     Targets are participant x pose; one counts where both of its trials were tracked and its cell is reached.
     """
@@ -140,7 +128,7 @@ def icc_1_1(ratings: Float) -> float:
     NaN with fewer than three targets, or where all ratings are alike.
     """
     n, k = ratings.shape
-    if n < _FEWEST_TARGETS or k < 2:
+    if n < 3 or k < 2:
         return float("nan")
     means = ratings.mean(axis=1)
     between = k * float(((means - ratings.mean()) ** 2).sum()) / (n - 1)
@@ -233,19 +221,13 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--participants", type=int, default=12)
     parser.add_argument("--blocks", type=int, default=3, help="how often each makes the six poses")
     parser.add_argument("--seed", type=int, default=1, help="same seed, same people, same poses")
-    parser.add_argument(
-        "--known", choices=get_args(Known), default="calibrated", help="of bones and mounting"
-    )
-    parser.add_argument(
-        "--solver-mode", choices=get_args(SolverMode), help="fingers from the laser alone (fk), with tip (ik)"
-    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="participants at a time")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every trial to FILE")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw errors and repeatability")
     options = parser.parse_args(arguments)
     rig, cameras, hand = rig_files("wrist")
     camera = cameras[rig.cameras[0]]
-    task = Task(rig, camera, hand, options.seed, options.blocks, options.known, options.solver_mode)
+    task = Task(rig, camera, hand, options.seed, options.blocks)
     trials = simulate(task, options.participants, options.jobs)
     print("\n".join(lines_of(trials, options.seed)))
     if options.json is not None:

@@ -1,12 +1,10 @@
 """Joint angles of five fingers by a wrist device alone, from its frames: by level, and in every light; exact truth.
 
-Recordings, hands of a mesh (`bench.wrist_mesh`) whose joints are independent, and the six poses of the Digits study,
-simulated from dark to sun. Every cycle is an unrelated pose, found by the slave's detector; the device knows its palm
-and the bones, not the skin. Errors are of valid fingers, those of TRACKED ones beside them; *false* are TRACKED fingers
-whose PIP is off by 20 degrees or more. Baseline of the recordings: the cubic that the paper prints.
+Recordings, and the six poses of the Digits study, simulated from dark to sun. Every cycle is an unrelated pose, found
+by the slave's detector; the device knows its palm and the bones, not the skin. Errors are of valid fingers, those of
+TRACKED ones beside them; *false*: TRACKED, PIP off by 20 degrees or more. Baseline: the cubic that the paper prints.
 """
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +14,9 @@ import cv2
 import numpy as np
 from msgspec.structs import replace as changed
 
-from bench.oracle.recorded import angles_of
+from bench.oracle.sets import angles_of
 from bench.report import Row, datasets, rig_files, skipped
 from bench.wrist.frames import RECORDINGS, drawn, recorded
-from bench.wrist_mesh.sets import set_named, write_set
 from common.arrays import Bool, Float
 from common.hand.model import CHAINS
 from common.messages import WristDetections
@@ -30,10 +27,7 @@ from slave.wrist.detector import find
 from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle
 
-_POSES, _SEEDS = 24, (301, 302, 303)
-_MESHES, _TRIPLES, _MESH_SEED = ("random", "left_random"), 30, 303
-_FALSE_DEG = 20.0
-_CYCLE_NS = 33_333_333
+_SEEDS = (301, 302, 303)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +67,17 @@ class Found:
         sure = off[tracked & known]
         thumb = self.off_deg[np.isfinite(self.off_deg[:, 0]), 0]
         mean, of_thumb = (float(one.mean()) if len(one) else np.nan for one in (sure, thumb))
+        false_deg = 20.0
         text = (
             f"valid {100.0 * known.mean():.0f} %; TRACKED {100.0 * tracked.mean():.0f} %, off by {mean:.1f}, false"
-            f" {int((sure >= _FALSE_DEG).sum())} of {len(sure)}; thumb {of_thumb:.1f}, TRACKED"
+            f" {int((sure >= false_deg).sum())} of {len(sure)}; thumb {of_thumb:.1f}, TRACKED"
             f" {100.0 * self.tracked[:, 0].mean():.0f} %"
         )
         return Row(name, self.pip_deg, "deg", f"{text}; {note}" if note else text)
 
 
 def rows() -> Iterator[Row]:
-    """Measure recordings, meshes, and every light."""
+    """Measure recordings and every light."""
     cv2.setNumThreads(1)
     data = datasets()
     if (data / "wrist").is_dir():
@@ -92,11 +87,6 @@ def rows() -> Iterator[Row]:
             yield Found.of(seen, "ik").row("  laser and tip (ik)")
             yield Found.of(seen, "fk").row("  laser alone, natural (fk)")
             yield Found.of(seen, "fk", cubic=True).row("  the printed cubic", "baseline")
-        with tempfile.TemporaryDirectory() as folder:
-            for name in _MESHES:
-                there = Path(folder) / name
-                write_set(set_named(name, data, _TRIPLES, _MESH_SEED), data, there, _MESH_SEED)
-                yield Found.of(of_recording(there, data / "hands")).row(f"{name}, mesh: PIP")
     else:
         yield skipped("recordings", data / "wrist")
     found = {light: _joined([Found.of(simulated(light, seed)) for seed in _SEEDS]) for light in AMBIENTS}
@@ -124,11 +114,10 @@ def simulated(light: str, seed: int) -> Seen:
     """Render and detect some moments of the six poses."""
     rig, cameras, hand = rig_files("wrist")
     camera = cameras[rig.cameras[0]]
-    scene, view = (
-        WristScene.by_name(f"poses@{light}", rig, cameras, hand, seed),
-        WristView.of(rig, camera, hand),
-    )
-    times = (np.arange(_POSES) + 0.5) * scene.period_s / _POSES
+    scene = WristScene.by_name(f"poses@{light}", rig, cameras, hand, seed)
+    view = WristView.of(rig, camera, hand)
+    poses = 24
+    times = (np.arange(poses) + 0.5) * scene.period_s / poses
     angles = np.array([scene.truth(float(t)).angles_rad for t in times])
     messages = _messages(drawn(scene, camera.name, times), view, camera.name)
     return Seen(WristSetup.of(rig, camera, view.model), messages, angles)
@@ -137,7 +126,7 @@ def simulated(light: str, seed: int) -> Seen:
 def _messages(cycles: Sequence[StrobeCycle], view: WristView, camera: str) -> list[WristDetections]:
     """The detector's messages, with times one after another."""
     found = [find(cycle, view).message(camera, session=1) for cycle in cycles]
-    times = [(k + 1) * _CYCLE_NS for k in range(len(found))]
+    times = [(k + 1) * 33_333_333 for k in range(len(found))]
     return [
         changed(m, seq=3 * k, t_ns=t, ready_t_ns=t) for k, (m, t) in enumerate(zip(found, times, strict=True))
     ]

@@ -22,7 +22,7 @@ from slave.wrist.led_image import WristView
 from slave.wrist.strobe import StrobeCycle, lit
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
-_ROTATION_RAD, _SHIFT_M = np.radians(3.0), 3e-3
+_ROTATION_RAD = np.radians(3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,5 +72,5 @@ def other_palm(rig: RigCalibration, rng: np.random.Generator) -> RigCalibration:
     """Return the rig before a palm that lies a little differently."""
     palm = np.array(rig.T_camera_palm)
     palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, _ROTATION_RAD, 3))[0] @ palm[:3, :3]
-    palm[:3, 3] += rng.normal(0.0, _SHIFT_M, 3)
+    palm[:3, 3] += rng.normal(0.0, 3e-3, 3)
     return replace(rig, T_camera_palm=convert(palm.tolist(), Matrix4))

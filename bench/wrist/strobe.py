@@ -20,9 +20,6 @@ from slave.sources import Frame
 from slave.wrist.strobe import Strobe
 
 RATE_HZ = 90.0
-_FAULTS = 0.05  # each of dropped, doubled, swapped
-_TRIPLES = 60  # rendered per light
-_SPREAD_S = 0.9  # between them: the scene of a minute in unrelated poses
 _SEEDS = range(40)
 
 
@@ -54,7 +51,7 @@ class Score:
     margins: list[float] = field(default_factory=list[float])
 
 
-def deliver(count: int, seed: int, share: float = _FAULTS, *, hidden: bool = False) -> list[Delivered]:
+def deliver(count: int, seed: int, share: float = 0.05, *, hidden: bool = False) -> list[Delivered]:
     """Drop, double and swap frames of a stream, each at random, starting anywhere in the cycle.
 
     Times and numbers go on rising. A lost frame leaves a gap in them, unless `hidden`: the strobe itself slips.
@@ -96,12 +93,13 @@ def score(shown: Sequence[Shown], delivered: Sequence[Delivered], into: Score) -
     return strobe
 
 
-def rendered(ambient: str, cycles: int = _TRIPLES, seed: int = 0) -> list[Shown]:
+def rendered(ambient: str, cycles: int = 60, seed: int = 0) -> list[Shown]:
     """Render unrelated poses of the standard wrist scene; in each the hand goes on moving from frame to frame."""
     rig, cameras, hand = rig_files("wrist")
     scene = WristScene.by_name(f"standard@{ambient}", rig, cameras, hand, seed)
     renderer = WristRenderer(scene, rig.cameras[0])
-    times = [(k, _SPREAD_S * (k // 3) + (k % 3) / RATE_HZ) for k in range(3 * cycles)]
+    spread_s = 0.9  # between them: the scene of a minute in unrelated poses
+    times = [(k, spread_s * (k // 3) + (k % 3) / RATE_HZ) for k in range(3 * cycles)]
     return [Shown(k // 3, ORDER[k % 3], renderer.render(t_s, ORDER[k % 3])) for k, t_s in times]
 
 

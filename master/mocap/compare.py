@@ -5,7 +5,7 @@ It yields errors, coverage of stated regions and false TRACKED, and how the two 
 Angles are those between bones, from the joints of both alike, so that nobody's definition of zero matters: PIP and
 DIP between the two bones at the joint, MCP between the proximal bone and the metacarpal (the line from the wrist,
 where the file has no metacarpal joint); of a thumb the MCP and IP. A TRACKED joint is *false* where it is off by 15
-mm, or the PIP of its finger by 20 degrees (a thumb's MCP), as in `bench/oracle_score.py`.
+mm, or the PIP of its finger by 20 degrees (a thumb's MCP), as in `bench/oracle/score.py`.
 """
 
 from collections.abc import Mapping

@@ -5,7 +5,7 @@ surroundings, near the middle of its range, and compact. A logistic regression w
 
     P(marker) = 1 / (1 + exp(-(w0 + w . evidence)))
 
-`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, markers drawn into
+`python -m bench real_markers --fit` fits its weights to markers (rendered hands, a real ball, markers drawn into
 photographs) and to what is found in photographs without markers, half and half: where things in the colours of the
 markers are more frequent than markers, less of what is found is right than it reports.
 """

@@ -13,13 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.aarch64 import baseline, scene, sysroot
-from bench.aarch64.baseline import Baseline, BaselineError
-from bench.aarch64.command import CASES, main
-from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
+from bench.aarch64 import command, scene, sysroot
+from bench.aarch64.command import CASES, Baseline, BaselineError, main
+from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, forth_and_back, read, read_strobed, without
 from bench.aarch64.guest import Digest, Marks, run_case
-from bench.aarch64.parts import counted_parts
 from bench.aarch64.sysroot import NotPossibleError, Sysroot
 from slave.markers import detector
 from tests.aarch64.machine import sysroot_or_skip
@@ -41,38 +39,6 @@ def test_the_slope_is_per_frame_and_blind_to_what_came_before() -> None:
     assert slope(10**9, 10**9 + 40 * 7_731_615) == 7_731_615 == slope(0, 40 * 7_731_615)
 
 
-def marked(own: int, *steps: tuple[str, int]) -> tuple[list[str], list[int]]:
-    """Labels and counts of a program whose marks cost `own` each: (label, work before it)."""
-    empty = [(f"{sign}nothing", 0) for _ in range(10) for sign in "+-"]
-    labels, counts, at = [], [], 5000
-    for label, work in (*empty, (f"parts {FIRST}", 900), *steps, (f"parts {LAST}", 300)):
-        at += work + own
-        labels.append(label)
-        counts.append(at)
-    return labels, counts
-
-
-@pytest.mark.parametrize("own", [0, 1152])
-def test_a_part_is_counted_with_what_it_calls_and_without_what_the_marks_cost(own: int) -> None:
-    frames = LAST - FIRST
-    steps = [("+scan", 70), ("+label", 100), ("-label", 40), ("+label", 10), ("-label", 60), ("-scan", 5)]
-    found = spans(*marked(own, *(steps * frames)))
-    assert found == {"label": (2.0, 100.0), "scan": (1.0, 215.0)}
-
-
-def test_parts_before_the_first_frame_and_calls_that_do_nothing_do_not_count() -> None:
-    labels, counts = marked(10, ("+scan", 1), ("-scan", 400))
-    early = labels.index(f"parts {FIRST}")
-    labels[early:early] = ["+scan", "-scan"]
-    counts[early:early] = [counts[early - 1] + 10, counts[early - 1] + 20]
-    assert spans(labels, counts) == {"scan": (1 / (LAST - FIRST), 400 / (LAST - FIRST))}
-
-
-def test_parts_that_are_not_nested_are_refused() -> None:
-    with pytest.raises(ValueError, match="scan ends inside label"):
-        spans(*marked(10, ("+scan", 1), ("+label", 1), ("-scan", 1), ("-label", 1)))
-
-
 # The record and its gate
 
 
@@ -81,19 +47,19 @@ def test_parts_that_are_not_nested_are_refused() -> None:
     [(4_000_000, True), (4_039_000, True), (3_961_000, True), (4_041_000, False), (3_959_000, False)],
 )
 def test_the_gate_is_one_percent_to_either_side(value: int, inside: bool) -> None:
-    assert baseline.within(value, RECORD.instructions["six"]) is inside
+    assert command.within(value, RECORD.instructions["six"]) is inside
 
 
 def test_a_case_without_record_is_outside() -> None:
-    assert not baseline.within(4_000_000, RECORD.instructions.get("twelve"))
-    assert baseline.compared(4_000_000, None) == "not recorded"
+    assert not command.within(4_000_000, RECORD.instructions.get("twelve"))
+    assert command.compared(4_000_000, None) == "not recorded"
 
 
 def test_a_record_comes_back_as_written(tmp_path: Path) -> None:
     file = tmp_path / "baseline.json"
-    assert baseline.read(file) is None
-    baseline.write(RECORD, file)
-    assert baseline.read(file) == RECORD
+    assert command.read(file) is None
+    command.write(RECORD, file)
+    assert command.read(file) == RECORD
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"cpu": "x", "instructions": {"six": "many"}, "versions": {}}'])
@@ -101,17 +67,17 @@ def test_a_record_that_is_none_is_refused_by_name(tmp_path: Path, text: str) -> 
     file = tmp_path / "baseline.json"
     file.write_text(text)
     with pytest.raises(BaselineError, match=r"baseline\.json.*--record"):
-        baseline.read(file)
+        command.read(file)
 
 
 def test_the_record_of_the_project_holds_every_case() -> None:
-    record = baseline.read()
+    record = command.read()
     assert record is not None
     assert record.instructions.keys() == CASES.keys()
 
 
 def test_other_versions_are_named() -> None:
-    lines = baseline.other_versions({"numpy": "2.5.0", "cffi": "2.1.1"}, RECORD.versions)
+    lines = command.other_versions({"numpy": "2.5.0", "cffi": "2.1.1"}, RECORD.versions)
     assert lines == [
         "cffi is 2.1.1, recorded with absent",
         "numpy is 2.5.0, recorded with 2.4.6",
@@ -177,30 +143,6 @@ def test_windows_find_what_whole_frames_do_and_a_lost_marker_is_one(folder: Path
     frames = without(read(folder / SIX), "thumb")
     found = detector.MarkerDetector(frames.camera, frames.names).push(frames.image(0), 0)
     assert np.isfinite(found.uv[:, 0]).tolist() == [name != "thumb" for name in frames.names]
-
-
-def test_counting_parts_changes_no_result_and_is_undone(folder: Path) -> None:
-    before = vars(detector) | vars(detector.MarkerDetector)
-    marks = Marks()
-    assert run_case("parts", folder, marks) == run_case("six", folder, Marks())
-    assert vars(detector) | vars(detector.MarkerDetector) == before
-    parts = spans(marks.labels, range(len(marks.labels)))
-    assert 1.0 in [calls for calls, _ in parts.values()]  # something is done once in a frame
-    assert "MarkerDetector.push" not in parts
-
-
-def fail_while_counting() -> None:
-    before = dict(vars(detector))
-    with counted_parts(Marks()):
-        assert vars(detector) != before
-        raise KeyError
-
-
-def test_parts_are_given_back_after_an_error() -> None:
-    before = dict(vars(detector))
-    with pytest.raises(KeyError):
-        fail_while_counting()
-    assert vars(detector) == before
 
 
 def test_an_unknown_case_is_refused(folder: Path) -> None:
@@ -337,12 +279,12 @@ def six(emulated: Sysroot, folder: Path) -> Counted:
 
 
 def test_a_frame_of_six_markers_takes_the_instructions_of_the_record(six: Counted, emulated: Sysroot) -> None:
-    record = baseline.read()
+    record = command.read()
     assert record is not None
     assert six.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
-    differences = baseline.compared(six.per_frame["six"], record.instructions["six"])
-    others = baseline.other_versions(emulated.versions, record.versions)
-    assert baseline.within(six.per_frame["six"], record.instructions["six"]), (differences, others)
+    differences = command.compared(six.per_frame["six"], record.instructions["six"])
+    others = command.other_versions(emulated.versions, record.versions)
+    assert command.within(six.per_frame["six"], record.instructions["six"]), (differences, others)
 
 
 def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(six: Counted, folder: Path) -> None:

@@ -1,16 +1,15 @@
-"""What the section fusion counts, on hands worked out by hand: errors, steps, bits, sight, and streams cut off."""
+"""What the section fusion counts, on hands worked out by hand: errors, steps, bits, sight."""
 
 import numpy as np
 import pytest
 
-from bench.both.scene import Both, Shown, Sight
-from bench.both.score import Figures, Sighted, ratios
-from bench.both.solved import RejectedPeer, Solved
+from bench.both.fusion import Figures, Sighted, ratios
+from bench.both.scene import Both, Shown, Sight, Solved
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import CHAINS, TIPS, WRIST
-from common.messages import HandPose, MarkerDetections, Source, WristDetections
+from common.messages import HandPose, Source
 
 BOTH = Both.of("both-poses", 3)
 HZ = 60.0
@@ -67,8 +66,8 @@ def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
     return Shown(BOTH, 6.0, [], line_of_sight)
 
 
-def figures(one: Solved, of: Shown, away: RejectedPeer | None = None) -> Figures:
-    return Figures.of(one, Sighted.of(of, one, away))
+def figures(one: Solved, of: Shown) -> Figures:
+    return Figures.of(one, Sighted.of(of, one))
 
 
 def test_a_hand_without_error_has_none_and_every_bit_is_true() -> None:
@@ -155,33 +154,6 @@ def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
     return HandPose(**fields)
 
 
-def test_streams_are_cut_off_in_turn_and_never_both() -> None:
-    away = RejectedPeer()
-    t = np.arange(0.0, 60.0, 0.01)
-    markers, wrist = away.at(t)
-    assert not (markers & wrist).any()
-    assert markers.mean() == pytest.approx(0.25, abs=0.01)
-    assert wrist.mean() == pytest.approx(0.25, abs=0.01)
-    assert not (markers | wrist)[t < 1.0].any()
-    begins = t[1:][np.diff((markers | wrist).astype(int)) == 1]
-    np.testing.assert_allclose(np.diff(begins), 2.0, atol=0.011)
-
-
-def test_what_is_cut_off_does_not_come() -> None:
-    nothing, five, none = np.full((6, 2), np.nan), np.full((5, 2), np.nan), np.full(5, np.nan)
-    ns = [START_NS + round(t * 1e9) for t in (0.5, 1.5, 2.5, 3.5, 4.5)]
-    six = np.full(6, np.nan)
-    markers = [
-        MarkerDetections("left", 1, k, t, t, nothing, six, six, six, nothing) for k, t in enumerate(ns)
-    ]
-    wrist = [
-        WristDetections("wrist", 1, k, t, t, five, none, none, five, none, none) for k, t in enumerate(ns)
-    ]
-    left = RejectedPeer().left([*markers, *wrist])
-    assert [one.seq for one in left if isinstance(one, MarkerDetections)] == [0, 2, 3, 4]
-    assert [one.seq for one in left if isinstance(one, WristDetections)] == [0, 1, 2, 4]
-
-
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
     both = shown(visible_area=0.0, line=0.0)
     name = BOTH.markers.rig.cameras[0]
@@ -194,7 +166,7 @@ def test_hand_overs_are_where_sight_changes() -> None:
     both = shown()
     for name in BOTH.markers.rig.cameras:
         both.line_of_sight.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
-    sighted = Sighted.of(both, solved(), None)
+    sighted = Sighted.of(both, solved())
     near = sighted.hand_over[:, INDEX]
     assert near[np.abs(T_S - 3.04) < 0.45].all()
     assert not near[np.abs(T_S - 3.04) > 0.55].any()

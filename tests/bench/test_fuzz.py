@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from msgspec import Meta, Struct
 
-from bench.rigs.fuzz import SAID, Attack, Now, all_attacks, attacks, flood, plausible
-from bench.rigs.fuzz_examples import Speaker, examples
+from bench.rigs.fuzz import MESSAGE_TYPES, Attack, Now, all_attacks, attacks, flood, plausible
+from bench.rigs.hostile_sender import Speaker, examples
 from common.arrays import Float
 from common.errors import MessageError
 from common.link.datagram import Kind
@@ -18,7 +18,7 @@ from common.link.handshake import EchoAnswer, Hello, Started, read
 from common.messages import Message, TrackerPose, decode, encode
 from common.messages.parts import Count, within
 
-MESSAGES = [kind for kind in SAID if issubclass(kind, Message)]
+MESSAGES = [kind for kind in MESSAGE_TYPES if issubclass(kind, Message)]
 SHAKES: dict[type[Struct], Kind] = {Hello: Kind.HELLO, Started: Kind.STARTED, EchoAnswer: Kind.ECHO_ANSWER}
 
 
@@ -46,14 +46,14 @@ def of_type(kind: type[Struct]) -> list[Attack]:
 
 def test_there_is_a_plausible_message_of_each_type() -> None:
     known = examples("left")
-    assert set(known) == set(SAID)
+    assert set(known) == set(MESSAGE_TYPES)
     for kind, base in known.items():
         body = msgspec.msgpack.encode(base)
         made = decode(body) if kind in MESSAGES else read(SHAKES[kind], body)
         assert type(made) is kind
 
 
-@pytest.mark.parametrize("kind", SAID, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", MESSAGE_TYPES, ids=lambda kind: kind.__name__)
 def test_every_field_is_attacked_with_many_values_and_left_out(kind: type[Struct]) -> None:
     single = [attack for attack in of_type(kind) if attack.whole is None]
     changed = Counter(name for attack in single for name in attack.changes)
@@ -117,14 +117,14 @@ def test_what_is_nested_ten_thousand_deep_is_refused() -> None:
 
 
 def test_a_flood_repeats_with_its_seed_and_half_of_it_is_whole_but_for_one_field() -> None:
-    known, shares = examples("left"), dict.fromkeys(SAID, 1.0)
+    known, shares = examples("left"), dict.fromkeys(MESSAGE_TYPES, 1.0)
     first, again, other = (list(flood(shares, known, 2000, seed)) for seed in (1, 1, 2))
     assert len(first) == 2000
     assert [one.what for one in first] == [one.what for one in again]
     assert [one.what for one in first] != [one.what for one in other]
     single = [one for one in first if one.whole is None and len(one.changes) == 1 and not one.without]
     assert len(single) > 1000
-    assert {one.kind for one in first} == set(SAID)
+    assert {one.kind for one in first} == set(MESSAGE_TYPES)
 
 
 def test_times_are_those_of_the_moment_of_sending() -> None:

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.gestures.actions import Score, recognised, seen_poses
-from bench.gestures.truth import GestureTruth
+from bench.gestures.actions import GestureTruth, Score, recognised, seen_poses
 from bench.played import START_NS
 from common.calibration.gesture_settings import default_gestures
 from common.messages import Gesture

@@ -14,11 +14,13 @@ from bench.hands.draws import (
     Noise,
     bench_model,
     draw,
+    finger_solvers,
+    fixed_palm,
     posed,
     score,
     seen,
+    tips_in_palm,
 )
-from bench.hands.peers import finger_solvers, fixed_palm, tips_in_palm
 from bench.hands.poses import CLOSED, PAPER, SCENARIOS, WHOLE, batch, scenario_rows
 from common.arrays import Float
 

@@ -8,10 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.markers.frames import STEP_NS, expose, frames_of, generator, sequences
-from bench.markers.kinds import KINDS, camera_file, paints
 from bench.markers.published import detect
-from bench.markers.scene import CLEAR, make_scene
+from bench.markers.scene import (
+    CLEAR,
+    KINDS,
+    STEP_NS,
+    camera_file,
+    expose,
+    frames_of,
+    generator,
+    make_scene,
+    paints,
+    sequences,
+)
 from common.sim.light import bgr_bytes
 from slave.markers.classify import in_range
 

@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from bench.markers.accuracy import Measurements, floor_px, honesty, measure, score
-from bench.markers.frames import FULL_WELL, READ_NOISE
-from bench.markers.kinds import KINDS
+from bench.markers.accuracy import Measurements, honesty, measure, score
+from bench.markers.scene import KINDS
 from common.arrays import Float, Image
 from slave.markers.detector import MarkerDetector
 
@@ -42,15 +41,6 @@ def test_honest_sigmas_score_95_percent_and_one_and_boasts_do_not() -> None:
     within, ratio = honesty(measurements(error, sigma / 2.0))
     assert within < 0.7
     np.testing.assert_allclose(ratio, 2.0, atol=0.05)
-
-
-def test_the_floor_falls_with_size_and_doubles_with_noise() -> None:
-    small, large = floor_px(KINDS["320x240"], 2), floor_px(KINDS["finger_end"], 2)
-    assert np.all((small > 0.0005) & (small < 0.05))
-    assert np.median(large) < np.median(small)
-    # A bright edge of contrast 0.5 blurred over 1 px around a cap of radius 8: sd about sigma / contrast / sqrt(pi r).
-    rough = math.sqrt(0.3 / FULL_WELL + READ_NOISE**2) / 0.5 / math.sqrt(math.pi * 8.0)
-    assert rough / 3.0 < np.median(large) < rough * 3.0
 
 
 class Displaced:

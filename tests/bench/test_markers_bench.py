@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.markers.kinds import KINDS
+from bench.markers.scene import KINDS
 from bench.markers.speed import Timed, interleaved
 from slave.markers.detector import Detections
 

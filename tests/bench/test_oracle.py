@@ -10,14 +10,11 @@ import pytest
 
 from bench.__main__ import main
 from bench.hands.motion import recordings
-from bench.oracle import scenes, wrist
-from bench.oracle.compare import ALL, compare, judged, table
-from bench.oracle.freeze import Piece, calibration_files, freeze
-from bench.oracle.recorded import Replayed
-from bench.oracle.scenes import CALIBRATION, DESK, shown_piece
-from bench.oracle.score import Solved, figures, samples_of
+from bench.oracle import sets
+from bench.oracle.score import ALL, Solved, compare, figures, judged, samples_of, table
+from bench.oracle.sets import CALIBRATION, DESK, Replayed, shown_piece
 from bench.oracle.solve import run
-from bench.oracle.truth import Truth, sets_of, truths_of
+from bench.oracle.truth import Piece, Truth, calibration_files, freeze, sets_of, truths_of
 from common.arrays import Float
 from common.errors import RecordingError
 from common.recording.recorded_files import read_npz, write_npz
@@ -208,8 +205,8 @@ def test_without_the_data_the_simulated_sets_are_frozen(
         yield piece()
 
     for name in ("scenes", "held", "in_room"):
-        monkeypatch.setattr(scenes, name, short)
-    monkeypatch.setattr(wrist, "fused", short)
+        monkeypatch.setattr(sets, name, short)
+    monkeypatch.setattr(sets, "fused", short)
     monkeypatch.setenv("PHALANX_DATASETS", str(tmp_path / "nowhere"))
     assert main(["oracle", "freeze", "--out", str(tmp_path)]) == 0
     assert "only the simulated sets" in capsys.readouterr().out

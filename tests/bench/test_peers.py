@@ -1,18 +1,34 @@
 """Our solvers and others on the same targets: all run, the known answers come out, and planted bad ones are seen."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
 from bench.hands import ik
-from bench.hands.draws import FACING_ROTATION, MARKERS, Noise, bench_model, draw, seen
-from bench.hands.peers import Angles, PaperFingers, ScipyHand, finger_solvers, tips_in_palm
-from bench.hands.point_hand import PointHand
+from bench.hands.draws import (
+    FACING_ROTATION,
+    INSIDE_RAD,
+    MARKERS,
+    Angles,
+    Noise,
+    PaperFingers,
+    PointHand,
+    bench_model,
+    draw,
+    finger_solvers,
+    seen,
+    tips_in_palm,
+)
 from bench.hands.poses import SCENARIOS
 from bench.report import Row
 from common.arrays import Float
-from common.geometry.transforms import rotation_vector_to_matrix
+from common.geometry.transforms import rigid, rotation_vector_to_matrix
+from common.hand.model import HandModel
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT
 from master.fabrik.linear_algebra import Vector
 
@@ -63,6 +79,66 @@ def test_the_papers_fingers_start_at_their_last_pose() -> None:
 
 
 # -- the whole hand ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScipyHand:
+    """The residuals of the whole-hand fit of a natural hand: whitened caps, priors, limits. Numerical Jacobian.
+
+    Attributes:
+        model: The hand.
+        parameters: Its free angles and their bounds.
+        whiten: (M, 3, 3) inverse square roots of the caps' covariances [1/m].
+        rows, mean: (n, n) and (n,): priors are the residuals rows @ (x - mean).
+    """
+
+    model: HandModel
+    parameters: HandParameters
+    whiten: Float
+    rows: Float
+    mean: Float
+
+    @classmethod
+    def of(cls, model: HandModel, noise: Noise) -> "ScipyHand":
+        """Prepare for caps with this noise, and the default priors."""
+        parameters = HandParameters.of(model)
+        posture_prior = posture_prior_of(model, parameters).natural_component()
+        normal, pull = posture_prior.normal[0], posture_prior.pull[0]
+        cov = noise.cov_m2 + DEFAULT.bones_m**2 * np.eye(3)
+        return cls(
+            model,
+            parameters,
+            np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64),
+            np.asarray(np.linalg.cholesky(normal).T, np.float64),
+            np.asarray(np.linalg.solve(normal, pull), np.float64),
+        )
+
+    def residuals(self, T_rig_palm: Float, x: Float, points_m: Float) -> Float:
+        """Residuals [sigma] of a palm (4, 4) and free angles (n,) [rad]: caps (M, 3) [m], then priors."""
+        joints = self.model.forward(T_rig_palm, self.parameters.angles(x))
+        off = self.model.marker_points(joints, MARKERS) - points_m
+        return np.concatenate([(self.whiten @ off[..., None]).ravel(), self.rows @ (x - self.mean)])
+
+    def solve(self, points_m: Float, T_rig_palm: Float, angles_rad: Float) -> tuple[Float, Float]:
+        """Return palm (4, 4) and angles (5, 4) [rad] for caps (M, 3) [m], from a palm and angles to start with."""
+        R, low, high = T_rig_palm[:3, :3], self.parameters.low, self.parameters.high
+        room = high - low > 2 * INSIDE_RAD
+        angles = np.clip(np.zeros(len(low)), low, high)
+
+        def hand(v: Float) -> tuple[Float, Float]:
+            angles[room] = v[6:]
+            return rigid(rotation_vector_to_matrix(v[:3]) @ R, v[3:6]), angles
+
+        def residual(v: Float) -> Float:
+            return self.residuals(*hand(v), points_m)
+
+        inside = np.clip(self.parameters.of_angles(angles_rad), low + INSIDE_RAD, high - INSIDE_RAD)[room]
+        start = np.concatenate([np.zeros(3), T_rig_palm[:3, 3], inside])
+        anywhere = np.full(6, np.inf)
+        bounds = np.concatenate([-anywhere, low[room]]), np.concatenate([anywhere, high[room]])
+        end = np.asarray(least_squares(residual, start, bounds=bounds, x_scale="jac").x, np.float64)
+        T, x = hand(end)
+        return T, self.model.clamp(self.parameters.angles(x))
 
 
 def test_scipy_finds_the_hand_when_the_posture_prior_is_the_truth_and_markers_are_exact() -> None:

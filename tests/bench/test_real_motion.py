@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.hands.draws import PointHand
 from bench.hands.motion import Recorded, held_poses, jitter, play, recordings, wide_limits
-from bench.hands.point_hand import PointHand
 from common.hand.model import HandModel
 from common.hand.profiles import generated_profile
 from tests.hand_helpers import MARKERS, palm, small_cov

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bench.rigs.rooms import ROOM, detections, dome, room
-from bench.rigs.scale import ScaleRun, cost_per_camera, summary
-from bench.rigs.scale_page import into_page
+from bench.rigs.scale import ScaleRun, cost_per_camera, into_page, summary
 from master.rig.setup import load_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.html"

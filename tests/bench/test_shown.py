@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.both.scene import Shown
-from bench.both.shown import shown
+from bench.both.scene import Shown, shown
 from bench.played import START_NS
 from common.messages import ImuSample, MarkerDetections, WristDetections
 

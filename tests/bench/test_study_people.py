@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.study.people import Participant, participant, rotated, with_bones
-from bench.study.trials import orders
+from bench.study.trials import Participant, orders, participant, rotated, with_bones
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
 from common.hand.model import FINGER_JOINTS, JOINTS, HandModel

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.cameras.unsynchronised import CALIBRATION, MOTIONS, Shooting, centroids, outcome
+from bench.cameras.sync import CALIBRATION, MOTIONS, Shooting, centroids, outcome
 from master.rig.setup import load_setup
 
 RATES_HZ = (30.0, 60.0, 90.0)

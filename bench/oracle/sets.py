@@ -1,14 +1,19 @@
-"""The oracle's recorded sets: rendered recordings, detected, and real hands before simulated cameras.
+"""The sets of the oracle: scenes, held hands and a room, simulated; recordings; hands before a wrist device.
 
 Of a Leap recording joints and palm are the truth; wrist and metacarpals were not recorded. The rig is the shipped one,
 before the back of the hand in the mean. What the caps show of themselves, and what hides them, is drawn of the hand
 whose angles come nearest to the recorded joints; then each cap is moved to where the recorded tip is.
+
+Of a wrist device alone (recordings) the palm stands where calibration found it, in its camera's frame. Before both
+kinds of rig messages are made of the truth (`shown_of`), or found by both slaves in rendered frames (`watched`). Hidden
+is a finger whose tip is not in sight of the wrist camera; before both, one whose marker fewer than two cameras see.
 """
 
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from pathlib import Path
 
 import msgspec
@@ -18,48 +23,113 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 from scipy.spatial.transform import Rotation, Slerp
 
-from bench.both.shown import markers_shown
+from bench.both.scene import Both, Observed, Shown, markers_shown, shown_of, watched
 from bench.hands.draws import FACING_ROTATION
-from bench.hands.motion import Recorded, recordings
-from bench.oracle.freeze import Piece, calibration_files
-from bench.oracle.truth import STEP_NS, Truth
-from bench.played import START_NS
+from bench.hands.motion import Recorded, held_poses, recordings
+from bench.oracle.truth import STEP_NS, Piece, Truth, calibration_files
+from bench.played import START_NS, times_of
 from bench.report import CALIBRATION, command
-from bench.rigs.rooms import DESK
+from bench.rigs.rooms import DESK, ROOM, middle_m, room
 from common.arrays import Float, Int
+from common.errors import RecordingError
 from common.geometry.transforms import rigid
-from common.hand.model import CHAINS, HandModel
-from common.messages.sensed import MarkerDetections
+from common.hand.model import CHAINS, FINGERS, HandModel
+from common.messages import MarkerDetections, WristDetections
 from common.recording.frame_recording import open_recording
 from common.recording.recorded_files import read_npz
-from common.sim.motion import HandState
+from common.sim.motion import HandState, ScriptedMotion, smooth_step
 from common.sim.scene import Scene, view_centre
-from master.replay.recorded import recorded_detections
+from common.sim.scenes import scene_by_name
+from master.evaluation.wrist_score import load_wrist_truth
+from master.replay.recorded import recorded_cycles, recorded_detections
 from master.rig.setup import load_setup
 
-RENDERED = {
+SCENES = ("standard", "grasp", "both-travel")
+SEEDS = (11, 12, 13)
+# Of the palm from the middle of the view, so that the fingers are in it.
+_BEHIND_M = np.array([0.03, 0.08, 0.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """A hand that opens for half a second, takes a pose in another half and then does not move."""
+
+    place: Float  # pose of the palm (4, 4) [m]
+    open_rad: Float  # (5, 4)
+    pose_rad: Float  # (5, 4)
+    period_s: float = 60.0
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]."""
+        share = smooth_step(min(max((t_s - 0.5) / 0.5, 0.0), 1.0))
+        return HandState(self.place, (1.0 - share) * self.open_rad + share * self.pose_rad)
+
+
+def scenes(name: str, seconds: float = 10.0, seeds: tuple[int, ...] = SEEDS) -> Iterator[Piece]:
+    """The scene called `name` before the shipped rig, once for each seed."""
+    desk = load_setup(CALIBRATION, DESK)
+    files = calibration_files(CALIBRATION, DESK)
+    for seed in seeds:
+        scene = scene_by_name(name, desk.rig, desk.cameras, desk.hand.profile, seed)
+        yield shown_piece(f"seed{seed}", files, scene, seconds, seed)
+
+
+def shown_piece(name: str, files: dict[str, bytes], scene: Scene, seconds: float, seed: int) -> Piece:
+    """What the cameras of a scene's rig report, with errors as large as measured."""
+    messages: list[MarkerDetections] = []
+    for camera in scene.rig.cameras:
+        rate = scene.cameras[camera].frame_rate_hz
+        times = times_of(scene, camera, seconds, rate)
+        messages += markers_shown(scene, camera, times, 1.0 / rate, seed)[0]
+    messages.sort(key=lambda one: one.t_ns)
+    return Piece(name, (scene.rig.name,), files, messages, truth_of(scene, seconds))
+
+
+def truth_of(scene: Scene, seconds: float) -> Truth:
+    """The hand of a scene, finely in time, a little longer than it is watched."""
+    since_ns: Int = np.arange(0, round((seconds + 0.1) * 1e9), STEP_NS)
+    states = tuple(scene.motion.at(1e-9 * t) for t in since_ns.tolist())
+    angles_rad = np.stack([state.angles_rad for state in states])
+    joints = scene.model.forward(np.stack([state.T_rig_palm for state in states]), angles_rad)
+    return Truth(START_NS + since_ns, joints.position_m, angles_rad)
+
+
+def held(seed: int = SEEDS[0]) -> Iterator[Piece]:
+    """A hand that takes a pose and keeps it, for each of some poses."""
+    desk = load_setup(CALIBRATION, DESK)
+    files = calibration_files(CALIBRATION, DESK)
+    place = rigid(FACING_ROTATION, view_centre(desk.rig) + _BEHIND_M)
+    poses = held_poses(desk.hand)
+    for k, (name, angles) in enumerate(poses.items()):
+        motion = Held(place, poses["open"], angles)
+        scene = Scene.of_motion(desk.rig, desk.cameras, desk.hand.profile, motion, seed + k)
+        yield shown_piece(name, files, scene, 3.0, seed + k)
+
+
+def in_room(seconds: float = 2.0, seed: int = SEEDS[0]) -> Iterator[Piece]:
+    """A hand among 16 cameras."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = room(Path(folder), 16, 90.0)
+        setup, files = load_setup(tree, ROOM), calibration_files(tree, ROOM)
+    motion = ScriptedMotion(setup.hand, middle_m(), seed)
+    scene = Scene.of_motion(setup.rig, setup.cameras, setup.hand.profile, motion, seed)
+    yield shown_piece(f"seed{seed}", files, scene, seconds, seed)
+
+
+STEREO = {
     "stills": ("calib_colors", "lights_0_warm", "poses_left"),
     "static": ("static",),
     "translate_8ms": ("translate_8ms",),
     "flex90": ("flex90",),
     "sweeps": ("sweep_paper", "sweep_rough"),
 }
-_FINGER_ANGLES = (
-    (1, 0, 3, 4),
-    *((6 + 4 * k, 5 + 4 * k, 7 + 4 * k, 8 + 4 * k) for k in range(4)),
-)
+_FINGER_ANGLES = ((1, 0, 3, 4), *((6 + 4 * k, 5 + 4 * k, 7 + 4 * k, 8 + 4 * k) for k in range(4)))
 """Columns of a recording's angles in the order of a pose's: abduction, flexion, PIP, DIP."""
-_SEED = 21
 _UP = np.array([0.0, 0.06, 0.0])  # of the palm's origin from the middle of the view
 
 
-def rendered(data: Path, names: Sequence[str]) -> Iterator[Piece]:
-    """Recordings of the marker rig, through the slave's own detection.
-
-    Args:
-        data: The data folder.
-        names: Of the recordings.
-    """
+def stereo(data: Path, names: Sequence[str]) -> Iterator[Piece]:
+    """Recordings `names` of the marker rig in the data folder, through the slave's own detection."""
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name)
         (tree / "cameras").mkdir()
@@ -67,10 +137,10 @@ def rendered(data: Path, names: Sequence[str]) -> Iterator[Piece]:
             target = tree / "cameras" / f"{camera}.json"
             command("slave", "colours", data / "stereo/calib_colors", "--camera", camera, "-o", target)
         for one in names:
-            yield _detected(data / "stereo" / one, tree, data / "hands")
+            yield _markers_detected(data / "stereo" / one, tree, data / "hands")
 
 
-def _detected(folder: Path, tree: Path, hands: Path) -> Piece:
+def _markers_detected(folder: Path, tree: Path, hands: Path) -> Piece:
     recording = open_recording(folder)
     rig = recording.manifest.marker_rig()
     files = {f"rigs/{rig.name}.json": msgspec.json.encode(rig)}
@@ -130,21 +200,13 @@ def angles_of(angles_rad: Float) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replayed:
-    """A recorded hand as a motion before the shipped rig, between its samples by straight lines in the palm's frame.
+    """A recorded hand as a motion before the shipped rig, between its samples by straight lines in the palm's frame."""
 
-    Attributes:
-        t_s: (T,) times of the samples.
-        turn: Of the palm, rig frame, over time.
-        origin_m: (T, 3) of the palm, rig frame.
-        fingers_m: (T, 20, 3) recorded joints, palm frame.
-        angles_rad: (T, 20) of the hand model, nearest to these.
-    """
-
-    t_s: Float
-    rotation: Slerp
-    origin_m: Float
-    fingers_m: Float
-    angles_rad: Float
+    t_s: Float  # (T,) times of the samples
+    rotation: Slerp  # of the palm, rig frame, over time
+    origin_m: Float  # (T, 3) of the palm, rig frame
+    fingers_m: Float  # (T, 20, 3) recorded joints, palm frame
+    angles_rad: Float  # (T, 20) of the hand model, nearest to these
 
     @property
     def period_s(self) -> float:
@@ -188,10 +250,7 @@ def _between(t_s: Float, rows: Float, at_s: float) -> Float:
 
 
 def _nearest_angles(model: HandModel, fingers_m: Float) -> Float:
-    """Angles (T, 20) [rad] whose joints are nearest to recorded ones (T, 5, 4, 3) [m], palm frame.
-
-    Of every other sample; those between are what lies between.
-    """
+    """Angles (T, 20) [rad] nearest to recorded joints (T, 5, 4, 3) [m], palm frame; every other sample is fitted."""
     rows, out = np.union1d(np.arange(0, len(fingers_m), 2), len(fingers_m) - 1), list[Float]()
     start = np.zeros(20)
     for fingers in fingers_m[rows]:
@@ -209,7 +268,7 @@ def _nearest_angles(model: HandModel, fingers_m: Float) -> Float:
 def leap(data: Path) -> Iterator[Piece]:
     """Recorded hands in motion; `data` is the data folder."""
     desk = load_setup(CALIBRATION, DESK)
-    for seed, recorded in enumerate(recordings(data / "leapjs"), _SEED):
+    for seed, recorded in enumerate(recordings(data / "leapjs"), 21):
         name = "".join(c if c.isalnum() else "-" for c in recorded.name).lower()
         model = recorded.model()
         profile = replace(model.profile, name=name)
@@ -257,3 +316,73 @@ def _leap_truth(motion: Replayed) -> Truth:
     cosine = (bones[:, :, 0] * bones[:, :, 1]).sum(axis=2)
     angles_rad[:, 1:, 2] = np.arccos(np.clip(cosine, -1.0, 1.0))
     return Truth(START_NS + since_ns, joints_m, angles_rad)
+
+
+WORN = ("curl", "mcp", "spread", "left_small")
+FUSED = {
+    "fused-poses": ("both-poses", "desk", "wrist"),
+    "fused-curl": ("both-curl", "desk", "wrist"),
+    "fused-travel": ("both-travel", "desk", "wrist"),
+    "fused-grasp": ("grasp", "desk", "wrist"),
+    "fused-grip": ("grasp", "desk-back3", "wrist-back3"),
+    "fused-grip-slow": ("grasp", "desk-back3", "wrist-back3"),
+}
+RENDERED = {
+    "rendered-grasp": ("grasp", "desk", "wrist"),
+    "rendered-grip": ("grasp", "desk-back3", "wrist-back3"),
+}
+_SLOW = "fused-grip-slow"
+_SEEDS = (31, 32)
+
+
+def worn(data: Path) -> Iterator[Piece]:
+    """Rendered recordings of wrist devices; `data` is the data folder."""
+    for name in WORN:
+        yield _cycles_detected(data / "wrist" / name, data / "hands")
+
+
+def _cycles_detected(folder: Path, hands: Path) -> Piece:
+    recording = open_recording(folder)
+    rig = recording.manifest.wrist_rig()
+    camera, hand = rig.cameras[0], hands / f"{rig.hand}.json"
+    files = {
+        f"rigs/{rig.name}.json": msgspec.json.encode(rig),
+        f"cameras/{camera}.json": msgspec.json.encode(recording.manifest.cameras[camera]),
+        f"hands/{rig.hand}.json": hand.read_bytes(),
+    }
+    with tempfile.TemporaryDirectory() as name:
+        target = Path(name) / f"detections_{camera}.npz"
+        command(
+            "slave", "run", "--name", camera, "--camera", f"replay:{folder}", "--hand", hand, "-o", target
+        )
+        messages = list(recorded_cycles(Path(name), camera))
+    found = load_wrist_truth(recording, camera)
+    if found is None:
+        raise RecordingError(f"{folder}: nothing says what is true of it")
+    angles = angles_of(read_npz(folder / "truth.npz")["angles"])
+    truth = Truth(found.t_ns, hand_of(found.joints_m), angles, recording.manifest.continuous)
+    return Piece(folder.name, (rig.name,), files, messages, changed(truth, hidden=~found.tip_visible))
+
+
+def fused(name: str, seconds: float = 8.0, seeds: Sequence[int] = _SEEDS) -> Iterator[Piece]:
+    """A hand before marker cameras, with a wrist device and its IMU, by seed; `name`: of `FUSED` or `RENDERED`."""
+    scene, *rigs = (FUSED | RENDERED)[name]
+    sensed = watched if name in RENDERED else shown_of
+    files = calibration_files(CALIBRATION, rigs[0]) | calibration_files(CALIBRATION, rigs[1])
+    for seed in seeds:
+        shown = sensed(Both.of(scene, seed, rigs=(rigs[0], rigs[1])), seconds)
+        messages = _thinned(shown.messages) if name == _SLOW else shown.messages
+        yield Piece(f"seed{seed}", tuple(rigs), files, messages, _truth_of(shown))
+
+
+def _thinned(messages: list[Observed]) -> list[Observed]:
+    """The same with every third triple (three frames) alone: as many as a busy machine makes."""
+    return [one for one in messages if not isinstance(one, WristDetections) or one.seq // 3 % 3 == 0]
+
+
+def _truth_of(shown: Shown) -> Truth:
+    scene = shown.both.scene
+    truth = truth_of(scene, shown.seconds)
+    cameras = shown.line_of_sight.cameras_of(1e-9 * (truth.t_ns - truth.t_ns[0]), 0.02)
+    markers = [scene.rig.markers.index(name) for name in FINGERS]
+    return changed(truth, hidden=np.asarray(cameras[:, markers] < 2, np.bool_))
