@@ -1,10 +1,14 @@
 """Compile numeric functions as kernels.
 
-NUMBA_DISABLE_JIT=1 leaves them plain. They take arrays and records (`common.records`).
+They take arrays and records (`common.records`). NUMBA_DISABLE_JIT=1 leaves them plain. Compiling takes two minutes
+on a version's first start, which is logged.
 """
 
+import logging
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import numba
@@ -77,3 +81,21 @@ def _alike(one: Any) -> object:
         each = cast(tuple[Any, ...], one)
         return cast(Any, type(each)), tuple(_alike(part) for part in each)
     return cast(object, type(one))
+
+
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def log_if_slow() -> Generator[None]:
+    """Log that kernels are compiled, where that takes longer than loading them does."""
+    slow_s = 1.5  # from the cache it takes half a second
+    timer = threading.Timer(
+        slow_s, _LOG.warning, ("compiling kernels, once for each version: about two minutes in all ...",)
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

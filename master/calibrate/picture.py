@@ -1,7 +1,7 @@
-"""A calibration is drawn as a plot: what was seen, and what was fitted to it.
+"""Draw the result of a calibration, and save it as one picture.
 
-One PNG for laser plane, flat field, curls, subject, object, registration or mounting. Every `draw_...` raises
-RecordingError where the file cannot be written.
+One PNG shows what was seen, and what was fitted to it: laser plane, flat field, curls, subject, object, registration
+or pose of the device. Every `draw_...` raises RecordingError where the file cannot be written.
 """
 
 from collections.abc import Sequence
@@ -9,19 +9,43 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
+from common.calibration.files import replacing
 from common.calibration.object_profile import ObjectProfile
 from common.calibration.rig import field_at
+from common.errors import RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import fit_rigid
 from master.calibrate.extrinsics.extrinsics import Extrinsics
-from master.calibrate.figures import figure_of, save_figure
 from master.calibrate.object.measure import Measurement
 from master.calibrate.tracker.registration import Registration
 from master.calibrate.wrist.curl import FingerCurl
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
 from master.calibrate.wrist.plane import PlaneFit, ViewLine
 from master.calibrate.wrist.subject import Subject
+
+
+def figure_of(size: tuple[float, float]) -> Figure:
+    """An empty figure of a size [inches]."""
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    try:
+        with replacing(path) as file:
+            figure.savefig(file, format="png")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write the picture: {error.strerror}") from error
+
 
 FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
 BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"

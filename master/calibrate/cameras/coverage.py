@@ -19,7 +19,7 @@ from master.calibrate.cameras.bundle import guess_lens, place_board, rms
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
 from master.calibrate.cameras.views import BoardViews, View
-from master.calibrate.figures import figure_of, save_figure
+from master.calibrate.picture import figure_of, save_figure
 
 CELLS = (6, 8)  # rows and columns: a cell is about as large as a board's square seen near
 

@@ -18,9 +18,9 @@ from common.errors import CalibrationError, FitError
 from common.hand.model import HandModel
 from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
-from master.calibrate.figures import figure_of, save_figure
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 from master.calibrate.hand.observed import Observed, marker_rows
+from master.calibrate.picture import figure_of, save_figure
 from master.run.process import join_bus
 
 Receive = Callable[[float], HandPose | None]
