@@ -38,9 +38,8 @@ from common.arrays import Bool, Float
 from common.calibration.gesture_settings import GestureSettings, HoldSettings, Quantity
 from common.geometry.transforms import matrix_to_quaternion
 from common.hand.model import CHAINS, FINGERS, MIDDLE_PROXIMAL, WRIST, HandModel
-from common.kernels import constant, inner, kernel
+from common.kernels import constant, inner, kernel, log_if_slow
 from common.messages import JOINT_COUNT, Gesture, HandPose, Phase, Source
-from master.fabrik.compile import log_if_slow
 from master.gestures.actions import PinchMonitor, PointMonitor, ThumbTapMonitor, is_pad
 from master.gestures.dial import DialMonitor
 from master.gestures.features import FeatureExtractor, HandFeatures, thumb_touch

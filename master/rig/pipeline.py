@@ -10,6 +10,7 @@ import numpy as np
 from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry.transforms import cross
+from common.kernels import log_if_slow
 from common.messages import Detections
 from master.estimator.epoch import CycleReader
 from master.estimator.estimator import Estimator
@@ -20,7 +21,6 @@ from master.estimator.settings import Settings
 from master.estimator.smoothing import HandOneEuro
 from master.estimator.wrist_pipeline import FusedPipeline, WristPipeline, WristSide
 from master.fabrik.caps import CapTables
-from master.fabrik.compile import log_if_slow
 from master.fabrik.depth import LAW_RESIDUAL, CalibrationResidual, depth_law, law_contradicts, law_residual
 from master.fabrik.intersection import RAYS, limits_of, rehearse
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
