@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +18,9 @@ from common.errors import CalibrationError
 from common.messages import TagDetections
 from common.recording.frame_recording import FrameRow
 from slave.sources import Frame
-from slave.tags.finder import FoundTags, TagFinder
+
+if TYPE_CHECKING:
+    from slave.tags.finder import FoundTags, TagFinder
 
 SHARE = 0.8  # of the time between two frames that markers and tags together may take
 
@@ -102,7 +105,7 @@ class LiveTags:
         self._found += len(found.ids)
         return message
 
-    def replace(self, finder: TagFinder | None) -> None:
+    def replace(self, finder: "TagFinder | None") -> None:
         """Go on with another finder; None: no object has tags any more."""
         self._finder = finder
 
@@ -118,10 +121,12 @@ class LiveTags:
         }
 
 
-def finder_of(camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> TagFinder | None:
+def finder_of(camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> "TagFinder | None":
     """A finder of the tags of `objects`; None: none has any; raises as `TagFinder`."""
     if all(profile.tags is None for profile in objects):
         return None
+    from slave.tags.finder import TagFinder  # seldom needed: it takes a third of a second to load
+
     return TagFinder(camera, objects)
 
 
@@ -153,6 +158,8 @@ class TagCollector:
         self, camera: CameraCalibration, objects: Mapping[str, ObjectProfile], continuous: bool = True
     ) -> None:
         """Seek the tags of `objects`, as `TagFinder`; `continuous`: with tracks."""
+        from slave.tags.finder import TagFinder
+
         self._finder = TagFinder(camera, list(objects.values()))
         self._continuous = continuous
         self._rows: list[FrameRow] = []

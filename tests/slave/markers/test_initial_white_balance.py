@@ -134,14 +134,7 @@ def test_the_lights_tried_lie_along_the_locus_of_black_bodies() -> None:
 
 def test_no_simulator_is_imported_to_know_the_light() -> None:
     folder = Path(initial_white_balance.__code__.co_filename).parent
-    for name in (
-        "initial_white_balance",
-        "drift",
-        "light_meter",
-        "white_balance",
-        "colour_monitor",
-        "light_adaptive",
-    ):
+    for name in ("white_balance", "illuminant", "colours", "reloadable"):
         assert "common.sim" not in (folder / f"{name}.py").read_text(), name
 
 
