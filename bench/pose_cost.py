@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from bench.both.scene import shown
 from bench.report import ROOT, Row
 from bench.rigs.rooms import ROOM, detections, in_order, room
+from common.clock import Clock
 from common.messages import ImuSample, encode
 from master.rig.setup import RigSetup, load_setups
 from master.run.app import StageTimes, result_at
@@ -65,7 +66,7 @@ print(spent_s + process_time() - began_s)
 """
 
 
-class _Clock:
+class _Clock(Clock):
     """A clock that shows what it is set to."""
 
     def __init__(self) -> None:

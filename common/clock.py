@@ -5,7 +5,7 @@ moves nothing. How the clock of another machine runs is `common.link.clock_offse
 """
 
 import time
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 
 def now_ns() -> int:
@@ -13,15 +13,15 @@ def now_ns() -> int:
     return time.monotonic_ns()
 
 
-class Clock(Protocol):
+class Clock(ABC):
     """Source of time, which tests can replace."""
 
+    @abstractmethod
     def now_ns(self) -> int:
         """Return the time [ns]; never runs backwards."""
-        ...
 
 
-class SystemClock:
+class SystemClock(Clock):
     """The monotonic clock of this machine."""
 
     def now_ns(self) -> int:
@@ -29,7 +29,7 @@ class SystemClock:
         return now_ns()
 
 
-class SkewedClock:
+class SkewedClock(Clock):
     """Clock of a simulated foreign machine: another zero and rate, steps if wanted."""
 
     def __init__(self, offset_ns: int, rate_ppm: float, clock: Clock | None = None) -> None:

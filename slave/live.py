@@ -18,9 +18,8 @@ from common.calibration.camera_settings import ColourPick
 from common.errors import CameraError
 from common.hand.model import FINGERS
 from slave.markers.colours import SampledColours
-from slave.markers.detector import MarkerDetector
+from slave.markers.detector import MarkerDetector, ambiguity_counts, ambiguity_metrics
 from slave.markers.engine import Engine
-from slave.markers.group import ambiguity_counts, ambiguity_metrics
 from slave.markers.reloadable import (
     AnyDetector,
     CalibratedDetector,
@@ -85,7 +84,7 @@ ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
 
 
-class LightReport:
+class LightReport(Reporting):
     """Counts and logs how the light affects colours; adds it to what `others` report."""
 
     def __init__(

@@ -23,7 +23,7 @@ from common.errors import CalibrationError, RecordingError
 from common.messages.command_bodies import RawWish
 from common.recording.frame_recording import Manifest
 from slave.recorder import ENCODERS, RESERVE_BYTES, Length, Recorder, clock_of, megabytes
-from slave.sources import Frame, FrameSource
+from slave.sources import Frame, FrameSource, Reporting
 from slave.tuning import CameraFiles
 
 GONE_S = 10.0  # a master that was away for so long ends it: nobody else could
@@ -41,7 +41,7 @@ class RawSettings:
     skewed: str = ""  # how the slave's clock differs from the machine's; empty: it is the machine's
 
 
-class RawFrames:
+class RawFrames(Reporting):
     """Answers "raw" and "raw_stop", and counts, for `slave.report.Reporter`."""
 
     def __init__(

@@ -40,7 +40,7 @@ class Backoff:
     longest_s: float = 1.0
 
 
-class ReconnectingDriver(Generic[ItemT]):
+class ReconnectingDriver(Reporting, Generic[ItemT]):
     """A driver around one whose device can be lost."""
 
     def __init__(
@@ -268,7 +268,7 @@ def _has_contrast(image: Image) -> bool:
     return cv2.countNonZero(even) < even.size
 
 
-class ReconnectingCamera(ReconnectingDriver[Frame]):
+class ReconnectingCamera(ReconnectingDriver[Frame], Tunable):
     """A camera that is opened again with its last settings, also where it is frozen."""
 
     def __init__(

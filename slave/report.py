@@ -164,7 +164,7 @@ def _why_alone(counts: Mapping[str, int]) -> str:
     return "no master received yet: is it running, and does its --beacon reach this network and port?"
 
 
-class Counters:
+class Counters(Reporting):
     """Counters of one sender: written by its loop, read by the thread of the reports."""
 
     def __init__(

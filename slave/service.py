@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from typing import Protocol
+from typing import TypeAlias
 
 from common.supervisor import WATCHDOG, ServiceManager, one_line
 
@@ -22,16 +22,14 @@ NEVER_NS = 2**63
 WAITING = "waits for the master"
 
 
-class ConnectionLost(Protocol):
-    """Callback for the loss of a device, and for each try to open it again."""
-
-    def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
-        """`what` is lost; the next try may take so long [s]."""
-        ...
+# called with what is lost, and before each try to open it again
+ConnectionLost: TypeAlias = Callable[[str], None]
+# the same, and how long the next try may take [s]
+ConnectionLostFor: TypeAlias = Callable[[str, float], None]
 
 
 def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
-    """Ignore the loss of a device: a `ConnectionLost` that notifies nobody."""
+    """Ignore the loss of a device."""
 
 
 class Service:

@@ -6,8 +6,9 @@ its message; whatever else a driver raises is a fault in a program: counted, and
 """
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Protocol, TypeAlias, TypeVar
 
 from msgspec import Struct
 
@@ -68,23 +69,22 @@ ImuSource: TypeAlias = Source[ImuSample]
 TrackerSource: TypeAlias = Source[TrackerPose]
 
 
-@runtime_checkable
-class Reporting(Protocol):
+class Reporting(ABC):
     """What has counts and metrics for `Health`; asked by the thread of the reports."""
 
+    @abstractmethod
     def counts(self) -> Mapping[str, int]:
         """Event -> how often since it was opened."""
-        ...
 
+    @abstractmethod
     def metrics(self) -> Mapping[str, float]:
         """Quantity with its unit -> value now; names of `calibration.camera_settings`."""
-        ...
 
 
-@runtime_checkable
-class Tunable(Reporting, Protocol):
+class Tunable(Reporting):
     """A camera whose settings may be changed by another thread while it is read."""
 
+    @abstractmethod
     def tune(self, camera: CameraCalibration) -> None:
         """Take exposure, gains and rate of `camera`; its size is that it was opened with.
 
@@ -92,7 +92,6 @@ class Tunable(Reporting, Protocol):
             CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or
                 the text states that they are not.
         """
-        ...
 
 
 LOG_EVERY_NS = 10_000_000_000

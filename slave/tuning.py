@@ -37,7 +37,7 @@ from common.calibration.camera_settings import (
 from common.calibration.files import MonitoredFiles, Provenance, date_now
 from common.calibration.object_profile import ObjectProfile
 from common.errors import CalibrationError, PhalanxError
-from slave.sources import Tunable
+from slave.sources import Reporting, Tunable
 
 _NAME = 64  # characters of a name in `Health`
 
@@ -127,7 +127,7 @@ Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | N
 Sample: TypeAlias = Callable[[ColourPick, CameraCalibration], tuple[CameraCalibration, Mapping[str, float]]]
 
 
-class CameraTuning:
+class CameraTuning(Reporting):
     """Answers commands about the camera, and follows its files; from any thread."""
 
     def __init__(

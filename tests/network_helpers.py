@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.rigs.local import free_port
+from common.clock import Clock
 from common.messages import FINGER_COUNT, Health, MarkerDetections, WristDetections
 from master.run.ingest import Ingest
 
@@ -51,7 +52,7 @@ def health(source: str, frames: int = 0) -> Health:
     return Health(source, 1, 2, {"frames": frames}, {"rate_hz": 60.0})
 
 
-class ManualClock:
+class ManualClock(Clock):
     """A clock that stands still until it is told."""
 
     def __init__(self, t_ns: int = 0) -> None:

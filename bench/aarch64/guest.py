@@ -21,6 +21,7 @@ import numpy as np
 
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, read, read_strobed, without
 from bench.markers import published
+from common.clock import Clock
 from common.messages import Message, WristDetections, encode
 from master.run.link import MasterLink
 from slave.link import SlaveLink
@@ -78,7 +79,7 @@ def arrays_of(message: Message) -> list[np.ndarray]:
     return [value.astype(float) for value in values if isinstance(value, np.ndarray)]
 
 
-class _StillClock:
+class _StillClock(Clock):
     """A clock that shows what it is set to, so that an emulated minute ends no session."""
 
     t_ns = 1_000_000_000_000

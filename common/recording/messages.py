@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 import msgspec
 from mcap.records import Channel
@@ -36,22 +36,10 @@ from common.messages.streams import STREAMS, sender_of
 from common.recording.mcap_file import BOUNDS, McapContent, messages_of, read_content
 
 
-class Disk(Protocol):
-    """Where the bytes go: a file, or what a test puts in its place."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Write part of the data and return how much, or raise OSError."""
-        ...
-
-    def close(self) -> None:
-        """Give it back."""
-        ...
-
-
 class Output:
     """What the library writes to: every byte goes to the disk at once."""
 
-    def __init__(self, disk: Disk) -> None:
+    def __init__(self, disk: io.FileIO) -> None:
         self._disk, self._written = disk, 0
 
     def write(self, data: bytes) -> int:
@@ -171,7 +159,7 @@ class MessageWriter:
         path: Path,
         files: Mapping[str, bytes],
         about: Mapping[str, str] | None = None,
-        open_disk: Callable[[Path], Disk] = lambda path: io.FileIO(path, "xb"),
+        open_disk: Callable[[Path], io.FileIO] = lambda path: io.FileIO(path, "xb"),
     ) -> None:
         """Begin a new file.
 

@@ -12,14 +12,13 @@ while changed files are read. Four things keep the list quiet:
 """
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Protocol, get_args
+from typing import get_args
 
 from common.bus.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
-from common.link.clock_offset import ClockEstimate
 from common.machine import Machine
 from common.messages import MAX_CHECKS, CheckCode, CheckItem, Checklist, Health
 from common.messages.streams import MASTER
@@ -27,9 +26,9 @@ from master.checklist.facts import MasterNow, Plan, SenderNow, SlaveReports, Ver
 from master.checklist.files import FileMonitor
 from master.checklist.link_rules import LinkRules
 from master.checklist.slave_rules import MovedRule, SlaveRules
+from master.rig.pipeline import Pipeline
 from master.rig.setup import RigSetup
-from master.run.link_senders import MarkerCounts, Quarantine, RejectedPeer
-from master.run.sequence import CameraCounts
+from master.run.ingest import Ingest
 
 CODES: tuple[CheckCode, ...] = get_args(CheckCode)
 HOLD_NS: dict[CheckCode, int] = {
@@ -159,30 +158,6 @@ class ChecklistMonitor:
         )
 
 
-class _Received(Protocol):
-    """What the publisher needs of an `Ingest`."""
-
-    @property
-    def quarantine(self) -> Quarantine: ...
-    @property
-    def started(self) -> bool: ...
-    @property
-    def connected(self) -> frozenset[str]: ...
-    def counts_of(self, sender: str) -> CameraCounts: ...
-    def clock_of(self, camera: str) -> ClockEstimate | None: ...
-    def rejected_peers(
-        self,
-    ) -> tuple[Mapping[str, RejectedPeer], Mapping[str, RejectedPeer], Mapping[str, RejectedPeer]]: ...
-    def marker_counts(self) -> Mapping[str, MarkerCounts]: ...
-
-
-class _Counting(Protocol):
-    """What the publisher needs of a `LivePipeline`."""
-
-    @property
-    def counts(self) -> Mapping[str, int]: ...
-
-
 class ChecklistPublisher:
     """Publisher of the checklist; belongs to one thread."""
 
@@ -190,9 +165,9 @@ class ChecklistPublisher:
         self,
         bus: Bus,
         clock: Clock,
-        received: _Received,
+        received: Ingest,
         setups: Sequence[RigSetup],
-        pipelines: Sequence[_Counting],
+        pipelines: Sequence[Pipeline],
         files: FileMonitor | None,
         session: int,
         writes_to: Path,

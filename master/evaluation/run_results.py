@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from common.arrays import Bool, Int
 from common.messages import Gesture, ResultMessage
+from common.sim.gestures import Annotation, Gestures
 from common.sim.scene import Scene
 from master.evaluation.score import ObjectTruth, score_object, score_objects
 from master.outputs.result_files import (
@@ -28,38 +28,6 @@ from master.outputs.result_files import (
 from master.rig.setup import RigSetup
 
 _LATE_S = 0.4  # a gesture that is reported so long after it was made is not that one
-
-
-class Annotation(Protocol):
-    """One gesture of a simulated hand as in `Gesture`, with begin and completion [s]."""
-
-    @property
-    def kind(self) -> str: ...  # noqa: D102
-    @property
-    def name(self) -> str: ...  # noqa: D102
-    @property
-    def start_s(self) -> float: ...  # noqa: D102
-    @property
-    def stop_s(self) -> float: ...  # noqa: D102
-
-
-@runtime_checkable
-class Annotated(Protocol):
-    """A simulated hand with known gestures."""
-
-    @property
-    def annotations(self) -> Sequence[Annotation]:
-        """Return all gestures in a period, in order."""
-        ...
-
-    @property
-    def period_s(self) -> float:
-        """Return the time [s] after which the gestures repeat."""
-        ...
-
-    def dial_rad(self, t_s: float) -> float:
-        """By how much knobs have been turned up to a time [s]."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +82,7 @@ class RunResults:
         made = Counter(_label(one) for one in _beginnings(self.gestures))
         if made:
             out["gestures"] = dict(made.most_common())
-        if scene is not None and isinstance(scene.motion, Annotated):
+        if scene is not None and isinstance(scene.motion, Gestures):
             out |= judge_gestures(self.gestures, scene.motion, epoch_ns, from_ns, until_ns)
         return out
 
@@ -131,7 +99,7 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 
 
 def judge_gestures(
-    published: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
+    published: Sequence[Gesture], motion: Gestures, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
     """Compare the published gestures, but poses, with those of a scene's hand.
 
@@ -186,7 +154,7 @@ def _label(one: Gesture) -> str:
     return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
 
 
-def _cut(published: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
+def _cut(published: Gesture, motion: Gestures, epoch_ns: int, first_s: float, end_s: float) -> bool:
     """Whether the hand made a gesture only in part between first and last pose."""
     turns = range(int(end_s // motion.period_s) + 1)
     spans = (

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import isfinite, pi, sqrt, tan
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,22 +29,6 @@ PARALLEL_RAD = np.radians(3.0)
 LAW_RESIDUAL = 0.02
 """Most by which a law of depth and the cameras' places may differ where both are used."""
 _DEPTHS_M = (0.35, 1.0)
-
-
-class DepthLaw(Protocol):
-    """Depth <-> disparity; arrays of any shape, NaN where not seen or impossible."""
-
-    def depth(self, disparity: Float) -> Float:
-        """Depth [m] along the reference camera's axis of disparities [px]."""
-        ...
-
-    def disparity(self, depth: Float) -> Float:
-        """Disparity [px] of depths [m]."""
-        ...
-
-    def metres_per_pixel(self, depth: Float) -> Float:
-        """|dD/dx| [m/px] at depths [m]: what one pixel of disparity error costs."""
-        ...
 
 
 def _positive(values: Float) -> Float:
@@ -102,6 +86,10 @@ class AffineDisparity:
         return _positive(depth) ** 2 / self.a_m_px
 
 
+# depth <-> disparity; arrays of any shape, NaN where not seen or impossible
+DepthLaw: TypeAlias = PowerLaw | AffineDisparity
+
+
 def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDisparity:
     """The law of perfectly parallel pinhole cameras: affine with a = f B and x0 = 0.
 
@@ -115,7 +103,7 @@ def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDispari
     return AffineDisparity(baseline_m * width_px / (2.0 * tan(fov_rad / 2.0)), 0.0)
 
 
-def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw | AffineDisparity | None:
+def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> DepthLaw | None:
     """The law the rig file asks for; None when it asks for full stereo triangulation.
 
     Raises:
@@ -128,7 +116,7 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw |
         raise CalibrationError(
             f"rig {rig.name!r}: depth_model {model!r} needs two cameras, cameras has {len(rig.cameras)}: use 'stereo'"
         )
-    law: PowerLaw | AffineDisparity | None = None
+    law: DepthLaw | None = None
     if model == "power_law" and rig.power_law is not None:
         law = PowerLaw.of(rig.power_law)
     if model == "affine_disparity" and rig.affine_disparity is not None:

@@ -326,7 +326,7 @@ class RayTriangulator:
         *,
         as_seen: bool = False,
     ) -> "RayPositions":
-        """As `Triangulate`."""
+        """As `master.fabrik.triangulate.DepthTriangulator`, by the rays of all cameras."""
         cameras, count = uv.shape[:2]
         observed = np.empty((cameras, count, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2

@@ -36,8 +36,9 @@ from master.fabrik.fabrik import Chain, Coupling, Link, solve_chain
 from master.fabrik.joints import ChainArrays, Hinge, Pair, Rotor, end_of
 from master.fabrik.linear_algebra import IDENTITY, Vector, as_matrix, as_vector, length, minus
 from master.fabrik.one_euro import PointFilter
+from master.fabrik.rays import RayTriangulator
 from master.fabrik.sync import FrameSet, FrameSync
-from master.fabrik.triangulate import Triangulate
+from master.fabrik.triangulate import DepthTriangulator
 
 THUMB = 0
 Four = tuple[float, float, float, float]
@@ -301,7 +302,7 @@ class FabrikSolver:
         hand_markers: tuple[str, ...],
         *,
         sync: FrameSync,
-        triangulate: Triangulate,
+        triangulate: DepthTriangulator | RayTriangulator,
         one_euro: PointFilter | None,
         palm: Estimator,
         once: Estimator,

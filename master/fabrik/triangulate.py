@@ -17,7 +17,7 @@ fit left; and by how far the point moves where the finger points elsewhere withi
 """
 
 from math import sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -324,28 +324,6 @@ def triangulate(
             noise[m, :, :] = np.nan
 
 
-class Triangulate(Protocol):
-    """Triangulator of the M markers of an epoch, by a rig's law or by all rays."""
-
-    def __call__(
-        self,
-        uv: Float,
-        sigma_px: Float,
-        area_px2: Float,
-        hand: SolvedHand | None,
-        age_s: float,
-        *,
-        as_seen: bool = False,
-    ) -> MarkerPositions:
-        """Triangulate centroids uv (C, M, 2) [px]; NaN: not seen.
-
-        `hand`, `age_s`: a hand of a moment ago, which determines what side of each cap is seen; None: any
-        that shows it. `as_seen`: there is no estimate of a hand: what is seen of a marker is taken for its
-        centroid.
-        """
-        ...
-
-
 class DepthTriangulator:
     """Triangulates the markers of a rig by its depth law. Holds no state."""
 
@@ -362,7 +340,12 @@ class DepthTriangulator:
         *,
         as_seen: bool = False,
     ) -> MarkerPositions:
-        """As `Triangulate`; only the first two cameras count."""
+        """Triangulate centroids uv (C, M, 2) [px] of the first two cameras; NaN: unseen.
+
+        `hand`, `age_s`: a hand of a moment ago, which determines what side of each cap is seen; None: any
+        that shows it. `as_seen`: there is no estimate of a hand: what is seen of a marker is taken for its
+        centroid.
+        """
         count = uv.shape[1]
         ahead, tilt = np.full((count, 3), np.nan), np.zeros((count, 3, 3))
         if hand is not None:

@@ -19,8 +19,9 @@ from common.messages import Command, Health
 from common.messages.streams import MASTER
 from common.supervisor import ServiceManager
 from master.monitor.clocks import ClockMonitor
+from master.outputs.bus import Receive
 from master.recording.probe import Probe
-from master.run.app import AuxiliaryMessage, RunFigures, SeenT, Source, health
+from master.run.app import AuxiliaryMessage, RunFigures, SeenT, health
 from master.run.dispatcher import Dispatcher
 from master.run.ingest import Ingest
 from master.run.link_senders import MarkerCounts, limits_of
@@ -197,10 +198,13 @@ class MonitoredLoop(Generic[SeenT]):
     """A source of messages that shows the manager each time it is asked."""
 
     def __init__(
-        self, source: Source[SeenT], manager: ServiceManager, now_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        receive: Receive[SeenT | AuxiliaryMessage],
+        manager: ServiceManager,
+        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Report that the loop is ready: it begins now."""
-        self._source, self._manager, self._now_ns = source, manager, now_ns
+        self._receive, self._manager, self._now_ns = receive, manager, now_ns
         notifies = 4  # in a period of the watchdog
         self._every_ns = manager.watchdog_us * 1000 // notifies
         self._due_ns = now_ns() + self._every_ns
@@ -211,4 +215,4 @@ class MonitoredLoop(Generic[SeenT]):
         if self._every_ns and (now_ns := self._now_ns()) >= self._due_ns:
             self._manager.send("WATCHDOG=1")
             self._due_ns = now_ns + self._every_ns
-        return self._source.get(timeout_s)
+        return self._receive(timeout_s)

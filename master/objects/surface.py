@@ -19,7 +19,7 @@ hundreds of points at once, and most of what that costs is the number of calls.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -42,26 +42,6 @@ _GRAZES_M = 1e-3  # a sight that goes no deeper is not hidden: a tag lies on the
 _TINY = 1e-12
 
 
-class Parts(Protocol):
-    """K parts of one kind. Hold no state."""
-
-    def distances(self, own: Float) -> Float:
-        """(K, N) [m], negative inside, of points (K, 3, N) in the frame of each part."""
-        ...
-
-    def feet(self, part: Int, own: Float) -> Float:
-        """Return nearest surface points (N, 3) of parts (N,) to points, part frames."""
-        ...
-
-    def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """Return from where to where rays are inside a part, a little below its skin.
-
-        Ways (K, 3, N) from starts (K, 3). Both (K, N) are shares of the way; where the second is not above
-        the first, the sight passes by.
-        """
-        ...
-
-
 class Boxes:
     """Boxes, by the halves of their sides (K, 3)."""
 
@@ -69,17 +49,21 @@ class Boxes:
         self._half = 0.5 * np.array([shape.size_m for shape in shapes])
 
     def distances(self, own: Float) -> Float:
-        """As of `Parts`."""
+        """(K, N) [m], negative inside, of points (K, 3, N) in the frame of each part."""
         deep = np.abs(own) - self._half[:, :, None]
         off = np.maximum(deep, 0.0)
         return np.sqrt((off * off).sum(axis=1)) + np.minimum(deep.max(axis=1), 0.0)
 
     def feet(self, part: Int, own: Float) -> Float:
-        """As of `Parts`."""
+        """Return nearest surface points (N, 3) of parts (N,) to points, part frames."""
         return _feet_of_box(self._half[part], own)
 
     def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """As of `Parts`."""
+        """Return from where to where rays are inside a part, a little below its skin.
+
+        Ways (K, 3, N) from starts (K, 3). Both (K, N) are shares of the way; where the second is not above
+        the first, the sight passes by.
+        """
         return _through_slabs(self._half - _GRAZES_M, start, way)
 
 
@@ -98,13 +82,13 @@ class Cylinders:
         return np.sqrt(side * side + end * end) + np.minimum(np.maximum(out, up), 0.0)
 
     def feet(self, part: Int, own: Float) -> Float:
-        """As of `Parts`."""
+        """As of `Boxes`."""
         out = np.sqrt(np.vecdot(own[:, :2], own[:, :2]))
         foot = _feet_of_box(self._size[part], np.stack([out, own[:, 2]], axis=1))
         return np.concatenate([foot[:, :1] * _unit(own[:, :2], out), foot[:, 1:]], axis=1)
 
     def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """As of `Parts`."""
+        """As of `Boxes`."""
         side = _through_round(self._size[:, 0] - _GRAZES_M, start[:, :2], way[:, :2])
         ends = _through_slabs(self._size[:, 1:] - _GRAZES_M, start[:, 2:], way[:, 2:])
         return np.maximum(side[0], ends[0]), np.minimum(side[1], ends[1])
@@ -117,16 +101,20 @@ class Balls:
         self._radius = np.array([shape.radius_m for shape in shapes])
 
     def distances(self, own: Float) -> Float:
-        """As of `Parts`."""
+        """As of `Boxes`."""
         return np.sqrt((own * own).sum(axis=1)) - self._radius[:, None]
 
     def feet(self, part: Int, own: Float) -> Float:
-        """As of `Parts`."""
+        """As of `Boxes`."""
         return self._radius[part, None] * _unit(own, np.sqrt(np.vecdot(own, own)))
 
     def through(self, start: Float, way: Float) -> tuple[Float, Float]:
-        """As of `Parts`."""
+        """As of `Boxes`."""
         return _through_round(self._radius - _GRAZES_M, start, way)
+
+
+# K parts of one kind; they hold no state
+Parts: TypeAlias = Boxes | Cylinders | Balls
 
 
 def by_kind(shapes: Sequence[Shape]) -> list[tuple[list[Shape], Parts]]:

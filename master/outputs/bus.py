@@ -8,7 +8,7 @@ being a master itself, they go on the bus as they came.
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 from common.bus.bus import Bus
 from common.clock import now_ns
@@ -57,27 +57,20 @@ class BusSink:
 
 
 ReceivedT = TypeVar("ReceivedT")
-TakenT_co = TypeVar("TakenT_co", covariant=True)
-
-
-class Taking(Protocol[TakenT_co]):
-    """Where messages come from; an `Ingest`."""
-
-    def get(self, timeout_s: float) -> TakenT_co | None:
-        """The next message, or None when none came in time."""
-        ...
+# the next message, or None when none came in so many seconds; `get` of an `Ingest`'s queue
+Receive: TypeAlias = Callable[[float], ReceivedT | None]
 
 
 class DevicePoses(Generic[ReceivedT]):
     """Message source that publishes tracker poses on the caller's bus as they pass."""
 
-    def __init__(self, source: Taking[ReceivedT], bus: Bus) -> None:
+    def __init__(self, receive: Receive[ReceivedT], bus: Bus) -> None:
         """Stand between a source and who reads it."""
-        self._source, self._bus = source, bus
+        self._receive, self._bus = receive, bus
 
     def get(self, timeout_s: float) -> ReceivedT | None:
         """The next message; one of a tracker is on the bus, too, stream `device`."""
-        message = self._source.get(timeout_s)
+        message = self._receive(timeout_s)
         if isinstance(message, TrackerPose):
             self._bus.publish("device", message.source, message)
         return message

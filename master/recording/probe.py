@@ -26,7 +26,7 @@ from common.clock import Clock
 from common.errors import BusError, RecordingError
 from common.messages import Backlog, Message
 from common.messages.streams import MASTER, sender_of
-from master.outputs.bus import Taking
+from master.outputs.bus import Receive
 from master.rig.setup import RigFiles
 from master.run.solver_supervisor import LoadShedding
 
@@ -148,15 +148,15 @@ class Tapped(Generic[ReceivedT]):
     By then its reader has processed the message as far as it can.
     """
 
-    def __init__(self, source: Taking[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
+    def __init__(self, receive: Receive[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
         """Stand between a source and who reads it."""
-        self._source, self._probe, self._load_shedding = source, probe, load_shedding
+        self._receive, self._probe, self._load_shedding = receive, probe, load_shedding
         self._last: ReceivedT | None = None
 
     def get(self, timeout_s: float) -> ReceivedT | None:
         """The next message, or None when none came in time."""
         self.flush()
-        self._last = self._source.get(timeout_s)
+        self._last = self._receive(timeout_s)
         if self._last is not None:
             self._load_shedding.look(self._last)
         return self._last

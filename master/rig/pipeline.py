@@ -27,7 +27,7 @@ from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSync
-from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
+from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig.setup import RigSetup
 
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
@@ -121,7 +121,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
     rates = {name: setup.cameras[name].frame_rate_hz for name in setup.models}
     residual = CalibrationResidual.of(rig)
     law = depth_law(rig, cameras)
-    triangulate: Triangulate
+    triangulate: DepthTriangulator | RayTriangulator
     if law is None:
         triangulate = RayTriangulator(cameras, CapTables.of(setup.hand, rig.markers), residual.rays_px)
     else:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -26,51 +26,23 @@ from common.messages import (
     TrackerPose,
     restamped,
 )
+from master.estimator.pipeline import SolvedPose
 from master.monitor.rates import CameraRates
-from master.outputs.bus import Sink
+from master.objects.line import SolvedObject
+from master.outputs.bus import Receive, Sink
 
 _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour would halt the loop 3 ms every second
 _OBJECT_KEPT = 2_000  # and of objects, some seconds of each
 
 SeenT = TypeVar("SeenT", bound=Detections)
-SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
-SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
 # What comes beside the frames of cameras.
 AuxiliaryMessage: TypeAlias = TagDetections | ImuSample | TrackerPose
 _AUXILIARY = (TagDetections, ImuSample, TrackerPose)
 
 
-class SolvedT(Protocol):
-    """Hand or object at one time."""
-
-    @property
-    def pose(self) -> HandPose | ObjectPose:
-        """Where it is."""
-        ...
-
-    @property
-    def ready_t_ns(self) -> int:
-        """When its last frame was handed to its slave [ns], master's clock."""
-        ...
-
-
-Solved: TypeAlias = SolvedT | Contact | Gesture
-
-
-class Source(Protocol[SeenT_co]):
-    """Where detections, samples and poses come from: the network, or a test."""
-
-    def get(self, timeout_s: float) -> SeenT_co | AuxiliaryMessage | None:
-        """The next message, or None when none came in time."""
-        ...
-
-
-class Solver(Protocol[SeenT_contra]):
-    """What is made of all that comes: the world of a master."""
-
-    def push(self, message: SeenT_contra | AuxiliaryMessage) -> Iterable[Solved]:
-        """Take one message; yield what it completes, each before the next is computed."""
-        ...
+Solved: TypeAlias = SolvedPose | SolvedObject | Contact | Gesture
+# The world of a master takes one message; yields what it completes, each before the next is computed.
+Solve: TypeAlias = Callable[[SeenT | AuxiliaryMessage], Iterable[Solved]]
 
 
 class RunFigures:
@@ -130,22 +102,22 @@ class RunFigures:
 class Observed(Generic[SeenT]):
     """A solver with camera rates counted before it, and `monitor` called after it."""
 
-    def __init__(self, solver: Solver[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
-        self._solver, self._rates, self._monitor = solver, rates, monitor
+    def __init__(self, solve: Solve[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
+        self._solve, self._rates, self._monitor = solve, rates, monitor
 
     def push(self, message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
         """Take one message; give what it completes."""
         if isinstance(message, _AUXILIARY):
-            yield from self._solver.push(message)
+            yield from self._solve(message)
             return
         self._rates.push(message)
-        yield from self._solver.push(message)
+        yield from self._solve(message)
         self._monitor(message)
 
 
 def run(
-    source: Source[SeenT],
-    solver: Solver[SeenT],
+    receive: Receive[SeenT | AuxiliaryMessage],
+    solve: Solve[SeenT],
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,
@@ -153,10 +125,10 @@ def run(
 ) -> None:
     """Solve and publish until `stop` is set."""
     while not stop.is_set():
-        message = source.get(timeout_s=0.1)
+        message = receive(0.1)
         if message is None:
             continue
-        for solved in solver.push(message):
+        for solved in solve(message):
             now = clock.now_ns()
             published = result_at(solved, now)
             for sink in sinks:

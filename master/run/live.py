@@ -129,7 +129,7 @@ def run_live(
         )
         in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
         supervisor = SolverSupervisor(
-            Observed(dispatcher, figures.rates, monitor.push),
+            Observed(dispatcher.push, figures.rates, monitor.push).push,
             ingest.quarantine,
             clock,
             (lambda sender: renew(setups, pipelines, dispatcher, sender)) if tuning is None else tuning.renew,
@@ -151,8 +151,9 @@ def run_live(
         notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest.queue, bus), probe, load_shedding)
-        run(MonitoredLoop(source, ServiceManager(os.environ)), supervisor, sinks, clock, figures, stop)
+        source = Tapped(DevicePoses(ingest.queue.get, bus).get, probe, load_shedding)
+        loop = MonitoredLoop(source.get, ServiceManager(os.environ))
+        run(loop.get, supervisor.push, sinks, clock, figures, stop)
         source.flush()
         probe.drain()
         stop.set()

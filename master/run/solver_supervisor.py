@@ -21,33 +21,17 @@ be solved again bit for bit (`master.recording`).
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from common.clock import Clock
 from common.messages import Detections, Message
 from common.messages.streams import sender_of
 from master.rig.setup import RigSetup
 from master.run.app import Solved
+from master.run.dispatcher import Dispatcher
 from master.run.ingest import QUEUE_PER_CAMERA, Span
 from master.run.link_senders import Quarantine, SensorMessage
-
-
-class Solving(Protocol):
-    """What messages are pushed into."""
-
-    def push(self, message: SensorMessage, /) -> Iterator[Solved]:
-        """Take one message; give what it completes."""
-        ...
-
-
-class Replayed(Solving, Protocol):
-    """A fresh solver, to solve messages again."""
-
-    def flush(self) -> Iterator[Solved]:
-        """Give what still waits for something."""
-        ...
 
 
 class SolverSupervisor:
@@ -55,18 +39,18 @@ class SolverSupervisor:
 
     def __init__(
         self,
-        solver: Solving,
+        solve: Callable[[SensorMessage], Iterable[Solved]],
         quarantine: Quarantine,
         clock: Clock,
         renew: Callable[[str], None],
-        fresh: Callable[[str], Replayed],
+        fresh: Callable[[str], Dispatcher],
     ) -> None:
-        """Guard `solver`.
+        """Guard `solve`.
 
         `renew` lets new solvers take over from those that a sender feeds, and may take its time; `fresh`
         builds a solver of what a sender feeds, in its first state.
         """
-        self._solver, self._quarantine, self._clock = solver, quarantine, clock
+        self._solve, self._quarantine, self._clock = solve, quarantine, clock
         self._renew, self._fresh = renew, fresh
         recent = 64  # messages that are solved again: about ten frames of each camera of a usual rig
         self._recent: deque[SensorMessage] = deque(maxlen=recent)
@@ -79,7 +63,7 @@ class SolverSupervisor:
             return
         self._recent.append(message)
         try:
-            yield from self._solver.push(message)
+            yield from self._solve(message)
         except Exception as error:  # noqa: BLE001
             # Anything at all: the tracking of all others depends on it that none gets through.
             self._failed(sender, error)
@@ -108,7 +92,7 @@ class SolverSupervisor:
             self._quarantine.fault(found, error, self._clock.now_ns())
 
 
-def culprit(messages: Sequence[SensorMessage], fresh: Callable[[], Replayed]) -> str | None:
+def culprit(messages: Sequence[SensorMessage], fresh: Callable[[], Dispatcher]) -> str | None:
     """The one sender without whose messages nothing raises; None: there is none such."""
     senders = dict.fromkeys(sender_of(message) for message in messages)
     if len(senders) < 2 or not _raises(messages, fresh()):
@@ -121,7 +105,7 @@ def culprit(messages: Sequence[SensorMessage], fresh: Callable[[], Replayed]) ->
     return found[0] if len(found) == 1 else None
 
 
-def _raises(messages: Sequence[SensorMessage], solver: Replayed) -> bool:
+def _raises(messages: Sequence[SensorMessage], solver: Dispatcher) -> bool:
     try:
         for message in messages:
             for _ in solver.push(message):

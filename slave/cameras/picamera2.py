@@ -33,7 +33,7 @@ from slave.cameras.picamera2_settings import (
 from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes, view_text
 from slave.cameras.picamera2_timing import SyncMonitor, Timeline, wait_in_step
 from slave.cameras.settings import FrameObserver, as_values, change, demand, differences
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
@@ -41,7 +41,7 @@ SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipel
 _LOG = logging.getLogger(__name__)
 
 
-class Picamera2Camera:
+class Picamera2Camera(Tunable):
     """A `FrameSource` of a Raspberry Pi camera."""
 
     def __init__(

@@ -13,10 +13,10 @@ from common.clock import Clock
 from common.errors import CameraError, PictureError, RecordingError
 from common.recording.frame_recording import FrameRow, Manifest, open_recording
 from common.recording.pictures import FramePictures, decode, read_picture
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 
 
-class ReplayCamera:
+class ReplayCamera(Tunable):
     """A `FrameSource` that reads the pictures of a recording.
 
     Paced, the first frame comes at once and each further one when as much time has passed as in the recording, a gap

@@ -37,7 +37,7 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.lights.controller import CYCLE as STROBE
 from slave.lights.strobed import SimulatedStrobe
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class _Pace:
         return self.t_ns + round((seq - self.seq) * 1e9 / self.rate_hz)
 
 
-class SyntheticCamera:
+class SyntheticCamera(Tunable):
     """A `FrameSource` that renders its frames."""
 
     def __init__(
@@ -262,7 +262,7 @@ class Frozen:
         return self._image
 
 
-class FaultyCamera:
+class FaultyCamera(Tunable):
     """A `FrameSource` and `Tunable` that adds faults to a simulated camera."""
 
     def __init__(

@@ -39,7 +39,7 @@ from slave.cameras.settings import FrameObserver, change
 from slave.cameras.v4l2_controls import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.clocks import ForeignClock, clock_of, system_clock
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 
 BUFFERS = 4
 # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
@@ -65,7 +65,7 @@ def device_path(place: str) -> Path:
     return Path(f"/dev/video{place or '0'}" if place.isdecimal() or not place else place)
 
 
-class V4l2Camera:
+class V4l2Camera(Tunable):
     """A `FrameSource` of a V4L2 camera; `broken` counts damaged frames."""
 
     def __init__(

@@ -9,7 +9,6 @@ opened again when it was lost, until `stop` is set; `connection_lost` is called 
 import argparse
 import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from common.calibration import CameraCalibration, ImuCalibration, RigCalibration, load
@@ -25,7 +24,7 @@ from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
 from slave.drivers import IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
 from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
-from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
+from slave.service import LOST_PATIENCE_S, ConnectionLost, ConnectionLostFor, nobody
 from slave.sources import FrameSource, ImuSource, TrackerSource
 
 SYNTHETIC = "synthetic"
@@ -53,7 +52,7 @@ def open_camera(
     stop: threading.Event | None,
     *,
     wrist: bool = False,
-    connection_lost: ConnectionLost = nobody,
+    connection_lost: ConnectionLostFor = nobody,
 ) -> FrameSource | None:
     """Open the real camera that `driver` names; None: it is no real one.
 
@@ -73,6 +72,7 @@ def open_camera(
             flag = "--" + name.replace("_", "-")
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     opener: Callable[[CameraCalibration], FrameSource]
+    patience_s = LOST_PATIENCE_S
     if kind == "picamera2":
         if place and not place.isdecimal():
             raise CameraError(
@@ -80,8 +80,8 @@ def open_camera(
             )
         pi = Picamera2Options(int(place or "0"), options.sync, options.sync_timeout, pixels=pixels)
         if options.sync != "off":  # the others may have to be started first
-            connection_lost = partial(connection_lost, patience_s=LOST_PATIENCE_S + options.sync_timeout)
-            connection_lost("opens the camera, in step with others")
+            patience_s += options.sync_timeout
+            connection_lost("opens the camera, in step with others", patience_s)
         opener = lambda file: Picamera2Camera(file, pi, clock, stop)  # noqa: E731
     elif kind == "v4l2":
         codes = _codes(options.control)
@@ -89,7 +89,7 @@ def open_camera(
         opener = lambda file: V4l2Camera(file, usb, clock)  # noqa: E731
     else:
         return None
-    return reconnecting_camera(opener, camera, clock, stop, connection_lost)
+    return reconnecting_camera(opener, camera, clock, stop, lambda what: connection_lost(what, patience_s))
 
 
 def reconnecting_camera(

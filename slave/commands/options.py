@@ -16,7 +16,7 @@ from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError
 from slave.commands import devices
 from slave.drivers import CAMERAS
-from slave.service import ConnectionLost, nobody
+from slave.service import LOST_PATIENCE_S, ConnectionLostFor, nobody
 from slave.sources import FrameSource
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def open_lit(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None = None,
-    connection_lost: ConnectionLost = nobody,
+    connection_lost: ConnectionLostFor = nobody,
 ) -> FrameSource:
     """Open the camera, and before it, dark, the lights of a wrist device."""
     lights = devices.choose_lights(options.lights, rig, str(options.camera))
@@ -135,7 +135,7 @@ def _open(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None,
-    connection_lost: ConnectionLost,
+    connection_lost: ConnectionLostFor,
     lights: "SimulatedStrobe | None" = None,
 ) -> FrameSource:
     found = devices.open_camera(
@@ -178,5 +178,5 @@ def _open(
         camera,
         clock,
         stop,
-        connection_lost,
+        lambda what: connection_lost(what, LOST_PATIENCE_S),
     )

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
-from common.clock import SkewedClock
+from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError, TrackerError
 from common.geometry.transforms import matrix_to_quaternion
 from common.imu.recording import write_imu
@@ -31,7 +31,7 @@ ItemT = TypeVar("ItemT", ImuSample, TrackerPose)
 TRACKER_HZ = 100.0  # poses per second of the simulated tracker
 
 
-class FrameClock:
+class FrameClock(Clock):
     """The time of a scene that goes on only where somebody sleeps in it."""
 
     def __init__(self, start_ns: int) -> None:

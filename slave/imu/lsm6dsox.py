@@ -34,6 +34,7 @@ from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.clocks import ClockSteppedError, DeviceClock
+from slave.sources import Reporting
 
 
 class Fifo(NamedTuple):
@@ -233,7 +234,7 @@ def buses(where: Path = Path("/dev")) -> list[str]:
     return [path.name.removeprefix("i2c-") for path in sorted(where.glob("i2c-*"))]
 
 
-class Lsm6dsoxImu:
+class Lsm6dsoxImu(Reporting):
     """An `ImuSource` of the ST LSM6DSOX."""
 
     def __init__(

@@ -46,6 +46,7 @@ from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.clocks import ClockSteppedError, DeviceClock
+from slave.sources import Reporting
 
 END, ESC, ESC_END, ESC_ESC = b"\n", b"\xdb", b"\xdb\xdc", b"\xdb\xdd"
 LONGEST = 4096  # bytes; the vendor's library drops what has not ended by then
@@ -282,7 +283,7 @@ def ports() -> list[str]:
     return lines
 
 
-class Ximu3Imu:
+class Ximu3Imu(Reporting):
     """An `ImuSource` of the x-IMU3."""
 
     def __init__(

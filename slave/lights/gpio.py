@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 from common.errors import LightsError
 from common.recording.frame_recording import Illumination
 from slave.lights.gpio_watchdog import DARK, LIT
+from slave.lights.interlock import Lights
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
@@ -54,7 +55,7 @@ class Line:
         return cls(int(place) if place.isdecimal() else place, bool(slash))
 
 
-class GpioLights:
+class GpioLights(Lights):
     """`Lights` behind two GPIO lines."""
 
     def __init__(self, place: str, longest_s: float) -> None:

@@ -21,6 +21,7 @@ from smbus2 import SMBus
 from common.calibration.strobe import StrobeCalibration
 from common.errors import LightsError
 from common.recording.frame_recording import Illumination
+from slave.lights.interlock import Lights
 
 
 class Register(NamedTuple):
@@ -54,7 +55,7 @@ FAULTS1 = (
 FAULTS2 = ("led_hot", "overvoltage", "input_low", "ntc_open", "ntc_short")
 
 
-class FlashDriverLights:
+class FlashDriverLights(Lights):
     """`Lights` behind the flash driver chip; counts its faults."""
 
     def __init__(self, place: str, strobe: StrobeCalibration) -> None:

@@ -10,9 +10,9 @@ docs/safety.md. A driver that fails raises `LightsError`.
 import atexit
 import logging
 import threading
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Protocol
 
 from common.calibration.strobe import StrobeCalibration
 from common.clock import Clock, SystemClock
@@ -25,9 +25,10 @@ _SHINING = (Illumination.LASER, Illumination.LED)
 _LOG = logging.getLogger(__name__)
 
 
-class Lights(Protocol):
+class Lights(ABC):
     """Laser and LEDs of a wrist device. Opened dark by its constructor."""
 
+    @abstractmethod
     def switch(self, lit: Illumination) -> None:
         """Switch laser on (`LASER`), LEDs on (`LED`), or both off, and wait for it.
 
@@ -36,19 +37,18 @@ class Lights(Protocol):
         Raises:
             LightsError: The device is gone, or did not do it. What it does then, nobody knows: `off` is tried next.
         """
-        ...
 
+    @abstractmethod
     def off(self) -> None:
         """Have nothing on, now. As `switch`."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Leave it dark and give the device back. Safe to call twice."""
-        ...
 
+    @abstractmethod
     def counts(self) -> dict[str, int]:
         """Event of the device -> how often."""
-        ...
 
 
 class Interlock:

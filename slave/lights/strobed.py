@@ -20,11 +20,11 @@ from common.clock import Clock
 from common.errors import CalibrationError, CameraError
 from common.recording.frame_recording import Illumination
 from slave.lights.controller import CYCLE, MARGIN_NS, Strobe, StrobeSchedule
-from slave.lights.interlock import Interlock
+from slave.lights.interlock import Interlock, Lights
 from slave.sources import Frame, FrameSource, Tunable
 
 
-class StrobedCamera:
+class StrobedCamera(Tunable):
     """A `FrameSource` around another, lit by a strobe; `Tunable` where that is."""
 
     def __init__(
@@ -165,7 +165,7 @@ class Timeline:
         return Lit(on_ns[Illumination.LASER] / whole_ns, on_ns[Illumination.LED] / whole_ns)
 
 
-class SyntheticLights:
+class SyntheticLights(Lights):
     """`Lights` that only take note on a timeline, at the times of `clock`."""
 
     def __init__(self, timeline: Timeline, clock: Clock) -> None:
@@ -191,7 +191,7 @@ class SyntheticLights:
         return {}
 
 
-class _SetClock:
+class _SetClock(Clock):
     def __init__(self) -> None:
         self.t_ns = 0
 

@@ -392,3 +392,20 @@ def _alone(blob: Blob, options: list[Blob]) -> bool:
             b.left >= blob.left and b.right <= blob.right and b.top >= blob.top and b.bottom <= blob.bottom
         )
     )
+
+
+def ambiguity_counts(detector: MarkerDetector | None) -> dict[str, int]:
+    """Counts of `Health`: ambiguous.<marker>, frames with other things of its colour."""
+    return (
+        {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
+    )
+
+
+def ambiguity_metrics(detector: MarkerDetector | None) -> dict[str, float]:
+    """Metrics of `Health`: ambiguous.<marker>.u and .v, its last place [px]."""
+    if detector is None:
+        return {}
+    places = list(detector.ambiguity.places.items())  # the loop may add one
+    return {
+        f"ambiguous.{name}.{axis}": value for name, at in places for axis, value in zip("uv", at, strict=True)
+    }

@@ -12,7 +12,7 @@ own area, does not touch the marker, and is no rim between two other colours.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -259,26 +259,3 @@ def _whole(blob: Blob, others: Sequence[Blob]) -> bool:
         and blob.top - SCALE <= other.v <= blob.bottom + SCALE
         for other in others
     )
-
-
-class MarkerSource(Protocol):
-    """What sees things beside the hand; a `MarkerDetector`."""
-
-    ambiguity: ColourAmbiguityMonitor
-
-
-def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
-    """Counts of `Health`: ambiguous.<marker>, frames with other things of its colour."""
-    return (
-        {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
-    )
-
-
-def ambiguity_metrics(detector: MarkerSource | None) -> dict[str, float]:
-    """Metrics of `Health`: ambiguous.<marker>.u and .v, its last place [px]."""
-    if detector is None:
-        return {}
-    places = list(detector.ambiguity.places.items())  # the loop may add one
-    return {
-        f"ambiguous.{name}.{axis}": value for name, at in places for axis, value in zip("uv", at, strict=True)
-    }

@@ -12,7 +12,7 @@ colours.
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from copy import copy
 from functools import partial
 from typing import TypeAlias
@@ -28,7 +28,7 @@ from slave.markers.classify import ColourTable, table_of
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
 from slave.markers.scan import ScanChoice
-from slave.markers.white_balance import ColourMonitor, ColourWarning, WhiteBalance, Workers, apart
+from slave.markers.white_balance import ColourMonitor, ColourWarning, WhiteBalance, apart
 from slave.tuning import CameraFiles, Prepare
 
 
@@ -109,7 +109,7 @@ class LightAdaptiveDetector:
         self,
         camera: CameraCalibration,
         markers: tuple[str, ...],
-        workers: Workers,
+        workers: Executor,
         initial_uv: Mapping[str, tuple[float, float]] | None = None,
         engine: Engine = NUMPY,
         free: Collection[str] = (),
@@ -214,7 +214,7 @@ def _white_balanced(table: ColourTable, log_gains: Float, engine: Engine) -> Col
 def detector_for(
     camera: CameraCalibration,
     markers: tuple[str, ...],
-    workers: Workers,
+    workers: Executor,
     initial_uv: Mapping[str, tuple[float, float]] | None = None,
     engine: Engine = NUMPY,
     free: Collection[str] = (),

@@ -15,10 +15,10 @@ counted in spreads, so a colour that flickers is warned of earlier.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -230,31 +230,26 @@ class LightMeter:
         return Change(change, sure=sure, agreeing=agreeing)
 
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class Workers(Protocol):
-    """Takes jobs; a `concurrent.futures.ThreadPoolExecutor` is one."""
-
-    def submit(self, fn: Callable[[], T], /) -> Future[T]:
-        """Do `fn` now or later; the future has its result."""
-        ...
-
-
-class Inline:
+class Inline(Executor):
     """Worker in the caller's thread: the same input gives the same output."""
 
-    def submit(self, fn: Callable[[], T], /) -> Future[T]:
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Do it; the future is done."""
         done: Future[T] = Future()
-        done.set_result(fn())
+        done.set_result(fn(*args, **kwargs))
         return done
 
 
 class WhiteBalance:
     """Light of one camera: estimate, whether it is proven, the proof under way."""
 
-    def __init__(self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Workers) -> None:
+    def __init__(
+        self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Executor
+    ) -> None:
         """Begin with the light of calibration, not proven.
 
         `reference`: (M, 3) linear light of each marker's core at calibration, blue first, positive or ValueError;

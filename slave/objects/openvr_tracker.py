@@ -23,6 +23,7 @@ from common.clock import Clock
 from common.errors import TrackerChoiceError, TrackerError
 from common.geometry.transforms import matrix_to_quaternion
 from common.messages import TrackerPose
+from slave.sources import Reporting
 
 INSTALL = "pip install 'phalanx-hand[vive]', on a PC with an x86 processor; elsewhere use --device survive"
 
@@ -113,7 +114,7 @@ def _why(error: Exception) -> str:
 _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
 
-class OpenVrTracker:
+class OpenVrTracker(Reporting):
     """`TrackerSource` that reads a device from SteamVR."""
 
     def __init__(

@@ -44,6 +44,7 @@ from common.clock import Clock
 from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
 from slave.clocks import ClockSteppedError, DeviceClock
+from slave.sources import Reporting
 
 LONGEST = 1 << 17  # bytes; the longest lines are CONFIG, some 10 kB
 _SERIAL = re.compile(rb'"device_serial_number"\s*:\s*"([^"]{1,64})"')
@@ -262,7 +263,7 @@ _IN_ITS_TERMINAL = 'terminal=$1; shift; exec "$0" "$@" <"$terminal"'
 _LOG = logging.getLogger(__name__)
 
 
-class SurviveTracker:
+class SurviveTracker(Reporting):
     """`TrackerSource` that reads survive-cli."""
 
     def __init__(

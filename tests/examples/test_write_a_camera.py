@@ -52,7 +52,7 @@ class FolderCamera:
         """Give the folder back; nothing is held open."""
 
 
-class StillClock:
+class StillClock(Clock):
     """A clock that stands."""
 
     def now_ns(self) -> int:

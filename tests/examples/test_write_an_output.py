@@ -57,7 +57,7 @@ def test_the_live_loop_writes_every_hand_to_it(tmp_path: Path) -> None:
     dispatcher = Dispatcher([made.setup], [pipeline_of(made.setup, nothing)], nothing, gestures=False)
     sink: Sink = PointingLog(path)
     figures = RunFigures()
-    run(Played(made.messages, stop), dispatcher, [sink], SystemClock(), figures, stop)
+    run(Played(made.messages, stop).get, dispatcher.push, [sink], SystemClock(), figures, stop)
     sink.close()
     sink.close()
     lines = path.read_text().splitlines()

@@ -10,7 +10,7 @@ from common.arrays import Float
 from slave.live import LightReport
 from slave.markers.reloadable import ReloadableDetector
 from slave.markers.white_balance import ColourWarning
-from slave.sources import Frame
+from slave.sources import Frame, Reporting
 
 SECOND = 1_000_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
@@ -27,7 +27,7 @@ class Detector:
         self.tables = 4
 
 
-class Others:
+class Others(Reporting):
     def counts(self) -> dict[str, int]:
         return {"frames": 7}
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration
+from common.clock import Clock
 from common.errors import CameraError, ImuError, PhalanxError, TrackerChoiceError, TrackerError
 from common.messages import ImuSample, TrackerPose
 from slave import sources
 from slave.reconnect import Backoff, ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
-from slave.sources import LOG_EVERY_NS, Frame
+from slave.sources import LOG_EVERY_NS, Frame, Reporting
 
 CALIBRATION = CameraCalibration(
     version=1,
@@ -34,7 +35,7 @@ Driver = ReconnectingCamera | ReconnectingDriver[ImuSample] | ReconnectingTracke
 
 
 @dataclass
-class Bench:
+class Bench(Clock):
     """Time, and the device that is or is not there. `lives`: items until each driver loses it; empty: for ever."""
 
     error: type[Exception] = CameraError
@@ -84,7 +85,7 @@ class Stop(threading.Event):
         return self.is_set()
 
 
-class Plain:
+class Plain(Reporting):
     """What the drivers below have in common: number, time, and the end of their life."""
 
     def __init__(self, bench: Bench) -> None:

@@ -2,14 +2,14 @@ import time
 
 import pytest
 
-from common.clock import SystemClock
+from common.clock import Clock, SystemClock
 from slave.clocks import OLDEST_NS, TRIES, ForeignClock, clock_of, system_clock
 
 PERIOD_NS = 16_666_667
 LATENCY_NS = 25_000_000
 
 
-class Clocks:
+class Clocks(Clock):
     """The slave's clock and a foreign one, both driven by the test."""
 
     def __init__(self, offset_ns: int) -> None:

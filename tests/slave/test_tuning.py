@@ -25,7 +25,7 @@ from slave.markers.scan import Scan, ScanChoice
 from slave.markers.white_balance import Inline
 from slave.report import DetectionCounters, Reporter
 from slave.sender import MarkerPipeline, run
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 from slave.tuning import CameraFiles, CameraTuning
 from slave.uplink import Uplink
 from tests.network_helpers import until
@@ -61,7 +61,7 @@ def text(camera: CameraCalibration) -> str:
     return msgspec.json.encode(camera).decode()
 
 
-class Knobs:
+class Knobs(Tunable):
     """A camera of which only the settings are there."""
 
     def __init__(self) -> None:

@@ -23,7 +23,8 @@ from common.messages import Detections, MarkerDetections
 from master.calibrate.depth.source import Measured, load_pair, straightened
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep, parse_distances, write_table
 from master.commands.options import address
-from master.run.app import Source
+from master.outputs.bus import Receive
+from master.run.app import AuxiliaryMessage
 from master.run.ingest import Ingest
 
 _QUARTERS = 4
@@ -113,18 +114,21 @@ def _drift(uv: Float) -> float:
 
 
 def measure(
-    source: Source[Detections], meter: Meter, clock: Clock, progress: Callable[[float], None]
+    receive: Receive[Detections | AuxiliaryMessage],
+    meter: Meter,
+    clock: Clock,
+    progress: Callable[[float], None],
 ) -> Reading:
     """Read the target that stands before the cameras now.
 
     Raises:
         FitError: It did not stand still, or was not seen, for ten seconds; the message states which.
     """
-    while source.get(0.0) is not None:  # what was seen while it was being put there
+    while receive(0.0) is not None:  # what was seen while it was being put there
         pass
     since_ns = clock.now_ns()
     while clock.now_ns() - since_ns < 10.0 * 1e9:
-        message = source.get(0.1)
+        message = receive(0.1)
         if not isinstance(message, MarkerDetections) or message.t_ns < since_ns:
             continue
         reading = meter.push(message)
@@ -135,7 +139,7 @@ def measure(
 
 
 def run_session(
-    source: Source[Detections],
+    receive: Receive[Detections | AuxiliaryMessage],
     cameras: tuple[str, str],
     marker: int,
     distances: Sequence[float],
@@ -151,7 +155,7 @@ def run_session(
     """Lead a person through a sweep; return all places in the order of measurement.
 
     Args:
-        source: Detections, times on `clock`, the master's.
+        receive: Gives detections, times on `clock`, the master's.
         cameras: First (left) and second camera.
         marker: Index of the target's marker.
         frames, seconds: Frames of each camera to average, and time over which, at least.
@@ -174,7 +178,7 @@ def run_session(
                 notify(f"{answer!r}: neither a distance in metres, nor s, nor q")
             continue
         try:
-            reading = measure(source, Meter(cameras, marker, frames, seconds), clock, progress)
+            reading = measure(receive, Meter(cameras, marker, frames, seconds), clock, progress)
         except FitError as error:
             notify(f"{distance:.3f} m: not measured: {error}; try again")
             continue
@@ -238,7 +242,7 @@ def sweep_live(options: Namespace, outline: Float) -> Measured:
         host, port = ingest.address
         echo(f"listening on {host}:{port}; {len(wanted)} distances, marker {marker!r}")
         sweep = run_session(
-            ingest,
+            ingest.get,
             pair.cameras,
             names.index(marker),
             wanted,

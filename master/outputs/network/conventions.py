@@ -10,7 +10,7 @@ never for a duration.
 import time
 from collections.abc import Callable
 from math import isfinite
-from typing import Literal, Protocol
+from typing import Literal
 
 from common.clock import now_ns
 from common.hand.model import JOINTS, WRIST
@@ -34,18 +34,6 @@ def side_of(pose: HandPose) -> Side | None:
     if not isfinite(along):
         return None
     return "right" if along > 0.0 else "left"
-
-
-class Times(Protocol):
-    """Turns the time of a message into that of another clock."""
-
-    def local_ns(self, t_ns: int) -> int:
-        """The monotonic time of this machine [ns] at the master's time `t_ns`."""
-        ...
-
-    def wall_ns(self, t_ns: int) -> int:
-        """Nanoseconds since 1970 (UTC, this machine's clock) at the master's time."""
-        ...
 
 
 class MasterTimes:
@@ -73,7 +61,7 @@ class MasterTimes:
         return estimate.offset_ns
 
     def local_ns(self, t_ns: int) -> int:
-        """This machine's monotonic time [ns] (see `Times`)."""
+        """The monotonic time of this machine [ns] at the master's time `t_ns`."""
         estimate = self._echoes.estimate()
         if estimate is not None and abs(estimate.offset_ns) > estimate.bound_ns:
             t_ns = estimate.to_local(t_ns)
@@ -87,7 +75,7 @@ class MasterTimes:
         return t_ns + self._played_ns
 
     def wall_ns(self, t_ns: int) -> int:
-        """Nanoseconds since 1970 (see `Times`)."""
+        """Nanoseconds since 1970 (UTC, this machine's clock) at the master's time."""
         # so often the wall clock is asked: it is set now and then, and slewed by its time service
         if abs(self._now_ns() - self._wall[0]) > 1_000_000_000:
             self._wall = self._compared()

@@ -29,7 +29,7 @@ from common.clock import now_ns
 from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS
 from common.messages import HandPose, ResultMessage
-from master.outputs.network.conventions import Times
+from master.outputs.network.conventions import MasterTimes
 
 _LOOPBACK = b"lo\0"
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
@@ -200,7 +200,7 @@ class LslSink:
 
     _bound_scope: ClassVar[str | None] = None  # the library is one for the process, and listens once
 
-    def __init__(self, settings: LslOutput, times: Times) -> None:
+    def __init__(self, settings: LslOutput, times: MasterTimes) -> None:
         """Load the library; PhalanxError: it, or liblsl, is missing."""
         self._library: _Library = load_library(settings.scope, LslSink._bound_scope)
         LslSink._bound_scope = settings.scope

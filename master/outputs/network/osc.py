@@ -23,7 +23,7 @@ from common.calibration.output_settings import OscOutput
 from common.errors import PhalanxError
 from common.hand.model import FINGERS, JOINTS
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage
-from master.outputs.network.conventions import Side, Times, side_of
+from master.outputs.network.conventions import MasterTimes, Side, side_of
 
 Words = npt.NDArray[np.uint32]
 
@@ -137,7 +137,7 @@ _XYZW = [1, 2, 3, 0]
 class OscSink:
     """A `Sink` that sends each message as one OSC bundle."""
 
-    def __init__(self, settings: OscOutput, times: Times) -> None:
+    def __init__(self, settings: OscOutput, times: MasterTimes) -> None:
         """Open the socket; PhalanxError: the host is unknown."""
         self._times = times
         self._blanks: dict[Hashable, BlankBundle] = {}

@@ -18,7 +18,7 @@ from common.clock import Clock, SystemClock
 from common.errors import PhalanxError
 from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage
 from master.outputs.bus import Sink
-from master.outputs.network.conventions import Times
+from master.outputs.network.conventions import MasterTimes
 from master.outputs.web.listening import is_loopback, is_open
 
 
@@ -30,34 +30,34 @@ class Output:
     part: Callable[[OutputSettings], OutputPart]  # its settings; where they differ, it is made anew
     where: Callable[[OutputSettings], str]  # where it sends to, for a person
     # opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is reported, and it is retried
-    make: Callable[[OutputSettings, Times], Sink]
+    make: Callable[[OutputSettings, MasterTimes], Sink]
 
 
-def _osc(settings: OutputSettings, times: Times) -> Sink:
+def _osc(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.network.osc import OscSink
 
     return OscSink(settings.osc, times)
 
 
-def _vmc(settings: OutputSettings, times: Times) -> Sink:
+def _vmc(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.network.vmc import VmcSink
 
     return VmcSink(settings.vmc, times)
 
 
-def _lsl(settings: OutputSettings, times: Times) -> Sink:
+def _lsl(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.network.lsl import LslSink
 
     return LslSink(settings.lsl, times)
 
 
-def _ros2(settings: OutputSettings, times: Times) -> Sink:
+def _ros2(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.network.ros2 import Ros2Sink
 
     return Ros2Sink(settings.ros2, times)
 
 
-def _web(settings: OutputSettings, times: Times) -> Sink:
+def _web(settings: OutputSettings, times: MasterTimes) -> Sink:
     from master.outputs.web.server import WebSink
 
     return WebSink(settings.web)

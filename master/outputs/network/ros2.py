@@ -29,7 +29,7 @@ from common.calibration.output_settings import Ros2Output
 from common.errors import BusError
 from common.hand.model import FINGERS, JOINTS
 from common.messages import HandPose, ObjectPose, ResultMessage
-from master.outputs.network.conventions import Times
+from master.outputs.network.conventions import MasterTimes
 
 ADMIN = "@ros2_lv"
 # Reliable, volatile, keep the last ten; what rmw takes for granted is left out of the text: reliability, durability,
@@ -282,7 +282,7 @@ def _cdr(name: str, type_name: str, message: object) -> tuple[Topic, memoryview]
 class Ros2Sink:
     """A `Sink`: the node `phalanx` in ROS's network."""
 
-    def __init__(self, settings: Ros2Output, times: Times) -> None:
+    def __init__(self, settings: Ros2Output, times: MasterTimes) -> None:
         """Join the router; BusError: the endpoint is malformed."""
         self._times, self._router = times, settings.router
         self._publishers = RosPublishers(settings.router, settings.domain_id, "/", "phalanx")

@@ -29,7 +29,7 @@ from common.geometry.transforms import cross, matrix_to_quaternion, quaternion_t
 from common.hand.model import CHAINS, WRIST
 from common.hand.wrist import forearm_palm
 from common.messages import HandPose, ResultMessage
-from master.outputs.network.conventions import Side, Times, side_of
+from master.outputs.network.conventions import MasterTimes, Side, side_of
 from master.outputs.network.osc import Blank, BlankBundle, UdpSender, floats, ints
 
 _SEGMENTS = ("Proximal", "Intermediate", "Distal")
@@ -147,7 +147,7 @@ _STILL = np.array([0.0, 0.0, 0.0, 1.0])
 class VmcSink:
     """A `Sink` that sends every pose as bones; it ignores other messages."""
 
-    def __init__(self, settings: VmcOutput, times: Times) -> None:
+    def __init__(self, settings: VmcOutput, times: MasterTimes) -> None:
         """Open the socket; PhalanxError: the host is unknown."""
         self._settings, self._times = settings, times
         rotation = quaternion_to_matrix(np.array(settings.q_avatar_rig))

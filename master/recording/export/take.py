@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -87,58 +87,6 @@ class Window:
 
 _Kind = TypeVar("_Kind", HandPose, ObjectPose, Contact, Gesture, MarkerDetections, WristDetections)
 _BATCH = 1024
-
-
-class Take(Protocol):
-    """What was recorded of one or more hands."""
-
-    @property
-    def begin_t_ns(self) -> int:
-        """Time of its beginning [ns], master's clock: second 0 of all that is exported."""
-        ...
-
-    @property
-    def hands(self) -> tuple[str, ...]:
-        """The hands it has poses of, in order."""
-        ...
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What is not as it should be with the source, for a person."""
-        ...
-
-    def count(self, hand: str) -> int:
-        """How many poses of a hand there are at most."""
-        ...
-
-    def batches(self, hand: str) -> Iterator[Poses]:
-        """The poses of a hand."""
-        ...
-
-    def objects(self) -> list[ObjectPoses]:
-        """The objects."""
-        ...
-
-    def contacts(self) -> list[Contacts]:
-        """The contacts of hands and objects."""
-        ...
-
-    def gestures(self) -> list[Gesture]:
-        """The gestures of the hands."""
-        ...
-
-    def detections(self) -> dict[str, list[Detections]]:
-        """Camera -> what it saw, where the source has that."""
-        ...
-
-    @property
-    def rigs(self) -> tuple[str, ...]:
-        """Names of the rigs that it was made with, where the source knows them."""
-        ...
-
-    def tree(self, given: Path) -> AbstractContextManager[Path]:
-        """Return the source's own calibration, unpacked for the context, or `given`."""
-        ...
 
 
 class _RunTake:
@@ -277,6 +225,10 @@ class _MessageTake:
                 continue
             if (first is None or message.t_ns >= first) and (last is None or message.t_ns <= last):
                 yield message
+
+
+# what was recorded of one or more hands
+Take: TypeAlias = _RunTake | _MessageTake
 
 
 def open_take(path: Path, window: Window) -> Take:

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import zlib
 from collections import Counter
+from io import FileIO
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -273,7 +275,7 @@ class SmallDisk:
 
 def test_a_full_disk_ends_the_file_and_leaves_what_was_written(tmp_path: Path) -> None:
     messages, path = recorded(), tmp_path / "full.mcap"
-    writer = MessageWriter(path, FILES, open_disk=lambda where: SmallDisk(where, 6000))
+    writer = MessageWriter(path, FILES, open_disk=lambda where: cast(FileIO, SmallDisk(where, 6000)))
 
     def write_all() -> None:
         for stream, message, t_ns in messages:

@@ -212,7 +212,7 @@ def test_the_loop_is_ready_once_and_gives_a_sign_of_life_four_times_in_a_period(
         manager.setblocking(False)
         now = [0]
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "8000000"}
-        loop = MonitoredLoop(_Nothing(), ServiceManager(environment), lambda: now[0])
+        loop = MonitoredLoop(_Nothing().get, ServiceManager(environment), lambda: now[0])
         assert manager.recv(100) == b"READY=1\nSTATUS=tracks"
         for now[0] in range(0, 8_000_000_001, 100_000_000):
             assert loop.get(0.1) is None

@@ -1,13 +1,13 @@
 """What a run told beside the hands: figures of gestures against a script, contact, and the messages again."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from common.messages import Contact, Gesture, ObjectPose
-from master.evaluation.run_results import Annotated, RunResults, judge_gestures
+from common.sim.gestures import Annotation, Gestures
+from master.evaluation.run_results import RunResults, judge_gestures
 from master.outputs.poses import RunFiles
 from tests.master.outputs.test_outputs_rerun import STEP_NS
 from tests.master.outputs.test_outputs_results import START_NS, WATCHED, bar, contact, gesture
@@ -15,19 +15,17 @@ from tests.master.outputs.test_outputs_results import START_NS, WATCHED, bar, co
 EPOCH_NS = START_NS
 
 
-@dataclass(frozen=True)
-class Act:
-    kind: str
-    name: str
-    start_s: float
-    stop_s: float
-
-
-class Script:
+class Script(Gestures):
     """Says three things in 10 s, and turns a knob by half a radian a second."""
 
-    annotations = (Act("pinch", "index", 1.0, 2.0), Act("dial", "dial", 3.0, 5.0), Act("tap", "5", 6.0, 6.3))
     period_s = 10.0
+
+    def __init__(self) -> None:
+        self.annotations = (
+            Annotation("pinch", "index", 1.0, 2.0),
+            Annotation("dial", "dial", 3.0, 5.0),
+            Annotation("tap", "5", 6.0, 6.3),
+        )
 
     def dial_rad(self, t_s: float) -> float:
         return 0.5 * t_s
@@ -36,10 +34,6 @@ class Script:
 def recognised(kind: str, name: str, at_s: float, phase: str = "begin", **more: float) -> Gesture:
     t_ns = EPOCH_NS + round(at_s * 1e9)
     return Gesture("h", t_ns, kind, name, phase, t_ns, 0.9, **more)  # type: ignore[arg-type]
-
-
-def test_the_script_is_one() -> None:
-    assert isinstance(Script(), Annotated)
 
 
 def test_what_was_made_and_reported_is_right_and_what_was_not_made_is_false() -> None:

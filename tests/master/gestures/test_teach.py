@@ -9,6 +9,7 @@ import pytest
 from common.arrays import Float
 from common.calibration import HandProfile, load, save
 from common.calibration.gesture_settings import GestureSettings, default_gestures
+from common.clock import Clock
 from common.errors import FitError, PhalanxError
 from common.hand.model import HandModel
 from common.messages import HandPose
@@ -119,7 +120,7 @@ def test_a_hidden_hand_cannot_teach() -> None:
         learn("horns", [unseen] * 3, SETTINGS)
 
 
-class Stage:
+class Stage(Clock):
     """A person before the master, on a clock of frames: shows what `angles` has for the time."""
 
     def __init__(self, moving: bool = False, silent: bool = False) -> None:

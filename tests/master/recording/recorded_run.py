@@ -85,7 +85,7 @@ def overloaded_run(path: Path, calibration: Path, bursts: Sequence[int]) -> tupl
     load_shedding.waiting, dispatcher = come.queue.frame_spans, world_of(setups, load_shedding)
     shown = bus.subscribe("taken", depth=1000)
     probe = Probe(bus, ManualClock(), always=True)
-    source = Tapped(come, probe, load_shedding)
+    source = Tapped(come.get, probe, load_shedding)
     while (message := source.get(0.0)) is not None:
         for solved in dispatcher.push(message):
             live.take(solved if isinstance(solved, Contact | Gesture) else solved.pose)

@@ -47,7 +47,7 @@ def test_the_tap_shows_only_while_somebody_asks_and_all_of_it_in_order() -> None
     bus, clock = LoopbackBus(), ManualClock(10)
     shown = bus.subscribe("taken", depth=100)
     probe = Probe(bus, clock)
-    source = Tapped(Listed(frames(9)), probe, LoadShedding())
+    source = Tapped(Listed(frames(9)).get, probe, LoadShedding())
     assert probe.counts == {}
     assert source.get(0.0) is not None
     assert source.get(0.0) is not None
@@ -98,7 +98,7 @@ def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() ->
     bus, load_shedding = LoopbackBus(), Behind([0, 3, 3, 3, 0, 0])
     shown = bus.subscribe("taken", depth=100)
     probe = Probe(bus, ManualClock(10))
-    source = Tapped(Listed(frames(6)), probe, load_shedding)
+    source = Tapped(Listed(frames(6)).get, probe, load_shedding)
     probe.lease()
     for number in range(7):
         if number == 3:
@@ -135,7 +135,7 @@ class Stuck:
 def test_a_disk_that_is_too_slow_costs_counted_messages(tmp_path: Path) -> None:
     disk = Stuck()
     disk.go.set()
-    writer = MessageWriter(tmp_path / "a.mcap", {}, open_disk=lambda _path: disk)
+    writer = MessageWriter(tmp_path / "a.mcap", {}, open_disk=lambda _path: cast(io.FileIO, disk))
     disk.go.clear()
     recorder = MessageRecorder(writer, tmp_path, 0, depth=5)
     for number, message in enumerate(frames(50)):
@@ -151,7 +151,9 @@ def test_a_disk_that_is_too_slow_costs_counted_messages(tmp_path: Path) -> None:
 def test_a_disk_that_fails_or_fills_ends_the_recording_with_the_reason(tmp_path: Path) -> None:
     disk = Stuck()
     disk.go.set()
-    recorder = MessageRecorder(MessageWriter(tmp_path / "a", {}, open_disk=lambda _path: disk), tmp_path, 0)
+    recorder = MessageRecorder(
+        MessageWriter(tmp_path / "a", {}, open_disk=lambda _path: cast(io.FileIO, disk)), tmp_path, 0
+    )
     disk.fail = True
     recorder.offer("taken", frames(1)[0], 0)
     assert until(lambda: recorder.failure is not None)

@@ -9,6 +9,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import ImuCalibration
+from common.clock import Clock
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand.model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
@@ -38,7 +39,7 @@ class ScriptedSource:
             return None
 
 
-class ScriptedClock:
+class ScriptedClock(Clock):
     """The time is whatever the last message said, and 3 ms."""
 
     t_ns = 0
@@ -79,7 +80,7 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     ]
     source = ScriptedSource(script, stop)
     clock.t_ns = short_run.messages[-1].t_ns + 3_000_000
-    run(source, world_of(short_run.setup), sinks, clock, figures, stop)
+    run(source.get, world_of(short_run.setup).push, sinks, clock, figures, stop)
     assert figures.poses == len(sinks[0].poses) >= 5
     assert [p.t_ns for p in sinks[0].poses] == [p.t_ns for p in sinks[1].poses]
     last = sinks[0].poses[-1]
@@ -103,8 +104,8 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
     hands, watched = world_of(setup), list[MarkerDetections]()
-    observed = Observed(hands, figures.rates, watched.append)
-    run(ScriptedSource([*script], stop), observed, [sink], ScriptedClock(), figures, stop)
+    observed = Observed(hands.push, figures.rates, watched.append)
+    run(ScriptedSource([*script], stop).get, observed.push, [sink], ScriptedClock(), figures, stop)
     assert watched == short_run.messages
     assert set(figures.rates.camera_hz) == {"left", "right"}
     assert hands.counts["orientation.used"] == len(sink.poses) >= 5
@@ -117,7 +118,9 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
 def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
     unplaced = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=ImuCalibration()))
     stop, hands = threading.Event(), world_of(unplaced)
-    run(ScriptedSource([rotated(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
+    run(
+        ScriptedSource([rotated(0, np.eye(3))], stop).get, hands.push, [], ScriptedClock(), RunFigures(), stop
+    )
     assert hands.counts == {"orientation.unplaced": 1}
 
 
@@ -126,7 +129,7 @@ def test_a_stopped_loop_does_nothing(short_run: SyntheticRun) -> None:
     stop.set()
     sink = Collector()
     source = ScriptedSource(list(short_run.messages), stop)
-    run(source, world_of(short_run.setup), [sink], ScriptedClock(), RunFigures(), stop)
+    run(source.get, world_of(short_run.setup).push, [sink], ScriptedClock(), RunFigures(), stop)
     assert sink.poses == []
 
 

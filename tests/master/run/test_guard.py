@@ -8,6 +8,7 @@ import pytest
 from common.messages import MarkerDetections
 from common.messages.streams import sender_of
 from master.run.app import Solved
+from master.run.dispatcher import Dispatcher
 from master.run.link_senders import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine, SensorMessage
 from master.run.solver_supervisor import SolverSupervisor, culprit
 from tests.network_helpers import ManualClock, detections
@@ -16,7 +17,7 @@ S = 1_000_000_000
 POISON = 13.0  # as `area` of the first marker
 
 
-class Fragile:
+class Fragile(Dispatcher):
     """Fails at the next message of `at` once it has seen poison, and ever after; then holds nothing else."""
 
     def __init__(self, at: str | None = None) -> None:
@@ -61,7 +62,7 @@ class Scene:
         self.at, self.clock, self.quarantine = at, ManualClock(0), Quarantine()
         self.solver, self.renewed = Fragile(at), list[str]()
         self.guard = SolverSupervisor(
-            self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at)
+            self.push, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at)
         )
 
     def push_inner(self, message: SensorMessage) -> Iterator[Solved]:

@@ -172,8 +172,8 @@ def test_the_loop_says_how_long_an_object_took_and_counts_it(wand: ObjectRun) ->
     clock.t_ns = wand.messages[-1].t_ns + 3_000_000
     watched: list[MarkerDetections] = []
     run(
-        ScriptedSource([*wand.messages], stop),
-        Observed(world_of(wand.setup), figures.rates, watched.append),
+        ScriptedSource([*wand.messages], stop).get,
+        Observed(world_of(wand.setup).push, figures.rates, watched.append).push,
         [sink],
         clock,
         figures,
@@ -197,8 +197,8 @@ def test_tags_and_poses_of_trackers_are_no_frames(cube: ObjectRun) -> None:
     setup = with_tracker(cube.setup)
     script = [*cube.messages, tracker_pose("puck", cube.pose("cube", START_NS), 0, START_NS)]
     dispatcher = world_of(setup)
-    observed = Observed(dispatcher, figures.rates, lambda _frame: None)
-    run(ScriptedSource([*script], stop), observed, [], ScriptedClock(), figures, stop)
+    observed = Observed(dispatcher.push, figures.rates, lambda _frame: None)
+    run(ScriptedSource([*script], stop).get, observed.push, [], ScriptedClock(), figures, stop)
     assert figures.rates.camera_hz == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
 

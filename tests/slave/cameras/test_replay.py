@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from common.clock import Clock
 from common.errors import CameraError
 from common.recording.frame_recording import Illumination
 from slave.cameras.replay import ReplayCamera
@@ -22,7 +23,7 @@ CAMERA = {
 }
 
 
-class StepClock:
+class StepClock(Clock):
     """A clock that a sleep cannot move: every look at it costs 1 ms."""
 
     def __init__(self, t_ns: int) -> None:

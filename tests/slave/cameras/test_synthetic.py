@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.clock import SkewedClock
+from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError
 from common.geometry.srgb import to_linear
 from common.sim.render import Renderer
@@ -23,7 +23,7 @@ READOUT_NS = 2_500_000 + 480 * 20_600  # half the exposure, then all rows
 EPOCH_NS = 7_000_000_000_000
 
 
-class StageClock:
+class StageClock(Clock):
     """A true clock that moves only when somebody sleeps or the test says so."""
 
     def __init__(self, t_ns: int) -> None:

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from common.clock import SkewedClock
+from common.clock import Clock, SkewedClock
 from common.messages import ImuSample
 from common.sim.sensors import SimulatedImu
 from slave.commands.simulated import SyntheticSensor
@@ -19,7 +19,7 @@ AHEAD_NS = 3_000_000_000
 IMU = SimulatedImu.of(scene("standard"))
 
 
-class Stage(threading.Event):
+class Stage(threading.Event, Clock):
     """A true clock that moves only when somebody waits or the test says so; set after `until` waits."""
 
     def __init__(self, t_ns: int, until: int = 10**9) -> None:

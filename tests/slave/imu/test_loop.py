@@ -18,6 +18,7 @@ from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
 from slave.report import Reporter, imu_counters
 from slave.sender import ImuPipeline, run, skip_one, wait_for_start
+from slave.sources import Reporting
 from slave.uplink import Uplink
 from tests.network_helpers import until
 
@@ -88,7 +89,7 @@ class Filter:
         return msgspec.structs.replace(sample, orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class Reporting(Source):
+class ReportingSource(Source, Reporting):
     """An IMU that has more to tell."""
 
     def counts(self) -> dict[str, int]:
@@ -99,7 +100,7 @@ class Reporting(Source):
 
 
 def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are_reported() -> None:
-    wire, source, orientation = Wire(), Reporting([sample(0), sample(1)]), Filter()
+    wire, source, orientation = Wire(), ReportingSource([sample(0), sample(1)]), Filter()
     counters = imu_counters(source, cast(OrientationFilter, orientation))
     run(source, ImuPipeline(77, wire.send, counters, orientation.push), threading.Event())
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2

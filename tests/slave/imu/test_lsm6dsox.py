@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.lsm6dsox import (
@@ -28,7 +29,7 @@ from tests.slave.imu.fake_i2c import FakeLsm6dsox
 PLACE = I2cPlace(1)
 
 
-class Dispatcher(threading.Event):
+class Dispatcher(threading.Event, Clock):
     """A clock that waiting moves on, and with it a part that measures."""
 
     def __init__(self, part: FakeLsm6dsox) -> None:

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from common.calibration import CameraCalibration, RigCalibration, load
+from common.clock import Clock
 from common.errors import LightsError
 from common.recording.frame_recording import Illumination
+from slave.lights.interlock import Lights
 
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
@@ -20,7 +22,7 @@ LASER, LED, AMBIENT = Illumination.LASER, Illumination.LED, Illumination.AMBIENT
 MS = 1_000_000
 
 
-class SetClock:
+class SetClock(Clock):
     """A clock that only the test moves."""
 
     def __init__(self, t_ns: int = FIRST_NS) -> None:
@@ -30,7 +32,7 @@ class SetClock:
         return self.t_ns
 
 
-class NotedLights:
+class NotedLights(Lights):
     """`Lights` that note when they were switched; each switching takes `takes_ns`, and fails while `fails`."""
 
     def __init__(self, clock: SetClock, takes_ns: int = 0) -> None:

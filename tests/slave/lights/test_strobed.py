@@ -10,11 +10,11 @@ from common.calibration import CameraCalibration
 from common.errors import CameraError, LightsError
 from slave.lights.controller import Strobe
 from slave.lights.strobed import StrobedCamera
-from slave.sources import Frame
+from slave.sources import Frame, Tunable
 from tests.slave.lights.stage import CAMERA, RIG
 
 
-class Source:
+class Source(Tunable):
     """A camera with two frames, which is lost then, and gone at last."""
 
     def __init__(self, output: list[object], tunes: bool = True) -> None:

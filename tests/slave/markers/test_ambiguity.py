@@ -13,7 +13,8 @@ from common.errors import CameraError
 from slave.cameras.synthetic import FaultyCamera, SyntheticCamera
 from slave.commands.simulated import FrameClock, scene_of
 from slave.markers.classify import Blob
-from slave.markers.group import ColourAmbiguityMonitor, ambiguity_counts, ambiguity_metrics
+from slave.markers.detector import ambiguity_counts, ambiguity_metrics
+from slave.markers.group import ColourAmbiguityMonitor
 from slave.tuning import in_use, overlap
 
 ROOT = Path(__file__).resolve().parents[3]

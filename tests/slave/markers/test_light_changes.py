@@ -4,10 +4,10 @@ Whole detector, rendered frames, exact truth; the scene, its courses of light an
 """
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import cache
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import msgspec
 import numpy as np
@@ -34,6 +34,7 @@ from tests.slave.light_courses import (
     standard_scene,
 )
 
+P = ParamSpec("P")
 T = TypeVar("T")
 MARKERS = load_rig().markers
 
@@ -79,7 +80,7 @@ def test_a_light_out_of_bounds_is_warned_of_before_it_costs_a_marker() -> None:
     assert got.missed_unwarned <= still(7, "left").visible - still(7, "left").found
 
 
-class Later:
+class Later(Executor):
     """Workers that are busy: a job is done so many frames after it came."""
 
     def __init__(self, frames: int) -> None:
@@ -87,9 +88,9 @@ class Later:
         self._jobs: list[tuple[int, Callable[[], None]]] = []
         self._now = 0
 
-    def submit(self, fn: Callable[[], T], /) -> Future[T]:
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         future: Future[T] = Future()
-        self._jobs.append((self._now + self.frames, lambda: future.set_result(fn())))
+        self._jobs.append((self._now + self.frames, lambda: future.set_result(fn(*args, **kwargs))))
         return future
 
     def frame(self) -> None:

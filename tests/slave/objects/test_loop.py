@@ -19,6 +19,7 @@ from slave.__main__ import main
 from slave.commands.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 from slave.report import pose_counters
 from slave.sender import PosePipeline, run, skip_one, wait_for_start
+from slave.sources import Reporting
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 KEY = "11" * 32
@@ -31,7 +32,7 @@ def pose(seq: int, known: bool = True) -> TrackerPose:
     return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, quaternion)
 
 
-class Source:
+class Source(Reporting):
     """A tracker with a list of poses; an exception in the list is raised."""
 
     def __init__(self, poses: list[TrackerPose | TrackerError]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.clock import Clock
 from common.recording.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.wrist.render import WristRenderer
@@ -21,7 +22,7 @@ PERIOD_NS = 1e9 / CAMERAS["wrist"].frame_rate_hz
 EPOCH_NS = 5_000_000_000_000
 
 
-class StageClock:
+class StageClock(Clock):
     """A true clock that moves only when somebody sleeps or the test says so."""
 
     def __init__(self, t_ns: int) -> None:

@@ -120,7 +120,7 @@ class Queue:
 def test_nobody_sends_and_the_reason_is_reported() -> None:
     clock = ManualClock()
     with pytest.raises(FitError, match="no frames from left and right"):
-        measure(Queue(clock, []), Meter(CAMERAS, INDEX, 8, 1.0), clock, lambda share: None)
+        measure(Queue(clock, []).get, Meter(CAMERAS, INDEX, 8, 1.0), clock, lambda share: None)
     assert clock.t_ns >= 10_000_000_000
 
 
@@ -131,7 +131,7 @@ def test_samples_of_an_imu_between_the_frames_are_passed_over() -> None:
         t_ns = round((1 + i) * 1e8)
         messages.append(ImuSample("palm-imu", 1, i, t_ns, zero, zero, zero, np.eye(4)[0]))
         messages += [sees(camera, 1, i, t_ns, uv[camera][i]) for camera in CAMERAS]
-    reading = measure(Queue(clock, messages), Meter(CAMERAS, INDEX, 30, 1.0), clock, lambda share: None)
+    reading = measure(Queue(clock, messages).get, Meter(CAMERAS, INDEX, 30, 1.0), clock, lambda share: None)
     assert (reading.frames >= 30).all()
 
 
@@ -198,7 +198,7 @@ def test_a_whole_session_over_the_wire(desk: Desk, tmp_path: Path) -> None:
         write_table(tmp_path / "kept.csv", sweep)
 
     sweep = run_session(
-        desk.ingest, CAMERAS, INDEX, STEPS.tolist(), frames=10, seconds=0.2, clock=desk.clock,
+        desk.ingest.get, CAMERAS, INDEX, STEPS.tolist(), frames=10, seconds=0.2, clock=desk.clock,
         ask=ask, notify=lines.append, progress=lambda share: None, keep=keep,
     )  # fmt: skip
     assert sweep.distance_m.tolist() == [1.0, 0.8, 0.55, 0.5, 0.4, 0.3, 0.25, 0.2]
@@ -214,13 +214,13 @@ def test_a_whole_session_over_the_wire(desk: Desk, tmp_path: Path) -> None:
 def test_skipping_and_ending(desk: Desk) -> None:
     answers = deque(["s", "", "q"])
     sweep = run_session(
-        desk.ingest, CAMERAS, INDEX, [0.7, 1.0, 0.5, 0.4], frames=10, seconds=0.2, clock=desk.clock,
+        desk.ingest.get, CAMERAS, INDEX, [0.7, 1.0, 0.5, 0.4], frames=10, seconds=0.2, clock=desk.clock,
         ask=lambda prompt: answers.popleft(), notify=lambda line: None, progress=lambda share: None,
         keep=lambda sweep: None,
     )  # fmt: skip
     assert sweep.distance_m.tolist() == [1.0]
     empty = run_session(
-        desk.ingest, CAMERAS, INDEX, [1.0], frames=10, seconds=0.2, clock=desk.clock,
+        desk.ingest.get, CAMERAS, INDEX, [1.0], frames=10, seconds=0.2, clock=desk.clock,
         ask=lambda prompt: None, notify=lambda line: None, progress=lambda share: None, keep=lambda sweep: None,
     )  # fmt: skip
     assert empty.size == 0

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from common.clock import Clock
 from common.errors import FitError
 from common.hand.routine import STEPS
 from common.messages import HandPose, Source
@@ -24,7 +25,7 @@ def pose_at(t_ns: int, hidden: tuple[int, ...] = ()) -> HandPose:
     )  # fmt: skip
 
 
-class Person:
+class Person(Clock):
     """A clock that each pose moves on by 20 ms; between two times some markers are hidden. Holds the time."""
 
     def __init__(self, hidden: tuple[int, ...] = (), first_s: float = 0.0, last_s: float = 0.0) -> None:

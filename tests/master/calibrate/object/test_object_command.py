@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from bench.played import START_NS
 from common.calibration import HandProfile, RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
+from common.clock import Clock
 from common.geometry.transforms import fit_rigid, transform
 from common.messages import HandPose
 from common.sim.record import record_scene
@@ -145,7 +146,7 @@ def test_what_is_asked_wrongly_is_refused(
     assert not (tree / "objects").exists()
 
 
-class Clock:
+class SetClock(Clock):
     """A clock that goes on by 1/60 s each time it is read."""
 
     def __init__(self) -> None:
@@ -161,7 +162,7 @@ class Clock:
 def test_a_person_is_warned_that_nothing_comes() -> None:
     output: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
-        guide(lambda wait_s: None, RIG, BEADS, Clock(), output.append, 3.0)
+        guide(lambda wait_s: None, RIG, BEADS, SetClock(), output.append, 3.0)
     assert any("phalanx run" in line for line in output[1:])
 
 
@@ -180,7 +181,7 @@ def test_markers_of_poses_are_what_is_measured() -> None:
     """A session of poses as a master publishes them is what was placed from the detections."""
     motion = seen(5, 1.5)
     poses = iter([*map(_pose, range(len(motion.t_s)), motion.t_s, motion.points_m, motion.cov_m2)])
-    found = guide(lambda wait_s: next(poses, None), RIG, BEADS, Clock(), lambda line: None, 4.0)
+    found = guide(lambda wait_s: next(poses, None), RIG, BEADS, SetClock(), lambda line: None, 4.0)
     np.testing.assert_array_equal(found.points_m, motion.points_m)
 
 

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from common.bus.bus import LoopbackBus
 from common.calibration import RigCalibration, load, save
 from common.calibration.object_profile import ObjectProfile
+from common.clock import Clock
 from common.errors import FitError, RecordingError
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.recording.recorded_files import write_npz
@@ -179,7 +180,7 @@ def test_coverage_reports_which_axis_and_what_else_is_missing() -> None:
     assert any("faster" in line for line in of(Motion(7, strays=0.0, pace=0.02)))
 
 
-class Clock:
+class SetClock(Clock):
     """The time of the poses that came."""
 
     def __init__(self) -> None:
@@ -190,7 +191,7 @@ class Clock:
 
 
 def played(
-    messages: list[ObjectPose | TrackerPose], clock: Clock
+    messages: list[ObjectPose | TrackerPose], clock: SetClock
 ) -> Callable[[float], ObjectPose | TrackerPose | None]:
     """Messages at their times, then nothing."""
     waiting = sorted(messages, key=lambda one: one.t_ns)
@@ -206,7 +207,7 @@ def played(
 
 
 def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() -> None:
-    motion, clock, output = Motion(9, seconds=40.0), Clock(), list[str]()
+    motion, clock, output = Motion(9, seconds=40.0), SetClock(), list[str]()
     held = replace(motion.objects()[0], tracked=False, source=ObjectSource.HELD)
     session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, output.append, 60.0)
     assert 15.0 < 1e-9 * (clock.t_ns - ZERO_NS) < 30.0
@@ -227,7 +228,7 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
     ],
 )
 def test_who_is_silent_is_said(rejected: str, text: str) -> None:
-    motion, clock, output = Motion(9, seconds=8.0), Clock(), list[str]()
+    motion, clock, output = Motion(9, seconds=8.0), SetClock(), list[str]()
     nowhere = [replace(one, position_m=np.full(3, np.nan)) for one in motion.tracked()]
     messages: list[ObjectPose | TrackerPose] = [] if rejected in ("object", "both") else [*motion.objects()]
     messages += {"tracker": [], "both": [], "place": nowhere}.get(rejected, motion.tracked())
@@ -248,7 +249,7 @@ def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
 
     bus = LoopbackBus()
     received = bus.subscribe("device", "tracker")
-    passing = DevicePoses(Source(), bus)
+    passing = DevicePoses(Source().get, bus)
     taken = [passing.get(0.0) for _ in range(5)]
     assert taken[3:] == ["a frame", None]
     for was in taken[:3]:

@@ -15,6 +15,7 @@ from common.calibration.output_settings import Ros2Output
 from common.errors import BusError
 from common.hand.model import JOINTS
 from common.messages import HandPose, ObjectPose, ObjectSource
+from master.outputs.network.conventions import MasterTimes
 from master.outputs.network.ros2 import (
     ANGLES,
     FRAME,
@@ -41,7 +42,7 @@ STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a1
 WALL_NS = 1_750_000_000_123_456_789
 
 
-class WallTimes:
+class WallTimes(MasterTimes):
     """The wall clock as the master's, plus an hour."""
 
     def local_ns(self, t_ns: int) -> int:
