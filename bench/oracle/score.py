@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite, isnan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -88,7 +89,8 @@ class Samples:
         """Both together."""
         parts = ((one.name, getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
         added = ("lag_m2", "wanted", "epochs", "without", "ghosts")
-        return Samples(**{name: a + b if name in added else np.concatenate([a, b]) for name, a, b in parts})
+        both: dict[str, Any] = {n: a + b if n in added else np.concatenate([a, b]) for n, a, b in parts}
+        return Samples(**both)
 
 
 def samples_of(run: Solved, truths: Mapping[str, Truth], other: Solved | None = None) -> Samples:

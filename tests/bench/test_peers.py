@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
+from scipy.optimize import least_squares
 
 from bench.hands import ik
 from bench.hands.draws import (
