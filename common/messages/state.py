@@ -28,7 +28,7 @@ from common.messages.parts import (
     TimeNs,
     printable,
 )
-from common.recording.pictures import MAX_PIXELS, jpeg_size
+from common.messages.picture_size import MAX_PIXELS, jpeg_size
 
 
 class Metric(NamedTuple):

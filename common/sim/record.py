@@ -16,7 +16,7 @@ import numpy.typing as npt
 from common.arrays import Float, Image
 from common.errors import RecordingError
 from common.hand.model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
-from common.imu.recording import write_imu
+from common.imu.csv_table import write_imu
 from common.recording.frame_recording import Illumination, Manifest
 from common.recording.frame_writing import RecordingWriter, encode_png
 from common.recording.recorded_files import write_npz

@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from common.bus.bus import Bus, Subscription
 from common.bus.keys import (
@@ -36,7 +37,6 @@ from common.bus.keys import (
     new_key,
     shown,
 )
-from common.bus.zenoh_bus import ZenohBus
 from common.clock import Clock, SystemClock
 from common.command_line import UsageError, echo
 from common.errors import PhalanxError
@@ -45,6 +45,9 @@ from common.machine import program
 from common.messages import Command, Health
 from common.messages.streams import sender_of
 from master.run.process import bus_of_master, stop_on_signals
+
+if TYPE_CHECKING:
+    from common.bus.zenoh_bus import ZenohBus
 
 AUTHORITY_KEY = "ca.key"
 _ENDINGS = ("pem", "key", "secret")
@@ -410,6 +413,8 @@ def relay(options: Namespace) -> None:
 
 def _route(listen: str, connect: Sequence[str]) -> None:
     stop = stop_on_signals()
+    from common.bus.zenoh_bus import ZenohBus  # the other commands on keys need no bus
+
     bus = ZenohBus(listen, connect, access_of(os.environ, MASTER), router=True)
     try:
         _notify("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect))
@@ -422,7 +427,7 @@ def _route(listen: str, connect: Sequence[str]) -> None:
         bus.close()
 
 
-def _repeat(below: ZenohBus, above: ZenohBus, site: str, stop: threading.Event) -> None:
+def _repeat(below: "ZenohBus", above: "ZenohBus", site: str, stop: threading.Event) -> None:
     try:
         repeats = Relay(below, above, SystemClock())
         _notify("relay", f"repeating as {site}")

@@ -13,7 +13,7 @@ from common.calibration import CameraCalibration
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Health, Message, Preview
 from common.messages.command_bodies import PreviewWish
-from common.recording.pictures import Size, jpeg_size
+from common.messages.picture_size import Size, jpeg_size
 
 POLL_S = 0.5  # between two looks at who is alive
 ANSWER_S = 20.0  # a slow camera shows its new settings after some seconds

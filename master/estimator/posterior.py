@@ -503,7 +503,7 @@ class Workspace:
 
 
 class Model(NamedTuple):
-    """Everything that is the same at every epoch, in boxes (`common.kernels.boxed`)."""
+    """Everything that is the same at every epoch, in boxes (`common.records.boxed`)."""
 
     hand: Any
     settings: Any

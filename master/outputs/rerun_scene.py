@@ -50,7 +50,7 @@ from common.messages import (
     Source,
     WristDetections,
 )
-from common.recording.pictures import Size, jpeg_size
+from common.messages.picture_size import Size, jpeg_size
 from master.outputs.drawing import (
     LASER_RGB,
     LIMIT_RGB,

@@ -16,8 +16,8 @@ from msgspec.structs import replace
 from common.arrays import Float, Int
 from common.calibration import ImuCalibration
 from common.errors import RecordingError
+from common.imu.csv_table import IMU, read_imu
 from common.imu.fusion import OrientationFilter
-from common.imu.recording import IMU, read_imu
 from common.messages import FINGER_COUNT, ImuSample, MarkerDetections, TagDetections, WristDetections
 from common.recording.frame_recording import FrameRecording
 from common.recording.recorded_files import read_npz

@@ -17,7 +17,7 @@ import msgspec
 from common.calibration import RigCalibration
 from common.command_line import echo, remark
 from common.errors import PictureError, RecordingError
-from common.imu.recording import IMU, read_imu, write_imu
+from common.imu.csv_table import IMU, read_imu, write_imu
 from common.messages import ImuSample
 from common.recording.frame_recording import (
     MAX_TIME_NS,

@@ -18,7 +18,7 @@ from common.calibration.object_profile import ObjectProfile
 from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError, TrackerError
 from common.geometry.transforms import matrix_to_quaternion
-from common.imu.recording import write_imu
+from common.imu.csv_table import write_imu
 from common.messages import ImuSample, TrackerPose
 from common.recording.frame_recording import open_recording
 from common.sim.board import BoardScene

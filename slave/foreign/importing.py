@@ -17,9 +17,10 @@ from common.arrays import Int
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.calibration.object_profile import ObjectProfile
 from common.errors import PictureError, RecordingError
+from common.messages.picture_size import size_of
 from common.recording.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
 from common.recording.frame_writing import RecordingWriter, refuse_occupied
-from common.recording.pictures import VideoFrames, decode, frame_name, read_picture, size_of
+from common.recording.pictures import VideoFrames, decode, frame_name, read_picture
 from slave.foreign.sources import (
     Source,
     Timed,

@@ -14,9 +14,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import ImuError, PhalanxError, RecordingError
-from common.imu.csv_table import QUATERNION, Table
+from common.imu.csv_table import HEADERS, IMU, QUATERNION, Table, row, write_imu
 from common.imu.fusion import OrientationFilter, TiltErrors
-from common.imu.recording import HEADERS, IMU, row, write_imu
 from common.messages import ImuSample
 from slave.report import imu_counters
 from slave.sources import ImuSource

@@ -18,8 +18,8 @@ from common.calibration import ImuCalibration
 from common.errors import RecordingError
 from common.geometry.transforms import quaternion_to_matrix
 from common.hand.model import WRIST
+from common.imu.csv_table import read_imu, write_imu
 from common.imu.fusion import OrientationFilter
-from common.imu.recording import read_imu, write_imu
 from common.recording.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene

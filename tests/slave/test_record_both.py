@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.imu.recording import read_imu
+from common.imu.csv_table import read_imu
 from common.recording.frame_recording import open_recording
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene

@@ -22,7 +22,7 @@ import pytest
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import CameraError, RecordingError
-from common.imu.recording import read_imu
+from common.imu.csv_table import read_imu
 from common.recording.frame_recording import Illumination, Manifest, open_recording
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera

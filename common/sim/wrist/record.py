@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from common.calibration import RigCalibration
 from common.hand.model import FINGERS, WEBXR_JOINTS
-from common.imu.recording import write_imu
+from common.imu.csv_table import write_imu
 from common.recording.frame_recording import Illumination, Manifest
 from common.sim.record import (
     ANGLE_NAMES,

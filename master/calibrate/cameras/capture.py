@@ -24,7 +24,8 @@ from common.clock import SystemClock, now_ns
 from common.command_line import echo
 from common.errors import BusError, CalibrationError, PictureError
 from common.messages import Command, Still
-from common.recording.pictures import Size, decode
+from common.messages.picture_size import Size
+from common.recording.pictures import decode
 from master.calibrate.cameras.boards import board_in, options_of
 from master.calibrate.cameras.coverage import LiveViews, Verdict
 from master.calibrate.tree_files import date_now

@@ -11,8 +11,8 @@ import numpy as np
 
 from common.command_line import echo
 from common.errors import CalibrationError, FitError
+from common.imu.csv_table import IMU, read_imu
 from common.imu.fusion import OrientationFilter
-from common.imu.recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
 from common.recording.frame_recording import FrameRecording, open_recording
 from master.calibrate.extrinsics.extrinsics import Extrinsics, calibrate_extrinsics, left_of

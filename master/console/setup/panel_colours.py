@@ -15,7 +15,7 @@ from nicegui import events, ui
 from common.calibration import CameraCalibration, HsvRange, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Command, Health, Preview
-from common.recording.pictures import jpeg_size
+from common.messages.picture_size import jpeg_size
 from master.console.controls import InUse
 from master.console.setup.files import keep_old
 from master.console.setup.parts import Desk, heading, jpeg_url

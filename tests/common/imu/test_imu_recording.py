@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.imu.recording import HEADERS, read_imu, write_imu
+from common.imu.csv_table import HEADERS, read_imu, write_imu
 from common.messages import ImuSample
 
 FULL = "t_ns,gx,gy,gz,ax,ay,az,mx,my,mz,qw,qx,qy,qz"

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from common.errors import MessageError, PhalanxError, PictureError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still, decode, encode
-from common.recording.pictures import MAX_SCANS, MAX_SIDE_PX, decode_file, jpeg_size, read_picture, size_of
+from common.messages.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
 from common.recording.pictures import decode as picture
+from common.recording.pictures import decode_file, read_picture
 from master.calibrate.cameras.views import image_sets
 from master.calibrate.wrist.device import load_grey
 from slave.cameras.replay import read_png
@@ -206,7 +207,7 @@ from pathlib import Path
 import cv2, numpy as np
 from common.errors import MessageError, PhalanxError
 from common.messages import decode
-from common.recording.pictures import size_of
+from common.messages.picture_size import size_of
 from common.recording.pictures import decode as picture, decode_file
 from master.calibrate.cameras.views import load_image
 from master.calibrate.wrist.device import load_grey

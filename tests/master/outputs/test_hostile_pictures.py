@@ -17,7 +17,7 @@ from common.bus.zenoh_bus import ZenohBus
 from common.calibration import CameraCalibration, load
 from common.geometry.camera_model import CameraModel
 from common.messages import Command, Health, Preview, Still
-from common.recording.pictures import Size
+from common.messages.picture_size import Size
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.coverage import LiveViews

@@ -12,7 +12,7 @@ import pytest
 from bench.both.scene import Both, Observed, shown
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError, RecordingError
-from common.imu.recording import write_imu
+from common.imu.csv_table import write_imu
 from common.messages import ImuSample, MarkerDetections, WristDetections
 from common.recording.frame_recording import FrameRecording, Manifest
 from common.sim.record import named_angles

@@ -11,7 +11,7 @@ import pytest
 
 from common.calibration import RigCalibration
 from common.errors import RecordingError
-from common.imu.recording import read_imu, write_imu
+from common.imu.csv_table import read_imu, write_imu
 from common.messages import ImuSample
 from common.recording.frame_recording import Illumination, Manifest, RecordedClock, open_recording
 from common.recording.frame_writing import RecordingWriter, encode_png

@@ -7,8 +7,7 @@ import pytest
 
 from common.errors import RecordingError
 from common.geometry.transforms import axis_rotation, matrix_to_quaternion
-from common.imu.csv_table import read_csv
-from common.imu.recording import read_imu
+from common.imu.csv_table import read_csv, read_imu
 from slave.__main__ import main
 from slave.imu.recording import import_table
 

@@ -10,7 +10,7 @@ import pytest
 
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import ImuError, RecordingError
-from common.imu.recording import IMU, read_imu
+from common.imu.csv_table import IMU, read_imu
 from common.messages import ImuSample
 from common.recording.frame_recording import open_recording
 from slave.__main__ import main

@@ -1,6 +1,6 @@
 // The hand in a page: `new HandView(container, options)`, then `push(json)` whenever a pose comes.
 //
-// How to embed it is in the docstring of the package (`master/web/__init__.py`). Shown is always the newest pose; nothing
+// How to embed it is in the docstring of the package (`master/outputs/web/__init__.py`). Shown is always the newest pose; nothing
 // is drawn while nothing changes.
 
 import { THREE, OrbitControls } from "./three.js";

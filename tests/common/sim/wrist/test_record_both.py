@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.imu.recording import read_imu
+from common.imu.csv_table import read_imu
 from common.recording.frame_recording import Illumination, open_recording
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import Scene

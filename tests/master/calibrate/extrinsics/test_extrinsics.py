@@ -9,7 +9,7 @@ from msgspec.structs import replace as replaced
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
 from common.geometry.transforms import quaternion_to_matrix
-from common.imu.recording import write_imu
+from common.imu.csv_table import write_imu
 from common.messages import HandPose
 from common.recording.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
 from master.calibrate.extrinsics import command, extrinsics, problem
