@@ -6,6 +6,7 @@ or pose of the device. Every `draw_...` raises RecordingError where the file can
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,13 +19,15 @@ from common.calibration.rig import field_at
 from common.errors import RecordingError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import fit_rigid
-from master.calibrate.extrinsics.extrinsics import Extrinsics
-from master.calibrate.object.measure import Measurement
-from master.calibrate.tracker.registration import Registration
-from master.calibrate.wrist.curl import FingerCurl
-from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
-from master.calibrate.wrist.plane import PlaneFit, ViewLine
-from master.calibrate.wrist.subject import Subject
+
+if TYPE_CHECKING:
+    from master.calibrate.extrinsics.extrinsics import Extrinsics
+    from master.calibrate.object.measure import Measurement
+    from master.calibrate.tracker.registration import Registration
+    from master.calibrate.wrist.curl import FingerCurl
+    from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
+    from master.calibrate.wrist.plane import PlaneFit, ViewLine
+    from master.calibrate.wrist.subject import Subject
 
 
 def figure_of(size: tuple[float, float]) -> Figure:
@@ -51,7 +54,7 @@ FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
 BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
-def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
+def draw_plane(path: Path, fit: "PlaneFit", lines: "Sequence[ViewLine]", optics: CameraModel) -> None:
     """Draw laser lines in the image and from above, and each view's plane distance."""
     figure = figure_of((15.0, 4.6))
     figure.suptitle(
@@ -76,7 +79,7 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
     save_figure(figure, path)
 
 
-def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
+def draw_flat_field(path: Path, fit: "FlatFit", samples: "WhiteSamples", optics: CameraModel) -> None:
     """Draw the flat field over the image, and its residuals where paper was seen."""
     figure = figure_of((15.0, 4.2))
     figure.suptitle(
@@ -102,7 +105,7 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     save_figure(figure, path)
 
 
-def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
+def draw_curls(path: Path, curls: "Sequence[FingerCurl]") -> None:
     """Draw the laser points from above, with lines from straight (o) to bent (x)."""
     figure = figure_of((8.0, 6.5))
     axes = figure.subplots()
@@ -130,7 +133,7 @@ def framed(axes: Axes, optics: CameraModel, title: str) -> None:
     axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
 
 
-def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
+def draw_subject(path: Path, found: "Subject", optics: CameraModel) -> None:
     """Draw laser points, fingertips and knuckles, seen (dots) and fitted (rings)."""
     model, fit, seen = found.model, found.fit, found.seen
     shown = model(fit.x, fit.angles_rad)
@@ -153,7 +156,7 @@ def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
     save_figure(figure, path)
 
 
-def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
+def draw_object(path: Path, found: "Measurement", profile: ObjectProfile) -> None:
     """Draw beads and observations in the object's frame, and residuals over time."""
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
     # Where each observation lies in the object: the bead less its residual, turned into its frame.
@@ -188,7 +191,7 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
 _GREEN = "#2f855a"
 
 
-def draw_registration(path: Path, found: Registration) -> None:
+def draw_registration(path: Path, found: "Registration") -> None:
     """Draw the object's path (dots: cameras; lines: tracker), and offsets over time."""
     fit = found.fit
     figure = figure_of((17.0, 8.4))
@@ -222,7 +225,7 @@ def draw_registration(path: Path, found: Registration) -> None:
     save_figure(figure, path)
 
 
-def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
+def draw_extrinsics(path: Path, found: "Extrinsics", optics: CameraModel) -> None:
     """Draw laser points and tips, seen (dots) and fitted (rings), and the wrist."""
     fit, cycles = found.fit, found.cycles
     seen = fit.shown + fit.off * fit.sigma  # tips as they were when the laser shone

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from common.bus.bus import Bus
 from common.clock import Clock
@@ -28,7 +28,9 @@ from common.messages import Backlog, Message
 from common.messages.streams import MASTER, sender_of
 from master.outputs.bus import Receive
 from master.rig.setup import RigFiles
-from master.run.solver_supervisor import LoadShedding
+
+if TYPE_CHECKING:
+    from master.run.solver_supervisor import LoadShedding
 
 LEASE_NS = 3_000_000_000
 _DRAIN_S = 5.0
@@ -148,7 +150,7 @@ class Tapped(Generic[ReceivedT]):
     By then its reader has processed the message as far as it can.
     """
 
-    def __init__(self, receive: Receive[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
+    def __init__(self, receive: Receive[ReceivedT], probe: Probe, load_shedding: "LoadShedding") -> None:
         """Stand between a source and who reads it."""
         self._receive, self._probe, self._load_shedding = receive, probe, load_shedding
         self._last: ReceivedT | None = None

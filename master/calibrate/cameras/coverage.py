@@ -9,9 +9,9 @@ is so between cameras.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from common.arrays import Bool, Float, Image
 from master.calibrate.cameras.boards import Board, ImageObservation, board_corners, find_board
@@ -19,7 +19,9 @@ from master.calibrate.cameras.bundle import guess_lens, place_board, rms
 from master.calibrate.cameras.fit import CamerasFit
 from master.calibrate.cameras.outliers import corners_seen
 from master.calibrate.cameras.views import BoardViews, View
-from master.calibrate.picture import figure_of, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 CELLS = (6, 8)  # rows and columns: a cell is about as large as a board's square seen near
 
@@ -200,6 +202,8 @@ def draw_views(path: Path, fit: CamerasFit) -> None:
         RecordingError: The file cannot be written.
     """
     cameras = fit.views.cameras
+    from master.calibrate.picture import figure_of, save_figure  # matplotlib, for a picture alone
+
     figure = figure_of((15.0, 0.6 + 3.7 * len(cameras)))
     figure.suptitle(f"{fit.views.board}: {len(fit.shots)} images, rms {fit.rms_px:.3f} px")
     axes = figure.subplots(len(cameras), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.1))
@@ -210,13 +214,13 @@ def draw_views(path: Path, fit: CamerasFit) -> None:
     save_figure(figure, path)
 
 
-def _image(axes: Axes, fit: CamerasFit, camera: str, title: str) -> None:
+def _image(axes: "Axes", fit: CamerasFit, camera: str, title: str) -> None:
     width, height = fit.views.sizes_px[camera]
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"{camera}: {title}")
     axes.tick_params(labelsize=7)
 
 
-def _corners(axes: Axes, fit: CamerasFit, camera: str) -> None:
+def _corners(axes: "Axes", fit: CamerasFit, camera: str) -> None:
     _image(axes, fit, camera, "corners; shaded: cells without any")
     width, height = fit.views.sizes_px[camera]
     corners = [fit.observations[i].uv for i in fit.of(camera)]
@@ -226,7 +230,7 @@ def _corners(axes: Axes, fit: CamerasFit, camera: str) -> None:
     axes.imshow(~seen, extent=(0, width, height, 0), cmap="Greys", alpha=0.25, vmin=0, vmax=1, aspect="equal")
 
 
-def _residuals(axes: Axes, fit: CamerasFit, camera: str) -> None:
+def _residuals(axes: "Axes", fit: CamerasFit, camera: str) -> None:
     own = fit.of(camera)
     uv = np.concatenate([fit.observations[i].uv for i in own])
     off = np.concatenate([fit.solution.residuals[i] for i in own])
@@ -240,7 +244,7 @@ def _residuals(axes: Axes, fit: CamerasFit, camera: str) -> None:
     )  # fmt: skip
 
 
-def _bars(axes: Axes, fit: CamerasFit, camera: str) -> None:
+def _bars(axes: "Axes", fit: CamerasFit, camera: str) -> None:
     errors = {fit.shots[i].view: rms([fit.solution.residuals[i]]) for i in fit.of(camera)}
     names = [name for name, _ in fit.views.of(camera)]
     noted = {no.view for no in fit.rejected if no.camera in (camera, "")}

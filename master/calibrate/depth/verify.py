@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from common.arrays import Bool, Float
 from common.calibration import RigCalibration
@@ -295,6 +293,9 @@ def draw_errors(
     Raises:
         RecordingError: The file cannot be written.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second, for a picture alone
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(9.0, 7.5), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)

@@ -7,9 +7,9 @@ was seen before is dropped and its time taken out, so that the rest is one routi
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from common.arrays import Float, Int
 from common.clock import Clock, SystemClock
@@ -20,8 +20,10 @@ from common.hand.routine import MOVES, STEPS, Step
 from common.messages import HandPose
 from master.calibrate.hand.measure import CERTAIN, WITHIN_M, HandMeasurement
 from master.calibrate.hand.observed import Observed, marker_rows
-from master.calibrate.picture import figure_of, save_figure
 from master.run.process import join_bus
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Receive = Callable[[float], HandPose | None]
 
@@ -147,6 +149,8 @@ def draw_hand(path: Path, measurement: HandMeasurement) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
+    from master.calibrate.picture import figure_of, save_figure  # matplotlib, for a picture alone
+
     figure = figure_of((13.0, 6.0))
     left, right = figure.subplots(1, 2)
     _lengths(left, measurement)
@@ -154,7 +158,7 @@ def draw_hand(path: Path, measurement: HandMeasurement) -> None:
     save_figure(figure, path)
 
 
-def _lengths(axes: Axes, measurement: HandMeasurement) -> None:
+def _lengths(axes: "Axes", measurement: HandMeasurement) -> None:
     parted = [length for finger in range(5) for length in measurement.parted(finger)]
     lengths = [one for one in measurement.lengths if len(one.bones) == 1 or one in parted]
     for row, length in enumerate(lengths):
@@ -171,7 +175,7 @@ def _lengths(axes: Axes, measurement: HandMeasurement) -> None:
     )
 
 
-def _residuals(axes: Axes, measurement: HandMeasurement) -> None:
+def _residuals(axes: "Axes", measurement: HandMeasurement) -> None:
     observed, off = measurement.observed, measurement.fit.residual_m
     for m, name in enumerate(observed.names):
         off_mm = 1e3 * np.linalg.norm(off[:, m], axis=-1)
