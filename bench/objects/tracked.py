@@ -1,6 +1,6 @@
 """Where tracked objects are: rendered frames, detectors of the slaves, line of the master, exact truth.
 
-The scene `object` (`common/sim/travel`): the object wanders and turns, goes to and fro, turns wholly, and is partly
+The scene `object` (`common/sim/scenes.py`): the object wanders and turns, goes to and fro, turns wholly, and is partly
 hidden by a card and by a hand. Seeds are others than served to tune it. A feature *faces* a camera where it lies in its
 image, turned to it and large enough to be found nearly always.
 """

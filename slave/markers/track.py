@@ -8,7 +8,7 @@ Centre of a covered cap: 15 % hidden moves the centroid by an eighth of the radi
 of the ellipse along rays from a point inside give the shift by least squares. Rays on which the cap ends too early
 see the edge of the thing in front; they are rejected by their residual, one side only, until nothing changes.
 
-Deviation of the centroid [px]: independent causes, added in squares (numbers of bench/marker_accuracy):
+Deviation of the centroid [px]: independent causes, added in squares (numbers of bench/markers/accuracy):
 
     edge    the rim is known to a fraction of a pixel; it counts more the smaller the marker and the less its contrast;
             shading and highlights keep a part at any size

@@ -228,6 +228,10 @@ def write_registration(
     base = load(path, ObjectProfile) if path.exists() else profile
     base = replace(base, tracker=profile.tracker)
     new_rig, new_object = documented(rig_in_tree(out, rig_name, rig), base, found, source)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)  # both files are written, or neither
+    except OSError as error:
+        raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
     return write_rig(out, rig_name, new_rig), write_object(out, new_object)
 
 
