@@ -202,7 +202,7 @@ class _Means:
 
 
 _SETTLED_RAD = radians(6.0)  # reached nine tenths of a second after the first sample
-_BIAS_MOST_RAD_S = 3.0 * BIAS_RAD_S  # three sigma of what they begin with
+_BIAS_MOST_RAD_S, _SCALE_MOST = 3.0 * BIAS_RAD_S, 0.03  # three sigma of what they begin with
 _GATE_RAD_S = radians(0.1)  # three of it beyond what is estimated: rather a slow turn
 _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 
@@ -324,8 +324,7 @@ class OrientationFilter:
             x, y, z = errors[ATTITUDE].tolist()
             self._q = _unit(quaternion_product(_small(x, y, z), self._q))
         self._bias = np.clip(self._bias + errors[BIAS], -_BIAS_MOST_RAD_S, _BIAS_MOST_RAD_S)
-        scale_most = 0.03  # three sigma of what they begin with
-        self._scale = np.clip(self._scale + errors[SCALE], -scale_most, scale_most)
+        self._scale = np.clip(self._scale + errors[SCALE], -_SCALE_MOST, _SCALE_MOST)
         self._velocity = self._velocity + errors[VELOCITY]
 
 

@@ -127,12 +127,12 @@ def write_report(file: Path | None, report: dict[str, object], written: Path | N
 
 
 @contextmanager
-def refusals_named(where: object) -> Generator[None, None, None]:
-    """Refusals (FitError) in the block begin with what was measured."""
+def refusals_named(where: object, reasons: Iterable[str] = ()) -> Generator[None, None, None]:
+    """Refusals (FitError) in the block begin with `where`, and end with `reasons`."""
     try:
         yield
     except FitError as error:
-        raise FitError(f"{where}: {error}") from error
+        raise FitError("\n  ".join([f"{where}: {error}", *reasons])) from error
 
 
 def vector_of(value: Float) -> Vector3:

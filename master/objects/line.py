@@ -77,7 +77,7 @@ class PoseFilter:
 HELD_S = 0.5
 _DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
 _PUSHED: Float = np.repeat([5.0, 40.0], 3)  # [m/s^2, rad/s^2] what may happen to its speed meanwhile
-_ARM_M = 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
+_UNSEEN_M_S2, _ARM_M = 1.5, 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
 _SCALE: Float = np.array([1.0] * 3 + [_ARM_M] * 3)
 _SIX, _TWELVE = np.arange(6), np.arange(12)
 
@@ -162,17 +162,17 @@ def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) ->
     size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
     unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
     cov = fitted.cov.copy()
-    unseen_m_s2 = 1.5  # how it moves unseen, a turn counting by what it does a decimetre away
-    cov[:6, :6] += (0.5 * unseen_m_s2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
+    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
     return replace(fitted, cov=cov, measured_only=False)
 
 
 # What light does to a ball's centroid beyond what a slave reports, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
-_POOR_RAD = np.radians(4.0)  # less sure than this: the past counts
-_INCOMPLETE_RAD = np.radians(12.0)  # less sure than this it does not determine all of the pose
-_LOST_RAD = np.radians(30.0)  # less sure than this is no pose
-_TRACKED_RAD = np.radians(10.0)  # less sure than this is led on rather than measured
+_POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
+# less sure than this it does not determine all of the pose
+_INCOMPLETE_M, _INCOMPLETE_RAD = 0.02, np.radians(12.0)
+_LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
+_TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,8 +246,7 @@ class ObjectLine:
             return self._held(window, predicted)
         if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
-        tracked_m = 15e-3  # less sure than this is led on rather than measured
-        tracked = fitted.measured_only or not fitted.poorer(tracked_m, _TRACKED_RAD)
+        tracked = fitted.measured_only or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
         T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
@@ -305,8 +304,7 @@ class ObjectLine:
         Only of a pose that was predicted (`led`). How it may have moved since is then in it.
         """
         measured = self._fit(seen.seen, start, feature=seen.feature)
-        poor_m = 6e-3  # less sure than this: the past counts
-        if measured is not None and not measured.poorer(poor_m, _POOR_RAD):
+        if measured is not None and not measured.poorer(_POOR_M, _POOR_RAD):
             return measured
         both = None
         if led:
@@ -315,15 +313,13 @@ class ObjectLine:
             both = self._fit(seen.seen, start, past, feature=seen.feature)
         if measured is None:
             return None if both is None else replace(both, measured_only=False)
-        incomplete_m = 0.02  # less sure than this it does not determine all of the pose
-        if both is None or not measured.poorer(incomplete_m, _INCOMPLETE_RAD):
+        if both is None or not measured.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
             return measured if both is None else both
-        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), poor_m)
+        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), _POOR_M)
 
     def _holds(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
-        lost_m = 0.05  # less sure than this is no pose
-        if fitted.poorer(lost_m, _LOST_RAD):
+        if fitted.poorer(_LOST_M, _LOST_RAD):
             return False
         most = 0.5  # share of what is seen that must be in its place
         return float(fitted.weight.mean()) >= most and len(np.unique(seen.feature[fitted.used])) >= 1

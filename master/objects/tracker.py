@@ -25,7 +25,8 @@ from common.geometry.transforms import invert, matrix_to_quaternion, quaternion_
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from master.objects.line import HELD_S, SolvedObject
 
-_UNKNOWN_RAD = np.radians(1.5)  # of a registration without figures, such as one made by hand
+# of a registration without figures, such as one made by hand
+_UNKNOWN_M, _UNKNOWN_RAD = 5e-3, np.radians(1.5)
 _NOWHERE = (np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan))
 
 
@@ -175,8 +176,7 @@ def covariance_of(profile: ObjectProfile) -> Float:
     rotation_rad = np.radians(
         np.hypot(residual.get("rotation_deg", 0.0), residual.get("rotation_sigma_deg", 0.0))
     )
-    unknown_m = 5e-3  # of a registration without figures, such as one made by hand
     # The figures are of the whole offset: a third of its square belongs to each axis.
-    place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else unknown_m
+    place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else _UNKNOWN_M
     rotation_rad = rotation_rad / np.sqrt(3.0) if rotation_rad > 0.0 else _UNKNOWN_RAD
     return np.diag(np.repeat([place_m, rotation_rad], 3) ** 2)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 REMEMBERED = 1024
-SEQ_JUMP = 100_000  # numbers rise by no more: at once, and with time besides
+SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and with time besides
 CYCLE_FRAMES = 3  # frames that become one message of a wrist device
 
 
@@ -184,8 +184,7 @@ class Counted:
         sender went on. Nothing is counted as missing then.
         """
         begins, self._begins = self._begins, False
-        seq_per_s = 10_000.0  # numbers rise by no more: at once, and with time besides
-        most = min(self._rise, SEQ_JUMP) + seq_per_s * (t_ns - self._came_ns) * 1e-9
+        most = min(self._rise, SEQ_JUMP) + SEQ_PER_S * (t_ns - self._came_ns) * 1e-9
         rise = max(seq - self.sequence.last, 0) if self.sequence.follows(session) else 0
         if rise > most:
             if not begins:

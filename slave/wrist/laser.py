@@ -272,7 +272,8 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
 
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
 _LINE_PX = 0.6  # one whole line
-_FAINT = 3.0 * SETTINGS.floor  # a line no brighter: what is left of one where the sun saturates
+# a line no brighter: what is left of one where the sun saturates
+_FAINT, _FAINT_PX = 3.0 * SETTINGS.floor, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,8 +322,7 @@ def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
     in_parts = np.where(
         np.isnan(apart), np.where(finger_lines.cut, in_parts_px, 0.0), np.fmax(apart, in_parts_px)
     )
-    faint_px = 5.0  # a line no brighter: what is left of one where the sun saturates
-    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(faint_px, in_parts), in_parts)
+    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
     unshown_px = 4.0  # no seam was seen
     unshown = 0.0 if shown else unshown_px
     return np.sqrt(_LINE_PX**2 + in_parts**2 + unshown**2)

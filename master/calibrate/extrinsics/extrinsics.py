@@ -34,7 +34,7 @@ from master.calibrate.tree_files import matrix_of, provenance
 from master.estimator.sensors import in_image, laser_points
 from master.rig.wrist import WristSetup
 
-_ROTATION_RAD = np.radians(4.0)  # standard deviations, at most
+_SHIFT_M, _ROTATION_RAD, _CLOCK_S = 4e-3, np.radians(4.0), 8e-3  # standard deviations, at most
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
@@ -77,13 +77,12 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
             f"its turn is known to {rotation:.1f} deg only: turn the forearm about another axis as well,"
             " and bend the wrist"
         )
-    shift_m, clock_s = 4e-3, 8e-3  # standard deviations, at most
-    if 1e-3 * sigma["shift_sigma_mm"] > shift_m:
+    if 1e-3 * sigma["shift_sigma_mm"] > _SHIFT_M:
         wanting.append(
             f"its place is known to {sigma['shift_sigma_mm']:.1f} mm only: bend every finger before the device, with"
             " its marker in sight of the cameras"
         )
-    if 1e-3 * clock > clock_s:
+    if 1e-3 * clock > _CLOCK_S:
         wanting.append(f"its clocks are known to {clock:.1f} ms only: move fingers and forearm faster")
     if wanting:
         raise FitError("; ".join(wanting))

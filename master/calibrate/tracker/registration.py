@@ -34,12 +34,12 @@ MOTION = (
     "hold the object with the tracker on it before the cameras for twenty seconds: turn it about all its axes, a"
     " quarter turn and back, and carry it to all sides"
 )
-_SIGMA_RAD = np.radians(1.0)  # standard deviations, at most
+_SIGMA_M, _SIGMA_RAD, _LATE_S = 3e-3, np.radians(1.0), 5e-3  # standard deviations, at most
 _LEFT_RAD = np.radians(5.0)
 # What is off in the same way all the time, a tag that sits a little aside, no leaving out of a part shows: of what is
 # left it counts as if it averaged out over so many looks only.
 _LOOKS = 24
-_ROTATION_RAD = np.radians(50.0)  # of the poses at which the result must be known
+_REACH_M, _ROTATION_RAD = 0.12, np.radians(50.0)  # of the poses at which the result must be known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,8 +110,7 @@ def _reach(fit: Fit) -> tuple[Float, Float]:
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     mean = fit.R[len(fit.R) // 2]
     rotated = np.concatenate([mean[None], rotation_vector_to_matrix(_ROTATION_RAD * ways) @ mean])
-    reach_m = 0.12  # of the poses at which the result must be known
-    places = fit.middle_m + reach_m * np.concatenate([np.zeros((1, 3)), ways])
+    places = fit.middle_m + _REACH_M * np.concatenate([np.zeros((1, 3)), ways])
     return np.repeat(rotated, len(places), axis=0), np.tile(places, (len(rotated), 1))
 
 
@@ -130,14 +129,13 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []
-    sigma_m, late_s = 3e-3, 5e-3  # standard deviations, at most
     turned = np.radians(figures["rotation_sigma_deg"]) > _SIGMA_RAD
-    if 1e-3 * figures["position_sigma_mm"] > sigma_m or turned:
+    if 1e-3 * figures["position_sigma_mm"] > _SIGMA_M or turned:
         wanting.append(
             f"poses would be known to {figures['position_sigma_mm']:.1f} mm,"
             f" {figures['rotation_sigma_deg']:.1f} deg only"
         )
-    if 1e-3 * figures["late_sigma_ms"] > late_s:
+    if 1e-3 * figures["late_sigma_ms"] > _LATE_S:
         wanting.append(f"the clocks are known to {figures['late_sigma_ms']:.1f} ms only: move it faster")
     if wanting:
         raise FitError("; ".join([*wanting, *coverage.missing]) + f". {MOTION[0].upper()}{MOTION[1:]}")

@@ -31,7 +31,7 @@ from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import transform
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in, grid_shape
-from master.calibrate.tree_files import print_lines, provenance, write_report
+from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
 from master.calibrate.wrist.device import (
     BoardPose,
     Device,
@@ -243,11 +243,8 @@ def flat_field(options: Namespace) -> None:
     views = lit_views(options.source, device.camera.name, Illumination.LED)
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
     seen = white_of(views, board_in(options), device.optics, leds)
-    try:
+    with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_flat_field(seen.samples, device.optics)
-    except FitError as error:
-        reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
-        raise FitError(f"{options.source}: {error}{reasons}") from error
     print_lines(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
     if options.picture is not None:
         from master.calibrate.picture import draw_flat_field

@@ -16,7 +16,7 @@ from common.errors import FitError
 from common.geometry.camera_model import CameraModel
 from common.recording.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board, board_in
-from master.calibrate.tree_files import print_lines, provenance, write_report
+from master.calibrate.tree_files import print_lines, provenance, refusals_named, write_report
 from master.calibrate.wrist.device import (
     Device,
     LitView,
@@ -42,11 +42,8 @@ def laser_plane(options: Namespace) -> None:
     device = device_of(options.source, options.rig, options.calibration, options.out)
     views = lit_views(options.source, device.camera.name, Illumination.LASER)
     seen = lines_of(views, board_in(options), device.optics)
-    try:
+    with refusals_named(options.source, grouped_by_reason(seen.refused)):
         fit = fit_plane(seen.lines)
-    except FitError as error:
-        reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
-        raise FitError(f"{options.source}: {error}{reasons}") from error
     print_lines(report_lines(fit, seen, len(views)))
     if options.picture is not None:
         from master.calibrate.picture import draw_plane

@@ -40,7 +40,7 @@ from master.calibrate.wrist.device import (
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
 _MOVED_RAD = np.radians(2.0)
-_ROTATION_LIMIT_RAD = np.radians(1.0)  # how sure the pose must be
+_SHIFT_LIMIT_M, _ROTATION_LIMIT_RAD = 1e-3, np.radians(1.0)  # how sure the pose must be
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +105,10 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffs
     rotation_sigma, shift_sigma = (
         float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:])
     )
-    shift_limit_m = 1e-3  # how sure the pose must be
-    if rotation_sigma > _ROTATION_LIMIT_RAD or shift_sigma > shift_limit_m:
+    if rotation_sigma > _ROTATION_LIMIT_RAD or shift_sigma > _SHIFT_LIMIT_M:
         raise FitError(
             f"the board's pose is known to {np.degrees(rotation_sigma):.1f} deg and {1e3 * shift_sigma:.1f} mm only"
-            f" (limits {np.degrees(_ROTATION_LIMIT_RAD):.0f} deg, {1e3 * shift_limit_m:.0f} mm): take a larger board,"
+            f" (limits {np.degrees(_ROTATION_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board,"
             " sharp and well lit"
         )
     return PalmFit(
