@@ -1,21 +1,20 @@
 """A bundle adjustment fits lenses, camera poses, board poses and board shape.
 
 Corner i of an image is seen at pixel = lens(T_camera_rig T_rig_board (c_i + s_i)), where c_i is the drawn
-corner and s_i its offset on the real, never quite flat board. A board pose touches only its own view, so the
-poses are eliminated view by view (Schur complement; Triggs et al., Bundle adjustment - a modern synthesis,
-2000, section 6), and the step is solved in what all views share. Damping by Marquardt. A prior of the shape
-about the drawn one also fixes the board's frame and size: few views leave it as drawn.
+corner and s_i its offset on the real, never quite flat board. The board's pose is a view's own unknown
+(`master.calibrate.adjust`), all else is shared. A prior of the shape about the drawn one also fixes the
+board's frame and size: few views leave it as drawn.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry.transforms import rigid, rotation_vector_to_matrix, transform
+from common.geometry.transforms import rigid, rotation_vector_to_matrix, skew, transform
+from master.calibrate.adjust import Minimum, Normal, cauchy, minimise
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -100,25 +99,19 @@ def solve(
     """
     mask = free.mask(len(start.drawn_m))
     shape_sd_m = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
-    prior = (sigma_px / shape_sd_m) ** 2 if free.shape else 0.0
-    now, damping = start, 1e-3
-    cost, normal = _normal_equations(observations, now, prior, cauchy_px)
-    for _ in range(100):
-        step = _step(normal, mask, damping)
-        tried = now if step is None else _retracted(now, *step)
-        new_cost, new_normal = _normal_equations(observations, tried, prior, cauchy_px)
-        if step is not None and new_cost <= cost:  # False where it is NaN: a board went through a camera
-            gain = cost - new_cost
-            now, cost, normal = tried, new_cost, new_normal
-            damping = max(damping / 10, 1e-10)
-            if gain <= (1e-9 if cauchy_px is None else 1e-6) * cost:  # robust fits only judge
-                break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    residuals = tuple(seen.uv - predict(now, seen) for seen in observations)
-    return _solution(now, residuals, normal, mask, free)
+    prior_px_m = sigma_px / shape_sd_m if free.shape else 0.0
+
+    def equations(bundle: Bundle) -> Normal:
+        return _equations(observations, bundle, mask, prior_px_m, cauchy_px)
+
+    def stepped(bundle: Bundle, step: Float, own: Float) -> Bundle:
+        shared = np.zeros(len(mask))
+        shared[mask] = step
+        return _retracted(bundle, shared, own)
+
+    # robust fits only judge
+    found = minimise(equations, stepped, start, gain_share=1e-8 if cauchy_px is None else 1e-6)
+    return _solution(observations, found, mask, free)
 
 
 def predict(bundle: Bundle, seen: Observation) -> Float:
@@ -138,8 +131,6 @@ def rms(residuals: Sequence[Float]) -> float:
 
 
 _ZERO = np.zeros(3)
-Normal = tuple[Float, Float, Float, Float, Float]
-"""Shared (S, S), shared x view (V, S, 6), view (V, 6, 6), right sides (S,) and (V, 6)."""
 
 
 def _matrix(lens: Float) -> Float:
@@ -153,16 +144,8 @@ def _camera_points(bundle: Bundle, seen: Observation) -> tuple[Float, Float, Flo
     return on_board, in_rig, transform(bundle.T_camera_rig[seen.camera], in_rig)
 
 
-def _skews(vectors: Float) -> Float:
-    """Matrices (n, 3, 3) with `_skews(a)[i] @ b == cross(a[i], b)`."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    return out - out.transpose(0, 2, 1)
-
-
 def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
-    """Residuals (n, 2), and derivatives of the prediction.
+    """Predicted minus seen corners (n, 2), and their derivatives.
 
     By lens (n, 2, 9), pose of camera and of board (n, 2, 6) each, shape (n, 2, 3). A pose rotates by exp(w)
     on its left and moves by t.
@@ -175,83 +158,50 @@ def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, F
     by_point, by_lens = by_all[:, :, 3:6], by_all[:, :, 6:15]
     rotation_c = bundle.T_camera_rig[seen.camera][:3, :3]
     rotation_v = bundle.T_rig_board[seen.view][:3, :3]
-    by_camera = np.concatenate([-by_point @ _skews(in_rig @ rotation_c.T), by_point], axis=2)
+    by_camera = np.concatenate([-by_point @ skew(in_rig @ rotation_c.T), by_point], axis=2)
     by_rig = by_point @ rotation_c
-    by_view = np.concatenate([-by_rig @ _skews(on_board @ rotation_v.T), by_rig], axis=2)
-    return seen.uv - uv, by_lens, by_camera, by_view, by_rig @ rotation_v
+    by_view = np.concatenate([-by_rig @ skew(on_board @ rotation_v.T), by_rig], axis=2)
+    return uv - seen.uv, by_lens, by_camera, by_view, by_rig @ rotation_v
 
 
-def _normal_equations(
-    observations: Sequence[Observation], bundle: Bundle, prior: float, cauchy_px: float | None
-) -> tuple[float, Normal]:
-    """Cost and Gauss-Newton equations at a bundle."""
-    cameras, views, corners = len(bundle.lenses), len(bundle.T_rig_board), len(bundle.drawn_m)
-    size, shape_at = 15 * cameras + 3 * corners, 15 * cameras
-    shared, right = np.zeros((size, size)), np.zeros(size)
-    mixed, own, right_own = np.zeros((views, size, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
-    cost = 0.0
+def _equations(
+    observations: Sequence[Observation],
+    bundle: Bundle,
+    mask: Bool,
+    prior_px_m: float,
+    cauchy_px: float | None,
+) -> Normal:
+    """Normal equations [px] of the free unknowns at a bundle, with the prior of the shape [px/m]."""
+    cameras, shape_at = len(bundle.lenses), 15 * len(bundle.lenses)
+    place = np.cumsum(mask) - 1  # of a shared unknown among the free ones
+    normal = Normal(int(mask.sum()), len(bundle.T_rig_board), 6)
+    loss = None if cauchy_px is None else cauchy(cauchy_px)
     for seen in observations:
-        residual, by_lens, by_camera, by_view, by_shape = _jacobian(seen, bundle)
-        square = (residual**2).sum(axis=1)
-        if cauchy_px is None:
-            weight = np.ones(len(square))
-            cost += float(square.sum())
-        else:
-            weight = 1.0 / (1.0 + square / cauchy_px**2)
-            cost += float(cauchy_px**2 * np.log1p(square / cauchy_px**2).sum())
-        c, v = seen.camera, seen.view
+        off, by_lens, by_camera, by_view, by_shape = _jacobian(seen, bundle)
+        c, rows = seen.camera, off.size
         at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6]
-        by_both = np.concatenate([by_lens, by_camera], axis=2)
-        heavy = by_both * weight[:, None, None]
-        shared[np.ix_(at, at)] += np.einsum("nij,nik->jk", heavy, by_both)
-        right[at] += np.einsum("nij,ni->j", heavy, residual)
-        mixed[v, at] += np.einsum("nij,nik->jk", heavy, by_view)
-        heavy_view = by_view * weight[:, None, None]
-        own[v] += np.einsum("nij,nik->jk", heavy_view, by_view)
-        right_own[v] += np.einsum("nij,ni->j", heavy_view, residual)
-        if prior > 0.0:
-            to = shape_at + 3 * seen.corners[:, None] + np.arange(3)
-            heavy_shape = by_shape * weight[:, None, None]
-            shared[to[:, :, None], to[:, None, :]] += np.einsum("nij,nik->njk", heavy_shape, by_shape)
-            cross = np.einsum("nij,nik->njk", heavy_shape, by_both)
-            shared[to[:, :, None], at] += cross
-            shared[at[:, None], to.ravel()] += cross.reshape(-1, len(at)).T
-            right[to] += np.einsum("nij,ni->nj", heavy_shape, residual)
-            mixed[v, to] += np.einsum("nij,nik->njk", heavy_shape, by_view)
-    if prior > 0.0:
-        shape = bundle.shape_m.ravel()
-        cost += prior * float(shape @ shape)
-        shared[np.arange(shape_at, size), np.arange(shape_at, size)] += prior
-        right[shape_at:] -= prior * shape
-    return cost, (shared, mixed, own, right, right_own)
-
-
-def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, Float, Float]:
-    """Schur's equations of the free shared parameters, and what leads back to views."""
-    shared, mixed, own, right, right_own = normal
-    shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
-    almost_nothing = 1e-3  # px^2 per rad^2 or m^2, where one view has 10^7 and more
-    # A board that wrong corners drove far away no longer moves any pixel; its equations must stay solvable.
-    damped: Float = own * (1.0 + damping * np.eye(6)) + almost_nothing * np.eye(6)
-    sides: Float = np.concatenate([mixed.transpose(0, 2, 1), right_own[:, :, None]], axis=2)
-    back = cast(Float, np.linalg.solve(damped, sides))
-    by_shared, by_right = back[:, :, :-1], back[:, :, -1]
-    schur = shared + damping * np.diag(np.diag(shared)) - np.tensordot(mixed, by_shared, ((0, 2), (0, 1)))
-    return schur, right - np.einsum("vsi,vi->s", mixed, by_right), by_shared, by_right
-
-
-def _step(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float] | None:
-    """Marquardt's step, shared (S,) and per view (V, 6); None: needs more damping."""
-    schur, right, by_shared, by_right = _reduced(normal, mask, damping)
-    step = np.zeros(len(mask))
-    if mask.any():
-        # Scaled to a unit diagonal: pixels, radians and metres differ by orders of magnitude.
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal[0])[mask], 1e-300))
-        try:
-            step[mask] = scale * np.linalg.solve(schur * scale[:, None] * scale, right * scale)
-        except np.linalg.LinAlgError:
-            return None
-    return step, by_right - by_shared @ step[mask]
+        by = np.concatenate([by_lens, by_camera], axis=2).reshape(rows, -1)
+        if prior_px_m > 0.0:
+            at = np.r_[at, (shape_at + 3 * seen.corners[:, None] + np.arange(3)).ravel()]
+            each = np.arange(len(off))
+            own_shape = np.zeros((*off.shape, len(off), 3))  # a corner's own place moves nothing else
+            own_shape[each, :, each] = by_shape
+            by = np.concatenate([by, own_shape.reshape(rows, -1)], axis=1)
+        free = mask[at]
+        normal.add(
+            off.reshape(1, -1),
+            by[None, :, free],
+            by_view.reshape(1, rows, 6),
+            epochs=np.array([seen.view]),
+            columns=place[at[free]],
+            loss=loss,
+            group=2,
+        )
+    if prior_px_m > 0.0:
+        away, sigma = np.zeros(len(mask)), np.full(len(mask), np.inf)
+        away[shape_at:], sigma[shape_at:] = bundle.shape_m.ravel(), 1.0 / prior_px_m
+        normal.add_prior(away[mask], sigma[mask])
+    return normal
 
 
 def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
@@ -271,9 +221,10 @@ def _rotated(T: Float, step: Float) -> Float:
 
 
 def _solution(
-    bundle: Bundle, residuals: tuple[Float, ...], normal: Normal, mask: Bool, free: Free
+    observations: Sequence[Observation], found: Minimum[Bundle], mask: Bool, free: Free
 ) -> Solution:
-    schur, *_ = _reduced(normal, mask, 0.0)
+    bundle = found.x
+    residuals = tuple(seen.uv - predict(bundle, seen) for seen in observations)
     numbers = 2 * sum(len(r) for r in residuals)
     # The prior takes the place of measurements for what the shape cannot learn: seven numbers of its frame and size.
     spent = int(mask[: 15 * len(bundle.lenses)].sum()) + 6 * len(bundle.T_rig_board)
@@ -281,11 +232,7 @@ def _solution(
     sigma = float(np.sqrt(sum(float((r**2).sum()) for r in residuals) / max(numbers - spent, 1)))
     covariance = np.zeros((len(mask), len(mask)))
     if mask.any():
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(schur), 1e-300))
-        values, vectors = np.linalg.eigh(schur * scale[:, None] * scale)
-        # A direction that nothing determines has a variance without bound; this one is large enough to be refused.
-        inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
-        covariance[np.ix_(mask, mask)] = sigma**2 * inverse * scale[:, None] * scale
+        covariance[np.ix_(mask, mask)] = sigma**2 * found.normal.covariance()
     return Solution(bundle, residuals, sigma, covariance)
 
 

@@ -6,13 +6,14 @@ bundle adjustment, linear in the points: Triggs et al. 2000):
 
     sum_tb  rho( e' C^-1 e ),   e = R_t q_b + p_t - x_tb
 
-Poses are eliminated (Schur complement), so that what is solved has 3 B unknowns however long the motion was.
-The frame of q is free: steps that only move the whole body are excluded (inner constraints, ibid. 9.2.2). rho
-is Geman and McClure's, so that a bead that was mistaken, or was half hidden, costs itself.
+The beads are shared, a pose is an epoch's own (`master.calibrate.adjust`). The frame of q is free: what only
+moves the whole body is no uncertainty of it. rho is Geman and McClure's, so that a bead that was mistaken, or
+was half hidden, costs itself.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from msgspec.structs import replace
@@ -23,6 +24,7 @@ from common.errors import CalibrationError, FitError
 from common.geometry.camera_model import CameraModel
 from common.geometry.transforms import fit_rigid, rotation_vector_to_matrix, skew, transform
 from common.messages import HandPose, MarkerDetections
+from master.calibrate.adjust import Loss, Normal, geman_mcclure, minimise
 from master.estimator.sensors import CameraArrays
 from master.fabrik.caps import LensShift
 from master.fabrik.depth import CalibrationResidual
@@ -134,7 +136,7 @@ def _seen(names: tuple[str, ...], times: list[int], points: list[Float], covs: l
     return Seen(names, t_s, at + nan[..., None], cov + nan[..., None, None])
 
 
-_ROUNDS = 40
+_ROUNDS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,26 +176,64 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
     own = Seen(seen.names, seen.t_s[chosen], seen.points_m[chosen], seen.cov_m2[chosen])
     beads, T = first_body(own)
     known_cov = np.where(np.isfinite(own.cov_m2), own.cov_m2, np.eye(3))
-    info = np.where(own.known[..., None, None], np.linalg.inv(known_cov), 0.0)
-    points = np.nan_to_num(own.points_m)
-    scale_2, cov = 1.0, np.empty(0)
-    weight = own.known.astype(np.float64)
+    whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(known_cov)), np.float64)
+    scale_2, body, cov = 1.0, _Body(beads, T), np.empty(0)
     for _ in range(_ROUNDS):
-        off = _off(beads, T, points)
-        chi = np.einsum("tbi,tbij,tbj->tb", off, info, off)
-        scale_2 = _scale_2(chi, own.known)
-        soft_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
-        weight = np.where(own.known, (1.0 + chi / (soft_2 * scale_2)) ** -2.0, 0.0)
-        step, poses, cov = _solved(beads, T, off, weight[..., None, None] * info)
-        beads = beads + step
-        rotation = rotation_vector_to_matrix(poses[:, :3])
-        T = T.copy()
-        T[:, :3, :3], T[:, :3, 3] = rotation @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
-        if float(np.abs(step).max()) < 1e-7:
+        chi = (_whitened(body, own, whiten) ** 2).sum(axis=-1)
+        last, scale_2 = scale_2, _scale_2(chi, own.known)
+        found = minimise(partial(_equations, own, whiten, _loss(scale_2)), _stepped, body, gain_share=1e-10)
+        body, cov = found.x, found.normal.covariance(_free(found.x.beads_m))
+        if abs(scale_2 / last - 1.0) < 1e-4:
             break
-    off = _off(beads, T, points)
-    left = np.where(own.known[..., None], off, np.nan)
-    return Bundle(own, beads, scale_2 * cov, T, left, weight, float(np.sqrt(scale_2)))
+    chi = (_whitened(body, own, whiten) ** 2).sum(axis=-1)
+    weight = np.where(own.known, _loss(scale_2)(np.nan_to_num(chi))[1], 0.0)
+    off = _off(body.beads_m, body.T, own.points_m)
+    return Bundle(own, body.beads_m, scale_2 * cov, body.T, off, weight, float(np.sqrt(scale_2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Body:
+    """What is fitted: beads (B, 3) [m], and poses (T, 4, 4) body -> rig."""
+
+    beads_m: Float
+    T: Float
+
+
+def _loss(scale_2: float) -> Loss:
+    soft_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
+    return geman_mcclure(float(np.sqrt(soft_2 * scale_2)))
+
+
+def _whitened(body: _Body, seen: Seen, whiten: Float) -> Float:
+    """Fitted minus seen (T, B, 3) in standard deviations; NaN: not seen."""
+    return (whiten @ _off(body.beads_m, body.T, seen.points_m)[..., None])[..., 0]
+
+
+def _equations(seen: Seen, whiten: Float, loss: Loss, body: _Body) -> Normal:
+    """Normal equations of beads and poses; a pose turns and moves by rig axes."""
+    epochs, count = seen.known.shape
+    R = body.T[:, None, :3, :3]
+    by_turn = -skew((R @ body.beads_m[..., None])[..., 0])
+    by_pose = whiten @ np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=-1)
+    by_beads = np.zeros((epochs, count, 3, count, 3))
+    each = np.arange(count)
+    by_beads[:, each, :, each] = np.moveaxis(whiten @ R, 1, 0)
+    normal = Normal(3 * count, epochs, 6)
+    normal.add(
+        _whitened(body, seen, whiten).reshape(epochs, -1),
+        by_beads.reshape(epochs, 3 * count, 3 * count),
+        by_pose.reshape(epochs, 3 * count, 6),
+        loss=loss,
+        group=3,
+    )
+    return normal
+
+
+def _stepped(body: _Body, shared: Float, own: Float) -> _Body:
+    T = body.T.copy()
+    T[:, :3, :3] = rotation_vector_to_matrix(own[:, :3]) @ T[:, :3, :3]
+    T[:, :3, 3] += own[:, 3:]
+    return _Body(body.beads_m + shared.reshape(-1, 3), T)
 
 
 def first_body(seen: Seen) -> tuple[Float, Float]:
@@ -246,32 +286,6 @@ def _scale_2(chi: Float, known: Bool) -> float:
     free = 3.0 - 6.0 / float(known.sum(axis=1).mean())
     median = free * (1.0 - 2.0 / (9.0 * free)) ** 3
     return max(1.0, float(np.median(own)) / median)
-
-
-def _solved(beads: Float, T: Float, off: Float, info: Float) -> tuple[Float, Float, Float]:
-    """Gauss-Newton step of beads (B, 3) and poses (T, 6), and the beads' covariance."""
-    count = len(beads)
-    R = T[:, :3, :3]
-    by_pose = np.empty((len(T), count, 3, 6))
-    by_pose[..., :3] = -skew(np.einsum("tij,bj->tbi", R, beads))
-    by_pose[..., 3:] = np.eye(3)
-    weighed = info @ by_pose
-    V = np.einsum("tbki,tbkj->tij", by_pose, weighed) + 1e-6 * np.eye(6)
-    X = np.einsum("tki,tbkj->tbij", R, weighed).reshape(len(T), 3 * count, 6)
-    U = np.einsum("tki,tbkl,tlj->bij", R, info, R)
-    pull = np.einsum("tbij,tbj->tbi", info, off)
-    of_beads = -np.einsum("tki,tbk->bi", R, pull).ravel()
-    of_poses = -np.einsum("tbki,tbk->ti", by_pose, pull)
-    V_inverse = np.asarray(np.linalg.inv(V), np.float64)
-    X_V = X @ V_inverse  # (T, 3 B, 6)
-    S = -np.einsum("tai,tbi->ab", X_V, X)
-    for b in range(count):
-        S[3 * b : 3 * b + 3, 3 * b : 3 * b + 3] += U[b]
-    free = _free(beads)
-    cov = free @ np.asarray(np.linalg.inv(free.T @ S @ free), np.float64) @ free.T
-    step = cov @ (of_beads - np.einsum("tai,ti->a", X_V, of_poses))
-    poses = np.einsum("tij,tj->ti", V_inverse, of_poses - np.einsum("tai,a->ti", X, step))
-    return step.reshape(count, 3), poses, cov
 
 
 def _free(beads: Float) -> Float:

@@ -20,6 +20,7 @@ an unknown, from the normal equations; the larger counts.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from common.geometry.transforms import (
     rotation_vector_to_matrix,
     skew,
 )
+from master.calibrate.adjust import Normal, minimise, tukey
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 _DRAWN = 6
@@ -171,7 +173,7 @@ DEFAULT_SIGMA_RAD = np.radians(1.5)  # of an object's pose without covariance
 OUTLIER = 4.1  # sigmas: 0.999 of chi with six degrees of freedom is within 4.7, at the good half's scale
 _ROUNDS = 4
 _UNKNOWNS = 13
-_PRIOR = np.array([1.0] * 12 + [0.5]) ** -2  # rad, m, rad, m, s: hardly any
+_ANY = np.array([1.0] * 12 + [0.5])  # rad, m, rad, m, s: a step of hardly any bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,13 +193,13 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Lines:
-    """Linearised equations: residuals (N, 6), and derivatives (N, 6, 13)."""
+class _Rows:
+    """Linearised equations (N epochs)."""
 
-    R: Float
+    R: Float  # this and p_m: the object as predicted
     p_m: Float
-    off: Float
-    jacobian: Float
+    off: Float  # (N, 6) seen minus predicted
+    jacobian: Float  # (N, 6, 13) of the prediction
 
 
 class _Problem:
@@ -211,9 +213,9 @@ class _Problem:
         with_cov = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
         jitter = np.diag(np.repeat([1e-3, TRACKER_RAD], 3) ** 2)
         cov = np.where(with_cov, seen.cov[rows], default_cov) + jitter
-        self.weight: Float = np.asarray(np.linalg.inv(cov), np.float64)
+        self.whiten: Float = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
 
-    def lines(self, placed: Placed) -> _Lines:
+    def rows(self, placed: Placed) -> _Rows:
         at = self.t_s - placed.late_s
         R, p = self._predicted(placed, at)
         dt_s = 4e-3
@@ -226,13 +228,30 @@ class _Problem:
         jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
         jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
         jacobian[:, :3, 12], jacobian[:, 3:, 12] = -v, -w
-        return _Lines(R, p, off, jacobian)
+        return _Rows(R, p, off, jacobian)
 
     def _predicted(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
         rotation, place, _ = self._tracker.at(at_s)
         return predicted(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
 
-    def retracted(self, placed: Placed, by: Float) -> Placed:
+    def sizes(self, off: Float) -> Float:
+        """Residuals (N,) in sigmas of six dimensions."""
+        return np.linalg.norm((self.whiten @ off[..., None])[..., 0], axis=1)
+
+    def equations(self, placed: Placed, scale: float, share: Float | float = 1.0) -> Normal:
+        """Normal equations of the registration, all covariances `scale` squared times as large."""
+        rows, whiten, normal = self.rows(placed), self.whiten / scale, Normal(_UNKNOWNS)
+        normal.add(
+            (whiten @ -rows.off[..., None])[..., 0],
+            whiten @ rows.jacobian,
+            loss=tukey(2.0 * OUTLIER),
+            group=6,
+            share=share,
+        )
+        normal.add_prior(np.zeros(_UNKNOWNS), _ANY)
+        return normal
+
+    def retracted(self, placed: Placed, by: Float, _own: Float) -> Placed:
         rotation = rotation_vector_to_matrix(by[:3])
         X = rigid(rotation, self.middle_m - rotation @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
         Z = invert(placed.T_object_tracker) @ rigid(rotation_vector_to_matrix(by[6:9]), by[9:12])
@@ -250,14 +269,15 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
     # Again, because the lag decides which epochs are known.
     problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, most))
     placed, scale = _refined(problem, better)
-    lines = problem.lines(placed)
-    sizes = _sizes(problem.weight, lines.off) / scale
-    counts = _counts(sizes)
-    normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
-    rejected = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
-    cov, left_out = np.asarray(np.linalg.inv(normal), np.float64), np.array(rejected).reshape(-1, _UNKNOWNS)
-    body = problem.middle_m, problem.t_s, lines.R, lines.p_m, lines.off
-    return Fit(placed, *body, sizes > OUTLIER, scale, cov, left_out)
+    rows, normal = problem.rows(placed), problem.equations(placed, scale)
+    changes: list[Float] = []  # of the unknowns when a block of time is omitted, by one step
+    for block in _blocks(problem.t_s):
+        step = problem.equations(placed, scale, np.where(block, 0.0, 1.0)).step(0.0)
+        changes.append(np.zeros(_UNKNOWNS) if step is None else step[0])
+    return Fit(
+        placed, problem.middle_m, problem.t_s, rows.R, rows.p_m, rows.off,
+        problem.sizes(rows.off) / scale > OUTLIER, scale, normal.covariance(), np.array(changes),
+    )  # fmt: skip
 
 
 def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
@@ -289,37 +309,11 @@ def late_sigma_s(fit: Fit) -> float:
 def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
     scale = 1.0
     for _ in range(_ROUNDS):
-        sizes = _sizes(problem.weight, problem.lines(placed).off)
         half = 5.348  # median of chi square with six degrees of freedom
-        scale = max(float(np.sqrt(np.median(sizes**2) / half)), 1e-3)
-        for _ in range(6):
-            lines = problem.lines(placed)
-            counts = _counts(_sizes(problem.weight, lines.off) / scale)
-            normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
-            pull = _pull(problem.weight, lines, counts) / scale**2
-            by = np.asarray(np.linalg.solve(normal, pull), np.float64)
-            placed = problem.retracted(placed, by)
-            if np.abs(by).max() < 1e-7:
-                break
+        median = float(np.median(problem.sizes(problem.rows(placed).off) ** 2))
+        scale = max(float(np.sqrt(median / half)), 1e-3)
+        placed = minimise(partial(problem.equations, scale=scale), problem.retracted, placed, steps=6).x
     return placed, scale
-
-
-def _sizes(weight: Float, off: Float) -> Float:
-    """Residuals (N,) in sigmas of six dimensions."""
-    return np.sqrt(np.einsum("ni,nij,nj->n", off, weight, off))
-
-
-def _counts(sizes: Float) -> Float:
-    """Weights (N,) by Tukey's biweight; zero at twice the outlier limit or more."""
-    return np.clip(1.0 - (sizes / (2.0 * OUTLIER)) ** 2, 0.0, 1.0) ** 2
-
-
-def _normal(weight: Float, lines: _Lines, counts: Float) -> Float:
-    return np.einsum("n,nia,nij,njb->ab", counts, lines.jacobian, weight, lines.jacobian, optimize=True)
-
-
-def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
-    return np.einsum("n,nia,nij,nj->a", counts, lines.jacobian, weight, lines.off, optimize=True)
 
 
 def _blocks(t_s: Float) -> list[Bool]:
@@ -328,10 +322,3 @@ def _blocks(t_s: Float) -> list[Bool]:
     blocks = 12
     number = (blocks * share).astype(np.int64)
     return [number == k for k in range(blocks) if (number == k).any()]
-
-
-def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:
-    """Change of the unknowns (13,) when a block is omitted, by one step."""
-    kept = np.where(block, 0.0, counts)
-    normal = _normal(problem.weight, lines, kept) + np.diag(_PRIOR)
-    return np.asarray(np.linalg.solve(normal, _pull(problem.weight, lines, kept)), np.float64)

@@ -1,0 +1,298 @@
+"""The adjustment engine: unknowns that all epochs share, and unknowns of each epoch.
+
+A calibration minimises a sum of squared residuals, outliers weighed down by a robust loss, over S shared
+unknowns (lenses, bones, a mounting) and L own unknowns of each of T epochs (the pose of a board, a hand). An
+epoch touches only its own unknowns and those of a few epochs behind it, so these are eliminated by a sparse
+factorisation, and the Schur complement that is left is the information about the shared ones (Triggs et al.,
+Bundle adjustment - a modern synthesis, 2000, section 6). Steps are those of Levenberg and Marquardt.
+
+A calibration is a function `equations(x) -> Normal`, which adds its rows and priors, and a function
+`stepped(x, shared, own) -> x`, which applies a step to its own kind of unknowns (rotations turn, numbers add).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.sparse import bsr_array, csc_array
+from scipy.sparse.linalg import splu
+
+from common.arrays import Bool, Float, Int
+
+X = TypeVar("X")
+Loss = Callable[[Float], tuple[Float, Float]]
+"""Of chi squares (...): what they cost, and the weight (...) of their residuals, the derivative of that."""
+
+
+def cauchy(sigmas: float) -> Loss:
+    """Cauchy's loss: at that many standard deviations a residual counts a half."""
+    return lambda chi2: (sigmas**2 * np.log1p(chi2 / sigmas**2), 1.0 / (1.0 + chi2 / sigmas**2))
+
+
+def huber(sigmas: float) -> Loss:
+    """Huber's loss: beyond that many standard deviations a residual costs by its size, not its square."""
+
+    def loss(chi2: Float) -> tuple[Float, Float]:
+        size = np.sqrt(np.maximum(chi2, 1e-24))
+        beyond = size > sigmas
+        return np.where(beyond, 2.0 * sigmas * size - sigmas**2, chi2), np.where(beyond, sigmas / size, 1.0)
+
+    return loss
+
+
+def geman_mcclure(sigmas: float) -> Loss:
+    """Geman and McClure's loss: a residual far beyond that many standard deviations costs itself alone."""
+
+    def loss(chi2: Float) -> tuple[Float, Float]:
+        share = 1.0 / (1.0 + chi2 / sigmas**2)
+        return chi2 * share, share**2
+
+    return loss
+
+
+def tukey(sigmas: float) -> Loss:
+    """Tukey's biweight: beyond that many standard deviations a residual does not count at all."""
+
+    def loss(chi2: Float) -> tuple[Float, Float]:
+        near = np.clip(1.0 - chi2 / sigmas**2, 0.0, 1.0)
+        return sigmas**2 / 3.0 * (1.0 - near**3), near**2
+
+    return loss
+
+
+def weigh(residual: Float, loss: Loss | None, group: int, share: Float | float = 1.0) -> tuple[float, Float]:
+    """Cost of residuals (E, R), and the factors (E, R) by which each is weighed down; as of `Normal.add`."""
+    count = len(residual)
+    known = np.isfinite(residual)
+    chi2 = (np.where(known, residual, 0.0).reshape(count, -1, group) ** 2).sum(axis=-1)
+    cost, weight = (chi2, np.ones_like(chi2)) if loss is None else loss(chi2)
+    share = np.broadcast_to(np.asarray(share, np.float64), (count,))
+    root = np.sqrt(share[:, None] * np.repeat(weight, group, axis=1)) * known
+    return float((share * cost.sum(axis=-1)).sum()), root
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One group of shared unknowns."""
+
+    name: str
+    count: int
+    sigma: float = np.inf  # prior standard deviation of each; inf: none
+
+
+class Layout:
+    """Where each group of shared unknowns stands among all: `layout["shift"]` is its slice."""
+
+    def __init__(self, *groups: Unknown) -> None:
+        ends = np.cumsum([group.count for group in groups]).tolist()
+        self.slices = {g.name: slice(end - g.count, end) for g, end in zip(groups, ends, strict=True)}
+        self.size: int = ends[-1]
+        self.sigma: Float = np.repeat([group.sigma for group in groups], [group.count for group in groups])
+
+    def __getitem__(self, name: str) -> slice:
+        return self.slices[name]
+
+
+class Normal:
+    """Normal equations of S shared unknowns and L own unknowns of each of T epochs, as added so far.
+
+    Attributes:
+        cost: Sum of the losses; without a robust loss, chi square.
+        shared, gradient: (S, S) information and (S,) half the gradient of the cost.
+        own: (T, B, L, L) blocks of the information: [t, d] couples the unknowns of epoch t + d (rows) with
+            those of epoch t (columns).
+        mixed, own_gradient: (T, L, S) and (T, L).
+    """
+
+    def __init__(self, shared: int, epochs: int = 0, own: int = 0, bands: int = 1) -> None:
+        self.cost = 0.0
+        self.shared: Float = np.zeros((shared, shared))
+        self.gradient: Float = np.zeros(shared)
+        self.own: Float = np.zeros((epochs, bands, own, own))
+        self.mixed: Float = np.zeros((epochs, own, shared))
+        self.own_gradient: Float = np.zeros((epochs, own))
+
+    def add(
+        self,
+        residual: Float,
+        shared: Float,
+        own: Float | None = None,
+        *,
+        epochs: Int | slice = slice(None),
+        columns: Int | slice = slice(None),
+        loss: Loss | None = None,
+        group: int = 1,
+        share: Float | float = 1.0,
+    ) -> None:
+        """Add rows, whitened, of some epochs.
+
+        Args:
+            residual: (E, R) predicted minus observed, in standard deviations; NaN: not observed.
+            shared: (E, R, C) derivatives by the shared unknowns `columns`.
+            own: (E, R, L) derivatives by the own unknowns of `epochs` (E,), each at most once.
+            columns: The C shared unknowns that these rows depend on, each once.
+            loss: Robust loss of each `group` of neighbouring residuals, such as both coordinates of a point.
+            share: (E,) what an epoch counts, where neighbours in time share their errors.
+        """
+        count, rows = residual.shape
+        cost, root = weigh(residual, loss, group, share)
+        self.cost += cost
+        residual, root = np.nan_to_num(residual) * root, root[..., None]
+        heavy = np.where(root > 0.0, shared * root, 0.0)
+        flat = heavy.reshape(count * rows, -1)
+        at = columns if isinstance(columns, slice) else np.ix_(columns, columns)
+        self.shared[(at, at) if isinstance(at, slice) else at] += flat.T @ flat
+        self.gradient[columns] += flat.T @ residual.ravel()
+        if own is not None:
+            back = np.swapaxes(np.where(root > 0.0, own * root, 0.0), 1, 2)
+            self.own[epochs, 0] += back @ np.swapaxes(back, 1, 2)
+            self.own_gradient[epochs] += (back @ residual[..., None])[..., 0]
+            cross = back @ heavy
+            if isinstance(columns, slice):
+                self.mixed[epochs, :, columns] += cross
+            else:
+                mixed = self.mixed[epochs]
+                mixed[..., columns] += cross
+                self.mixed[epochs] = mixed
+
+    def hold(self, held: Bool) -> None:
+        """Keep own unknowns (T, L) where they are in the next step, such as an angle pushed beyond its limit."""
+        moves = np.where(held, 0.0, 1.0)
+        self.own[:, 0] *= moves[:, :, None] * moves[:, None, :]
+        np.einsum("tii->ti", self.own[:, 0])[...] += held
+        self.mixed *= moves[..., None]
+        self.own_gradient *= moves
+
+    def add_prior(self, away: Float, sigma: Float) -> None:
+        """Add a prior of the shared unknowns: `away` (S,) from its mean, of widths (S,); inf: none."""
+        info = sigma**-2.0
+        self.cost += float((away**2 * info).sum())
+        self.shared[np.diag_indices_from(self.shared)] += info
+        self.gradient += away * info
+
+    def eliminated(self, damping: float = 0.0) -> tuple[Float, Float, Float, Float]:
+        """The equations without the own unknowns.
+
+        Returns:
+            Information (S, S) and half the gradient (S,) of the shared unknowns; and (T, L, S), (T, L): the
+            own unknowns' step is -(the second) - (the first) @ (step of the shared).
+
+        Raises:
+            RuntimeError: The own unknowns' equations cannot be solved.
+        """
+        size, (count, _, length, _) = len(self.gradient), self.own.shape
+        information = self.shared + damping * np.diag(np.diag(self.shared))
+        if not count:
+            return information, self.gradient, self.mixed, self.own_gradient
+        sides = np.concatenate([self.mixed, self.own_gradient[..., None]], axis=-1).reshape(-1, size + 1)
+        options = {
+            "SymmetricMode": True
+        }  # positive definite, and in the order of time: no pivots, little fill
+        factor = splu(self._matrix(damping), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
+        solved = np.asarray(factor.solve(sides), np.float64)
+        back = sides[:, :size].T @ solved
+        solved = solved.reshape(count, length, size + 1)
+        return (
+            information - back[:, :size],
+            self.gradient - back[:, size],
+            solved[..., :size],
+            solved[..., size],
+        )
+
+    def _matrix(self, damping: float) -> csc_array:
+        """The own unknowns' information (T L, T L), damped."""
+        count, bands, length, _ = self.own.shape
+        nothing = 1e-9  # information of what nothing constrains
+        blocks, rows, columns = list[Float](), list[Int](), list[Int]()
+        for d in range(min(bands, count)):
+            block, first = self.own[: count - d, d], np.arange(count - d)
+            if d == 0:
+                block = block + np.eye(length) * (damping * block + nothing)
+            for one, row, column in ((block, first + d, first), (np.swapaxes(block, 1, 2), first, first + d))[
+                : 2 if d else 1
+            ]:
+                blocks.append(one)
+                rows.append(row)
+                columns.append(column)
+        row, column = np.concatenate(rows), np.concatenate(columns)
+        order = np.lexsort((column, row))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=count))])
+        data, shape = np.concatenate(blocks)[order], (count * length, count * length)
+        return csc_array(bsr_array((data, column[order], starts), shape=shape))
+
+    def step(self, damping: float) -> tuple[Float, Float] | None:
+        """Marquardt's step of the shared (S,) and the own unknowns (T, L); None: needs more damping."""
+        try:
+            information, gradient, by_shared, by_own = self.eliminated(damping)
+            # To a unit diagonal: pixels, radians and metres differ by orders of magnitude.
+            scale = _unit_scale(information if damping == 0.0 else self.shared)
+            scaled = information * scale[:, None] * scale
+            step = -scale * np.asarray(np.linalg.solve(scaled, gradient * scale), np.float64)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return None
+        return step, -by_own - by_shared @ step
+
+    def covariance(self, basis: Float | None = None) -> Float:
+        """Covariance (S, S) of the shared unknowns, where residuals have unit variance.
+
+        What nothing determines has an enormous variance, large enough to be refused.
+
+        Args:
+            basis: (S, S') the steps that count, where others, such as the choice of a frame, change nothing
+                (inner constraints; Triggs et al. 2000, section 9.2.2).
+        """
+        information = self.eliminated()[0]
+        if basis is not None:
+            information = basis.T @ information @ basis
+        scale = _unit_scale(information)
+        values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+        inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale[:, None] * scale
+        return inverse if basis is None else basis @ inverse @ basis.T
+
+
+def _unit_scale(information: Float) -> Float:
+    return 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum(Generic[X]):
+    """Where an adjustment came to rest."""
+
+    x: X
+    normal: Normal  # the equations there
+    steps: int  # steps taken
+    settled: bool  # False: it would have gone on
+
+
+def minimise(
+    equations: Callable[[X], Normal],
+    stepped: Callable[[X, Float, Float], X],
+    x: X,
+    *,
+    steps: int = 100,
+    gain: float = 0.0,
+    gain_share: float = 1e-8,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Minimum[X]:
+    """Levenberg and Marquardt's minimum from a first guess.
+
+    A step is taken when the cost falls. It has settled when a step gains no more than `gain`, or that share of
+    the cost, or when no step gains anything.
+    """
+    normal, damping, taken = equations(x), 1e-3, 0
+    while taken < steps:
+        step = normal.step(damping)
+        tried = None if step is None else stepped(x, *step)
+        after = None if tried is None else equations(tried)
+        if tried is not None and after is not None and after.cost <= normal.cost:  # False where it is NaN
+            gained, x, normal, taken = normal.cost - after.cost, tried, after, taken + 1
+            damping = max(damping / 8.0, 1e-10)
+            progress(min(taken / 15.0, 0.99))
+            if gained <= max(gain, gain_share * normal.cost):
+                return Minimum(x, normal, taken, settled=True)
+        else:
+            damping *= 8.0
+            if damping > 1e8:
+                return Minimum(x, normal, taken, settled=True)
+    return Minimum(x, normal, taken, settled=False)
