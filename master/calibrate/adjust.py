@@ -159,7 +159,9 @@ class Normal:
     def hold(self, held: Bool) -> None:
         """Keep own unknowns (T, L) where they are in the next step, such as an angle pushed beyond its limit."""
         moves = np.where(held, 0.0, 1.0)
-        self.own[:, 0] *= moves[:, :, None] * moves[:, None, :]
+        for d in range(min(self.own.shape[1], len(moves))):
+            count = len(moves) - d
+            self.own[:count, d] *= moves[d:, :, None] * moves[:count, None, :]
         np.einsum("tii->ti", self.own[:, 0])[...] += held
         self.mixed *= moves[..., None]
         self.own_gradient *= moves
@@ -233,6 +235,12 @@ class Normal:
             return None
         return step, -by_own - by_shared @ step
 
+    def predicted_gain(self, shared: Float, own: Float, damping: float) -> float:
+        """By how much a step of this damping would lower the cost if all were linear."""
+        on = np.einsum("tii->ti", self.own[:, 0]) if own.size else own
+        squares = np.diag(self.shared) @ shared**2 + float((on * own**2).sum())
+        return float(damping * squares - self.gradient @ shared - (self.own_gradient * own).sum())
+
     def covariance(self, basis: Float | None = None) -> Float:
         """Covariance (S, S) of the shared unknowns, where residuals have unit variance.
 
@@ -280,19 +288,22 @@ def minimise(
     A step is taken when the cost falls. It has settled when a step gains no more than `gain`, or that share of
     the cost, or when no step gains anything.
     """
-    normal, damping, taken = equations(x), 1e-3, 0
+    normal, damping, harder, taken = equations(x), 1e-3, 2.0, 0
     while taken < steps:
         step = normal.step(damping)
         tried = None if step is None else stepped(x, *step)
         after = None if tried is None else equations(tried)
-        if tried is not None and after is not None and after.cost <= normal.cost:  # False where it is NaN
-            gained, x, normal, taken = normal.cost - after.cost, tried, after, taken + 1
-            damping = max(damping / 8.0, 1e-10)
+        if step is not None and tried is not None and after is not None and after.cost <= normal.cost:
+            gained = normal.cost - after.cost  # the comparison is False where it is NaN
+            ratio = gained / max(normal.predicted_gain(*step, damping), 1e-300)
+            # Nielsen, Damping parameter in Marquardt's method, 1999
+            damping, harder = max(damping * max(1.0 / 8.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-10), 2.0
+            x, normal, taken = tried, after, taken + 1
             progress(min(taken / 15.0, 0.99))
             if gained <= max(gain, gain_share * normal.cost):
                 return Minimum(x, normal, taken, settled=True)
         else:
-            damping *= 8.0
+            damping, harder = damping * harder, 2.0 * harder
             if damping > 1e8:
                 return Minimum(x, normal, taken, settled=True)
     return Minimum(x, normal, taken, settled=False)

@@ -13,10 +13,9 @@ Unknown in each epoch is the hand, palm and fingers, as markers and the widest p
   R_rig_palm has two angles and no third (`common.hand.wrist`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
-The hand of each epoch is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of
-Levenberg and Marquardt; outliers are weighed down (Cauchy). Errors of skin and tips last as long as a bend
-does, so all epochs of a second together count as a few. A part of the motion is fitted from several guesses,
-then all of it from the best.
+The hand is an epoch's own, the 34 unknowns of the mounting are shared (`master.calibrate.adjust`); outliers
+are weighed down (Cauchy). Errors of skin and tips last as long as a bend does, so all epochs of a second
+together count as a few. A part of the motion is fitted from several guesses, then all of it from the best.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,8 @@ from common.arrays import Float
 from common.geometry.transforms import rotation_vector_to_matrix
 from common.hand.model import HandModel
 from common.hand.wrist import wrist_angles_of
-from master.calibrate.extrinsics.normal import HandProblem, Hands, Normal
+from master.calibrate.adjust import Normal, cauchy, minimise
+from master.calibrate.extrinsics.normal import HandProblem, Hands
 from master.calibrate.extrinsics.tracks import (
     FINGERS,
     SEEN,
@@ -192,27 +192,12 @@ class Problem:
 
     def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
         """The least cost from a guess, and the number of steps."""
-        damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
-        for _ in range(rounds):
-            normal, gain = self.normal(unknown, hands), 0.0
-            trials, settled = 6, 0.03  # of a step; the gain that is none
-            for _ in range(trials):
-                trial = self._stepped(unknown, hands, *normal.step(damping))
-                trial_cost = self.cost(*trial)
-                if trial_cost < cost:
-                    break
-                damping *= 8.0
-            else:
-                break
-            (unknown, hands), gain, cost, damping = trial, cost - trial_cost, trial_cost, 0.2 * damping
-            taken += 1
-            if gain < settled:
-                break
-        return unknown, hands, taken
+        found = minimise(self.equations, self._stepped, (unknown, hands), steps=rounds, gain=0.03)
+        return *found.x, found.steps
 
     def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
         """The fit with its covariance and residuals."""
-        covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
+        covariance = self.equations((unknown, hands)).covariance()
         shown, wrist_angles = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
         far = self._hands.place(hands) - self._here(unknown).points_m
@@ -221,10 +206,11 @@ class Problem:
         bends, twist = wrist_angles[:, :2], wrist_angles[:, 2]
         return Fit(unknown, covariance, bends, twist, off, self.sigma, shown, marker_m, steps)
 
-    def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
+    def _stepped(self, x: tuple[Unknown, Hands], step: Float, own: Float) -> tuple[Unknown, Hands]:
+        unknown, hands = x
         after = hands.retracted(own)
-        x = np.minimum(np.maximum(after.x, self._parameters.low), self._parameters.high)
-        return unknown.retracted(step), replace(after, x=x)
+        angles = np.minimum(np.maximum(after.x, self._parameters.low), self._parameters.high)
+        return unknown.retracted(step), replace(after, x=angles)
 
     def _here(self, unknown: Unknown) -> Markers:
         """The markers when the frames were taken."""
@@ -274,29 +260,24 @@ class Problem:
         farthest = 8.0  # of a finger that the laser should meet and does not
         return np.where(missed, farthest, np.nan_to_num(off))
 
-    def cost(self, unknown: Unknown, hands: Hands) -> float:
-        """Sum of squares with outliers down-weighted."""
-        shown, wrist_angles = self._shown(unknown, hands)
-        off = self._off(shown)
-        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
-        data = (OUTLIER_SIGMAS**2 * np.log1p(pairs / OUTLIER_SIGMAS**2)).sum()
-        chi2 = ((wrist_angles / self._wrist_sigma) ** 2).sum(axis=-1) * self._known
-        wrist = (OUTLIER_SIGMAS**2 * np.log1p(chi2 / OUTLIER_SIGMAS**2)).sum()
-        markers = replace(self._hands, points_m=self._here(unknown).points_m)
-        held = 2.0 * markers.cost(hands).sum()
-        prior_residual = unknown.off(self._first) / self._prior_sigma
-        return float(self._share * (data + wrist + held) + (prior_residual**2).sum())
-
-    def normal(self, unknown: Unknown, hands: Hands) -> Normal:
+    def equations(self, x: tuple[Unknown, Hands]) -> Normal:
         """Normal equations at a point."""
+        unknown, hands = x
         orientations, here = self._orientations(unknown), self._here(unknown)
-        problem = replace(self._hands, points_m=here.points_m)
-        linear = problem.linearise(hands)
-        out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
-        out = out.and_rows(*self._line_of_sight_rows(unknown, hands, orientations))
-        out = out.and_rows(*self._wrist_rows(unknown, hands, orientations))
-        out = out.shared_out(self._share, unknown.off(self._first), self._prior_sigma)
-        return out.within(hands.x, self._parameters)
+        normal = Normal(UNKNOWN, len(hands.x), 6 + hands.x.shape[1])
+        markers = replace(self._hands, points_m=here.points_m)
+        markers.add_to(normal, hands, here.speed_m_s, CAMERA_LATE, self._share)
+        loss, share = cauchy(OUTLIER_SIGMAS), self._share
+        sight, by_hand, by_shared = self._line_of_sight_rows(unknown, hands, orientations)
+        normal.add(sight, by_shared, by_hand, loss=loss, group=2, share=share)
+        wrist, by_hand, by_shared = self._wrist_rows(unknown, hands, orientations)
+        normal.add(wrist, by_shared, by_hand, loss=loss, group=3, share=share)
+        normal.add_prior(unknown.off(self._first), self._prior_sigma)
+        low, high = self._parameters.low, self._parameters.high
+        held = np.zeros(normal.own_gradient.shape, np.bool_)
+        held[:, 6:] = np.where(normal.own_gradient[:, 6:] > 0.0, hands.x <= low, hands.x >= high)
+        normal.hold(held)
+        return normal
 
     def _line_of_sight_rows(
         self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
@@ -312,10 +293,8 @@ class Problem:
             R, unknown.shift_m, angles, unknown.thick, unknown.reach_m
         )
         off = self._off(shown)
-        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
-        root = np.repeat((1.0 + pairs / OUTLIER_SIGMAS**2) ** -0.5, 2, axis=-1)
         observed = np.isfinite(self._data) & np.isfinite(shown)
-        by = by * (np.where(observed, root, 0.0) / self.sigma)[..., None]
+        by = by * (observed / self.sigma)[..., None]
         count, n = len(hands.x), hands.x.shape[1]
         by_rotation = by[..., :3].reshape(count, -1, 3)
         own = np.zeros((count, 4 * SEEN, 6 + n))
@@ -331,16 +310,14 @@ class Problem:
         shared[..., CAMERA_IMU] = by_rotation
         shared[..., SHIFT] = by[..., 3:6].reshape(count, -1, 3)
         self._world_columns(shared, -by_rotation @ camera_rig, unknown, orientations)
-        return (off * root).reshape(count, -1), own, shared
+        return off.reshape(count, -1), own, shared
 
     def _wrist_rows(
         self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
     ) -> tuple[Float, Float, Float]:
         """As `_line_of_sight_rows`, of flexion, deviation and twist."""
         wrist = self._wrists(unknown, hands, orientations)
-        chi2 = wrist_rotation_angles(wrist) / self._wrist_sigma
-        root = (1.0 + np.vecdot(chi2, chi2) / OUTLIER_SIGMAS**2) ** -0.5  # where the hand itself was mistaken
-        weight = (self._known * root)[:, None] / self._wrist_sigma
+        weight = self._known[:, None] / self._wrist_sigma
         by_rotation = weight[..., None] * bends_by_rotation(wrist)
         forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
         own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
@@ -399,8 +376,9 @@ def fit_extrinsics(
     for first in firsts:
         problem = Problem(lines_of_sight, model, names, hand, imu, coarse, px_per_m, first)
         unknown, hands, _ = problem.followed(first, _COARSE_ROUNDS)
-        if best is None or problem.cost(unknown, hands) < best[0]:
-            best = problem.cost(unknown, hands), unknown
+        cost = problem.equations((unknown, hands)).cost
+        if best is None or cost < best[0]:
+            best = cost, unknown
     first = firsts[0] if best is None else best[1]
     problem = Problem(lines_of_sight, model, names, hand, imu, cycles, px_per_m, first)
     return problem.result(*problem.followed(first, _ROUNDS))

@@ -12,9 +12,9 @@ thickness and length are those of a hand of its size, about. What none of that d
 the covariance shows it: above all, a knuckle that lies farther from the camera looks like a thicker finger,
 and all knuckles shifted alike like a palm that is shifted.
 
-The angles of each finger in each strobe cycle are eliminated (Schur complement), which leaves 26 unknowns.
-Steps are Levenberg-Marquardt; outliers are downweighted (Cauchy). Errors of skin, tips and couplings last as
-long as a bend does: its strobe cycles count together as a few.
+The angles of a finger in a strobe cycle are its own, 26 unknowns are shared (`master.calibrate.adjust`);
+outliers are downweighted (Cauchy). Errors of skin, tips and couplings last as long as a bend does: its strobe
+cycles count together as a few.
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import FitError
 from common.hand.skin import SPREAD
+from master.calibrate.adjust import Normal, cauchy, minimise
 from master.calibrate.wrist.subject_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, SubjectModel
 
 MOTION = (
@@ -231,25 +232,12 @@ class _Problem:
 
     def solved(self, x: Float, guess: _Guess, rounds: int) -> tuple[Float, _Guess, Float]:
         """Unknowns (26,), angles and covariance (26, 26), from a guess."""
-        damping, covariance = 1e-2, np.diag(self.prior_sigma**2)
-        cost = self._cost(x, guess)
-        for _ in range(rounds):
-            normal = self._normal(x, guess)
-            covariance = np.asarray(np.linalg.inv(normal.reduced(0.0)[0]), np.float64)
-            trials, settled = 6, 0.02  # of a step; the gain that is none
-            for _ in range(trials):
-                step, change = normal.step(damping)
-                stepped = _Guess(guess.angles + change, guess.fist, guess.used)
-                trial = self._cost(x + step, stepped)
-                if trial < cost:
-                    break
-                damping *= 6.0
-            else:
-                break
-            x, guess, gain, cost, damping = x + step, stepped, cost - trial, trial, 0.2 * damping
-            if gain < settled:
-                break
-        return x, guess, covariance
+        found = minimise(self._equations, self._stepped, (x, guess), steps=rounds, gain=0.02)
+        return *found.x, found.normal.covariance()
+
+    def _stepped(self, at: tuple[Float, _Guess], step: Float, change: Float) -> tuple[Float, _Guess]:
+        x, guess = at
+        return x + step, _Guess(guess.angles + change.reshape(guess.angles.shape), guess.fist, guess.used)
 
     def result(self, x: Float, guess: _Guess, covariance: Float) -> Fit:
         """The fit with its residuals."""
@@ -286,62 +274,32 @@ class _Problem:
         by[~fist, :, PIP, PIP] = 1.0 / _STRAIGHT_RAD
         return (by @ angles[..., None])[..., 0], by
 
-    def _cost(self, x: Float, guess: _Guess) -> float:
-        off = np.nan_to_num(self._off(x, guess.angles)) * guess.used[..., None]
-        pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)])
-        data = (_OUTLIER_SIGMAS**2 * np.log1p(pairs / _OUTLIER_SIGMAS**2)).sum(axis=(0, 2))
-        grid = (self._prior_rows(guess)[0] ** 2).sum(axis=(1, 2))
-        return float((self._share * (data + grid)).sum() + ((x / self.prior_sigma) ** 2).sum())
-
-    def _normal(self, x: Float, guess: _Guess) -> "_Normal":
-        """The normal equations at a point, with outliers down-weighted."""
-        off = np.nan_to_num(self._off(x, guess.angles))
-        pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)], axis=-1)
-        root = np.repeat((1.0 + pairs / _OUTLIER_SIGMAS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
-        root = np.where(np.isfinite(self._data), root, 0.0)
+    def _equations(self, at: tuple[Float, _Guess]) -> Normal:
+        """Normal equations at a point; a finger in a strobe cycle is an epoch."""
+        x, guess = at
+        off = np.where(guess.used[..., None], self._off(x, guess.angles), np.nan)
         by_x, by_angles = self._model.derivatives(x, guess.angles)
+        by_x, by_angles = (np.nan_to_num(-by / self._sigma[..., None]) for by in (by_x, by_angles))
         prior_residual, prior_jacobian = self._prior_rows(guess)
-        share = np.sqrt(self._share)[:, None, None]
-        scale = (share * root / self._sigma)[..., None]
-        residual = np.concatenate([share * root * off, share * prior_residual], axis=-1)
-        local = np.concatenate([-scale * by_angles, share[..., None] * prior_jacobian], axis=-2)
-        shared = np.concatenate([-scale * by_x, np.zeros((*prior_residual.shape, UNKNOWN))], axis=-2)
-        back = np.swapaxes(local, -1, -2)
-        return _Normal(
-            back @ local,
-            back @ shared,
-            (back @ residual[..., None])[..., 0],
-            np.einsum("tfij,tfik->jk", shared, shared) + np.diag(self.prior_sigma**-2.0),
-            np.einsum("tfij,tfi->j", shared, residual) + x / self.prior_sigma**2,
+        epochs = off.shape[0] * off.shape[1]
+        share = np.repeat(self._share, off.shape[1])
+        normal = Normal(UNKNOWN, epochs, LOCAL)
+        normal.add(
+            off.reshape(epochs, -1),
+            by_x.reshape(epochs, -1, UNKNOWN),
+            by_angles.reshape(epochs, -1, LOCAL),
+            loss=cauchy(_OUTLIER_SIGMAS),
+            group=2,
+            share=share,
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
-    """Normal equations of 26 shared unknowns and each cycle's angles (T, 4, 3)."""
-
-    own: Float  # this, mixed and shared: (T, 4, 3, 3), (T, 4, 3, 26) and (26, 26) information
-    mixed: Float
-    own_pull: Float  # this and shared_pull: (T, 4, 3) and (26,)
-    shared: Float
-    shared_pull: Float
-
-    def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
-        """Information (26, 26), gradient (26,) without the angles; and the angles' part."""
-        eye = damping * np.eye(LOCAL)
-        own = self.own * (1.0 + eye) + 1e-9 * np.eye(LOCAL)
-        by_shared = _solve(own, self.mixed)
-        own_step = _solve(own, self.own_pull[..., None])[..., 0]
-        information = self.shared * (1.0 + damping * np.eye(UNKNOWN))
-        information = information - np.einsum("tfij,tfik->jk", self.mixed, by_shared)
-        pull = self.shared_pull - np.einsum("tfij,tfi->j", self.mixed, own_step)
-        return information, pull, by_shared, own_step
-
-    def step(self, damping: float) -> tuple[Float, Float]:
-        """Of the shared unknowns (26,) and the angles (T, 4, 3)."""
-        information, pull, by_shared, own_step = self.reduced(damping)
-        step = -_solve(information, pull[:, None])[:, 0]
-        return step, -own_step - by_shared @ step
+        normal.add(
+            prior_residual.reshape(epochs, -1),
+            np.zeros((epochs, LOCAL, UNKNOWN)),
+            prior_jacobian.reshape(epochs, LOCAL, LOCAL),
+            share=share,
+        )
+        normal.add_prior(x, self.prior_sigma)
+        return normal
 
 
 def fists_of(cost: Float) -> Bool:
@@ -357,7 +315,3 @@ def fists_of(cost: Float) -> Bool:
     if clear.any() and (better[clear] < 0.0).all():
         return ~clear
     return better > 0.0
-
-
-def _solve(a: Float, b: Float) -> Float:
-    return np.asarray(np.linalg.solve(a, b), np.float64)

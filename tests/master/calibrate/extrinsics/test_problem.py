@@ -54,17 +54,22 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     return out, first.retracted(1e-3 * rng.normal(size=UNKNOWN)), hands
 
 
+def cost_of(at: Problem, unknown: Unknown, hands: Hands) -> float:
+    return at.equations((unknown, hands)).cost
+
+
 def derivatives(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
     """Of half of the cost by each of these steps (N, UNKNOWN), by central differences."""
     out = [
-        at.cost(unknown.retracted(step), hands) - at.cost(unknown.retracted(-step), hands) for step in steps
+        cost_of(at, unknown.retracted(step), hands) - cost_of(at, unknown.retracted(-step), hands)
+        for step in steps
     ]
     return 0.25 * np.array(out)
 
 
 def test_the_gradient_of_what_all_epochs_share_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
-    pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * prior_sigma()
+    pull, little = at.equations((unknown, hands)).gradient, 1e-4 * prior_sigma()
     derivative = derivatives(at, unknown, hands, np.diag(little)) / little
     scale = np.abs(pull * prior_sigma())
     most = float(scale.max())  # small pulls are differences of large ones
@@ -74,11 +79,11 @@ def test_the_gradient_of_what_all_epochs_share_is_the_derivative_of_the_cost() -
 
 def test_the_gradient_of_each_hand_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
-    pull, little = at.normal(unknown, hands).own_pull, 1e-4
+    pull, little = at.equations((unknown, hands)).own_gradient, 1e-4
     for k in range(6):
         step = np.zeros_like(pull)
         step[:, k] = little
-        costs = [at.cost(unknown, hands.retracted(way * step)) for way in (1.0, -1.0)]
+        costs = [cost_of(at, unknown, hands.retracted(way * step)) for way in (1.0, -1.0)]
         assert 0.25 * (costs[0] - costs[1]) / little == pytest.approx(pull[:, k].sum(), rel=0.01)
 
 
@@ -86,7 +91,7 @@ def test_a_step_of_gauss_and_newton_lessens_the_cost() -> None:
     at, unknown, hands = problem()
     solved, after, taken = at.solved(unknown, hands, 3)
     assert taken == 3
-    assert at.cost(solved, after) < 0.5 * at.cost(unknown, hands)
+    assert cost_of(at, solved, after) < 0.5 * cost_of(at, unknown, hands)
 
 
 def test_a_turn_about_the_axes_of_the_forearm_bends_the_wrist() -> None:
